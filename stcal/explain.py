@@ -23,7 +23,7 @@ class Candidate:
 
     words: str
     change: Callable[[], Any]
-    size: float = 0
+    size: Any = 0
 
 
 def explain(
@@ -31,8 +31,8 @@ def explain(
 ) -> list[tuple[Candidate, float]]:
     """Return the candidates that explain the data, with their misfits, the best first; several if the data cannot tell.
 
-    Of the candidates, in the order of their sizes, those of one size are tried together; larger changes are tried only
-    if no smaller one explains the data. Nothing is named if none does.
+    Candidates of one size are tried together, the smallest first; larger changes are tried only if no smaller one
+    explains the data. Nothing is named if none does.
 
     ``fit`` : returns the misfit of a changed input; an input that gives no solution (DegenerateError,
     ConvergenceError) explains nothing; ``most`` : misfit below which a candidate explains the data; ``alike`` : ratio
@@ -45,7 +45,7 @@ def explain(
         except (DegenerateError, ConvergenceError):
             return np.inf
 
-    for _, level in groupby(candidates, lambda each: each.size):
+    for _, level in groupby(sorted(candidates, key=lambda each: each.size), lambda each: each.size):
         found = [(each, left) for each in level if (left := misfit(each)) < most]
         if found:
             found.sort(key=lambda each: each[1])

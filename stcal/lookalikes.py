@@ -143,31 +143,24 @@ def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray
     slack = MAX_GAP * min(radius.min(), other_radius.min())
     like = alike(radius[k][:, None], other_radius[p]) & alike(radius[near][:, None], other_radius[q])
     a, b = np.nonzero((np.abs(length[:, None] - other_length) < slack) & like)
-    masks, places = [np.zeros((0, n), bool)], [np.zeros((0, n), int)]
+    masks, places, tree = [np.zeros((0, n), bool)], [np.zeros((0, n), int)], KDTree(other_xy)
     for start in range(0, len(a), BLOCK):
         block = slice(start, start + BLOCK)
-        fits, nearest = _coincide(
-            xy, radius, other_xy, other_radius, (k[a[block]], p[b[block]]), step[a[block]], other_step[b[block]], same
-        )
+        own, other = step[a[block]], other_step[b[block]]
+        turn = np.arctan2(other[:, 1], other[:, 0]) - np.arctan2(own[:, 1], own[:, 0])
+        c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+        x, y = np.moveaxis(xy - xy[k[a[block]]][:, None], 2, 0)
+        moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[p[b[block]]][:, None]
+        gap, nearest = map(np.asarray, tree.query(moved))
+        fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
+        if same:  # the identity is excluded
+            moved_away = ~((nearest == np.arange(n)) | ~fits).all(1)
+            fits, nearest = fits[moved_away], nearest[moved_away]
         enough = fits.sum(1) >= MIN_COMMON
         _, first = np.unique(np.where(fits, nearest, -1)[enough], axis=0, return_index=True)
         masks.append(fits[enough][first])
         places.append(nearest[enough][first])
     return np.concatenate(masks), np.concatenate(places)
-
-
-def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool):
-    """Returns the circles that coincide and the nearest ones, (motions, n), for motions of two onto two."""
-    turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
-    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
-    moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
-    gap, nearest = map(np.asarray, KDTree(other_xy).query(moved))
-    fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
-    if same:  # the identity is excluded
-        moved_away = ~((nearest == np.arange(len(xy))) | ~fits).all(1)
-        fits, nearest = fits[moved_away], nearest[moved_away]
-    return fits, nearest
 
 
 def alike(a, b):

@@ -36,14 +36,14 @@ from stcal.parallel import one_thread
 from stcal.report.text import text_table
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import Refined
+from stcal.sfm.checks.significance import MOST_SIGMAS
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.checks.verdict import MOST_SIGMAS, ranked
 from stcal.sfm.data.model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labelling import label_images
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.report.judgement import CAUSE
+from stcal.sfm.report.check import CAUSE, ranked
 from stcal.sfm.runs.solve import LIKELY, explained, refine_or_explain, wrong_file
 from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, make_scene, second_design
 from tests.support.circle_images import circle_conic, ellipse_of_conic

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
-from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
+from stcal.boards.tags import APART_PX, Unseen, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
 from stcal.boards.target_file import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError
@@ -66,7 +66,7 @@ def find_on_faces(
         if view is not None:
             views[face] = view
             notes += [f"{where}: {reason}" for reason in view.unused]
-        elif why and (face == BOARD or ("no tag of" not in why and "none of" not in why)):
+        elif why and (face == BOARD or not isinstance(why, Unseen)):
             notes.append(f"{where}: {why}")
     return views, notes
 

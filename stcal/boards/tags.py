@@ -235,6 +235,12 @@ MOST_STRAY_SHARE = 1 / 3
 """Largest share of the tags in view that may be rejected for lying off the plane."""
 
 
+class Unseen(str):
+    """The reason why a board is not found that is no fault of an image: no part of the board is in it."""
+
+    __slots__ = ()
+
+
 def find_aprilgrid(
     image: np.ndarray, name: str, board: AprilGridDesign, camera: Camera
 ) -> tuple[BoardView | None, str]:
@@ -243,11 +249,12 @@ def find_aprilgrid(
     tags, bits = _tags(image, board)
     view = view_of_tags(name, tags, layout)
     if view is None and tags.tags:
-        return None, f"tag {tags.tags[0][1]} of {board.dictionary}, none of {ids[0]} … {ids[-1]} of the AprilGrid"
+        others = f"tag {tags.tags[0][1]} of {board.dictionary}, none of {ids[0]} … {ids[-1]} of the AprilGrid"
+        return None, Unseen(others)
     if view is None and tags.repeated:
         return None, f"tag {tags.repeated[0][1]} of the AprilGrid is in view more than once, and no other"
     if view is None:
-        return None, f"no tag of the AprilGrid: {board.dictionary}, border of {bits} cells"
+        return None, Unseen(f"no tag of the AprilGrid: {board.dictionary}, border of {bits} cells")
     fitting, unused = view, list(view.unused)
     unused += [f"tag {tag} is none of its {len(ids)}" for _, tag in tags.tags if tag not in ids]
     least = (1 - MOST_STRAY_SHARE) * len(view)

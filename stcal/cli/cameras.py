@@ -59,13 +59,13 @@ def show(
     plot: PlotFile = None,
 ) -> None:
     """Print a camera's parameters with σ, its field of view, and how far the lens moves points."""
-    from stcal.report.camera import distortion_figure, shown
+    from stcal.report.camera import field_figure, moved_px, shown
     from stcal.report.svg import save
 
     camera = _lens(source, name, size).camera
     say("\n".join(shown(camera)))
     if plot:
-        save(distortion_figure(camera), plot)
+        save(field_figure(*moved_px(camera)), plot)
         say(f"picture: {plot}")
 
 
@@ -79,14 +79,14 @@ def compare(
 ) -> None:
     """Compare two cameras: by how many pixels their images of a ray differ, after the rotation that fits best."""
     from stcal.io.cameras.difference import compare_cameras
-    from stcal.report.camera import comparison_figure, comparison_text
+    from stcal.report.camera import comparison_text, field_figure
     from stcal.report.svg import save
 
     first_lens, second_lens = _lens(first, name, size, False), _lens(second, name, size, False)
     difference = compare_cameras(first_lens.lens, second_lens.lens)
     say("\n".join(comparison_text(difference)))
     if plot:
-        save(comparison_figure(difference), plot)
+        save(field_figure(difference.pixels, difference.apart, "second camera, px apart"), plot)
         say(f"picture: {plot}")
 
 

@@ -21,8 +21,7 @@ from stcal.locate.layout_calibration import AdjustedLayout, CalibratedLayout
 from stcal.locate.patent import ASSUMED, PatentPose
 from stcal.locate.scenes import Located
 from stcal.locate.verdict import Verdict
-from stcal.report import document
-from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, columns, macro
+from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, columns, macro, verdict_word
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
 
@@ -112,7 +111,7 @@ def _overview(results: Sequence[Located]) -> list[list]:
         rows.append(
             [
                 located.name,
-                document.Verdict(located.verdict.decision),
+                verdict_word(located.verdict.decision),
                 len(located.merged.seen) if located.merged else 0,
                 len(located.exposures),
                 *(number(v, 2) for v in place),
@@ -131,7 +130,7 @@ def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: Cam
             check.name,
             f"{check.value:.4g}{check.unit}" if np.isfinite(check.value) else "no other pose",
             f"≥ {check.at_least:.4g}" if check.at_least is not None else f"≤ {check.at_most:.4g}",
-            "yes" if check.passed else document.Verdict("no"),
+            "yes" if check.passed else verdict_word("no"),
         ]
         for check in located.verdict.checks
     ]

@@ -78,11 +78,6 @@ def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         return pixels, pixels - ideal.pixel_from_normalised(rays_camera[:, :2]).reshape(pixels.shape)
 
 
-def distortion_figure(camera: Camera) -> Drawing:
-    """Return a figure of the distortion over the image: its direction and size."""
-    return _field(*moved_px(camera), "moved by the lens, px")
-
-
 def comparison_text(found: CameraDifference) -> list[str]:
     """Return lines with the numbers of a comparison."""
     length = found.lengths()
@@ -104,12 +99,7 @@ def comparison_text(found: CameraDifference) -> list[str]:
     return lines
 
 
-def comparison_figure(found: CameraDifference) -> Drawing:
-    """Return a figure of the differences between two cameras: their direction and size."""
-    return _field(found.pixels, found.apart, "second camera, px apart")
-
-
-def _field(pixels: np.ndarray, moved: np.ndarray, what: str) -> Drawing:
+def field_figure(pixels: np.ndarray, moved: np.ndarray, what: str = "moved by the lens, px") -> Drawing:
     """Return a figure of vectors (r, c, 2), px, at ``pixels``: lengths as colours, directions as arrows."""
     (x0, y0), (x1, y1) = pixels[0, 0], pixels[-1, -1]
     drawing = Drawing(7.0, 0.6 + 5.7 * (y1 - y0) / (x1 - x0))

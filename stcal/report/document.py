@@ -19,8 +19,6 @@ from stcal.parallel import one_thread
 from stcal.report.svg import Drawing
 from stcal.report.text import NONE, join, number, text_table
 
-MACROS = "report/templates/macros.html.jinja"
-
 
 @cache
 def environment() -> Environment:
@@ -34,7 +32,7 @@ def environment() -> Environment:
     )
     env.filters["with_code"] = with_code
     env.filters["number"] = number
-    macros = vars(env.get_template(MACROS).module)
+    macros = vars(env.get_template("report/templates/macros.html.jinja").module)
     env.globals |= {name: macro for name, macro in macros.items() if not name.startswith("_")}
     return env
 
@@ -160,51 +158,48 @@ def tone_of(word: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """The word of a verdict, for a cell."""
+class Cell:
+    """A word for a cell that a page shows in a way of its own. ``look`` : the macro that writes it, and its values."""
 
     word: str
+    look: tuple[str, ...]
 
     def __str__(self) -> str:
         return self.word
 
     def __html__(self) -> str:
-        return _macro("verdict", self.word, tone_of(self.word))
+        return _macro(self.look[0], self.word, *self.look[1:])
+
+
+def verdict_word(word: str) -> Cell:
+    """Return the word of a verdict in its tone."""
+    return Cell(word, ("verdict", tone_of(word)))
+
+
+def swatch(text: str, colour: str) -> Cell:
+    """Return a word with a patch of its colour before it."""
+    return Cell(text, ("swatch", colour))
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer at the head of a report. ``word`` : yes, with care, part or no; ``why`` : in one sentence."""
+    """The answer at the head of a report. ``word`` : yes, with care, part or no; ``why`` : in one sentence; ``said`` :
+    both, if not as ``Word: why``."""
 
     word: str
-    why: str
+    why: str = ""
+    question: str = "May I use it?"
+    said: str = ""
 
     def lines(self) -> list[str]:
         """Return the answer as a line."""
-        return [f"{USABLE} {self._said()}"]
+        return [f"{self.question} {self._said()}"]
 
     def __html__(self) -> str:
-        return _macro("answers", [(USABLE, self._said())], tone_of(self.word))
+        return _macro("answers", [(self.question, self._said())], tone_of(self.word))
 
     def _said(self) -> str:
-        return sentence(f"{self.word.capitalize()}: {self.why}")
-
-
-USABLE = "May I use it?"
-
-
-@dataclass(frozen=True, slots=True)
-class Swatch:
-    """A word for a cell, with a patch of its colour before it."""
-
-    text: str
-    colour: str
-
-    def __str__(self) -> str:
-        return self.text
-
-    def __html__(self) -> str:
-        return _macro("swatch", self.text, self.colour)
+        return self.said or sentence(f"{self.word.capitalize()}: {self.why}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +250,6 @@ class Document:
 
     def page(self) -> str:
         """Return the page, which opens offline."""
-
         with one_thread():  # small matrices of figures, on which threads wait for each other
             sections = [(each.anchor(), each.heading, html(*each.blocks)) for each in self.sections]
             return (
@@ -308,7 +302,7 @@ def html(*blocks: Block):
 
 def sentence(text: str) -> str:
     """Return a message as a sentence; symbols, file names and what ends in a colon keep their small letters."""
-    first = re.split(r"[\s,]", text, maxsplit=1)[0]
+    first = re.split(r"[\s,;]", text, maxsplit=1)[0]
     start = text[0].upper() if first.isascii() and first.isalpha() else text[0]
     return start + text[1:] + ("" if text[-1] in ".!?:)" else ".")
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +29,10 @@ def round_below(value: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
 
 
-AXIS, PANE, PANE_EDGE = "#9aa0a8", "#f4f6f8", "#e1e5e9"
+AXIS = "#9aa0a8"
 FONTS = "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 RED_BLUE = "#053061 #2166ac #4393c3 #92c5de #d1e5f0 #f7f7f7 #fddbc7 #f4a582 #d6604d #b2182b #67001f"
 """The diverging ramp RdBu of ColorBrewer (Harrower & Brewer 2003), from blue to red."""
-YELLOW_RED = "#ffffcc #ffeda0 #fed976 #feb24c #fd8d3c #fc4e2a #e31a1c #bd0026 #800026"
-"""The ramp YlOrRd of ColorBrewer, light to dark."""
 VIRIDIS = "#440154 #472d7b #3b528b #2c728e #21918c #28ae80 #5ec962 #addc30 #fde725"
 """The ramp viridis (van der Walt & Smith 2015), dark to light."""
 DASH = "5 4"
@@ -55,8 +52,6 @@ Ticks = tuple[Sequence[float], Sequence[str]]
 """Values of an axis, and their words."""
 UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 """Characters that no XML file may contain."""
-MARGIN_PT = 34.0
-"""Space around a view in space for ticks and names of its axes."""
 
 
 Box = tuple[float, float, float, float]
@@ -387,67 +382,3 @@ def arrows(start: np.ndarray, along: np.ndarray, width: float) -> list[np.ndarra
         shape += [(length - head, -thin), (0, -thin)]
         outlines.append(at + np.array(shape) @ np.array([unit, [-unit[1], unit[0]]]))
     return outlines
-
-
-class Space:
-    """Parallel projection of a box in space that is just large enough for points (n, 3), mm, with its axes.
-
-    The same scale holds for X, Y and Z. ``elevation_deg``, ``azimuth_deg`` : direction to the viewer.
-    """
-
-    def __init__(self, drawing: Drawing, xyz: np.ndarray, elevation_deg: float, azimuth_deg: float):
-        low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (-np.ones(3), np.ones(3))
-        margin = 0.03 * max(float((high - low).max()), 1e-6)
-        self._limits = np.array([low - margin, high + margin])
-        (sin_e, sin_a), (cos_e, cos_a) = (f(np.radians([elevation_deg, azimuth_deg])) for f in (np.sin, np.cos))
-        self._towards = np.array([cos_e * cos_a, cos_e * sin_a, sin_e])
-        self._axes = np.array([[-sin_a, cos_a, 0.0], [sin_e * cos_a, sin_e * sin_a, -cos_e]])
-        corners = np.array(list(product(*self._limits.T))) @ self._axes.T
-        extent = np.maximum(np.ptp(corners, axis=0), 1e-9)
-        room = np.array([drawing.width, drawing.height]) - 2 * MARGIN_PT
-        self._scale = float((room / extent).min())
-        self._middle = (corners.min(0) + corners.max(0)) / 2
-        self._centre = np.array([drawing.width, drawing.height]) / 2
-        front = (self._towards > 0).astype(int)  # index of the limit that is nearer to the viewer, by axis
-        for axis in range(3):  # the walls behind the points
-            others = [i for i in range(3) if i != axis]
-            wall = np.empty((4, 3))
-            wall[:, axis] = self._limits[1 - front[axis], axis]
-            for other, sides in zip(others, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True):
-                wall[:, other] = self._limits[sides, other]
-            drawing.lines([self.at(wall)], PANE_EDGE, 0.8, PANE)
-        for axis, name in enumerate("XYZ"):
-            self._draw_axis(drawing, axis, name, front)
-
-    def at(self, xyz: np.ndarray) -> np.ndarray:
-        """Returns the places (n, 2) in the drawing of points (n, 3)."""
-        return self._centre + self._scale * (np.asarray(xyz, float) @ self._axes.T - self._middle)
-
-    def _draw_axis(self, drawing: Drawing, axis: int, name: str, front: np.ndarray) -> None:
-        """Draws ticks and the name of an axis along an edge that nothing hides."""
-        a, b = (i for i in range(3) if i != axis)
-        low, high = self._limits[:, axis]
-
-        def points(sides: tuple[int, int], values) -> np.ndarray:
-            xyz = np.empty((len(values), 3))
-            xyz[:, axis], xyz[:, a], xyz[:, b] = values, self._limits[sides[0], a], self._limits[sides[1], b]
-            return self.at(xyz)
-
-        outline = ((front[a], 1 - front[b]), (1 - front[a], front[b]))  # edges between a wall in front and one behind
-        ends = [points(sides, [low, high]) for sides in outline]
-        chosen = int(np.argmax([end.mean(0)[0 if name == "Z" else 1] for end in ends]))
-        edge = ends[chosen]
-        along = edge[1] - edge[0]
-        length = float(np.hypot(*along))
-        if length < 1:  # seen from its end
-            return
-        across = np.array([-along[1], along[0]]) / length
-        across *= np.sign(across @ (edge.mean(0) - self._centre)) or 1.0
-        values, texts = ticks(low, high, 5 if length > 100 else 3)
-        places = points(outline[chosen], values)
-        drawing.lines([edge, *(np.array([at, at + 3 * across]) for at in places)], AXIS, 0.8)
-        for at, text in zip(places, texts, strict=True):
-            drawing.words(at + 11 * across, text, SMALL - 0.5)
-        turned = float(np.degrees(np.arctan2(along[1], along[0])))
-        turned -= 180 * round(turned / 180)
-        drawing.words(edge.mean(0) + 27 * across, f"{name}, mm", SMALL + 0.5, turned_deg=turned)

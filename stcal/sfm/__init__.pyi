@@ -1,8 +1,7 @@
-from .budget.page import uncertainty_budget as uncertainty_budget
+from .budget.budget_page import uncertainty_budget as uncertainty_budget
 from .camera.calibrate import calibrate_camera as calibrate_camera
-from .checks.verdict import Check as Check
-from .checks.verdict import Trial as Trial
-from .checks.verdict import judge as judge
+from .checks.significance import Trial as Trial
+from .checks.significance import judge as judge
 from .detect.labelling import Detection as Detection
 from .detect.labelling import detect_circles as detect_circles
 from .interop.crosscheck import crosscheck as crosscheck
@@ -25,6 +24,7 @@ from .planning.advise import noise_of_run as noise_of_run
 from .planning.forecast import CentreNoise as CentreNoise
 from .planning.session import PlanOptions as PlanOptions
 from .planning.session import plan as plan
+from .report.check import Check as Check
 from .report.compare import compare as compare
 from .report.compare import compare_poses as compare_poses
 from .runs.crosscheck import Tolerances as Tolerances

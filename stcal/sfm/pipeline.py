@@ -31,8 +31,8 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.causes import cause_of_drawing, cause_of_size
+from stcal.sfm.checks.significance import MOST_SIGMAS, Check
 from stcal.sfm.checks.suite import run_checks, shows_rim
-from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups

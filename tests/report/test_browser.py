@@ -8,7 +8,7 @@ from PIL import Image
 from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 
-from stcal.sfm.report.page import report_html
+from stcal.sfm.report.run_page import report_html
 from tests.report.browser import faults, opened, show, sideways_px
 from tests.sfm.report.test_report import by_image, make
 

@@ -6,7 +6,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from stcal.report.svg import Axes, Drawing, Space
+from stcal.report.svg import Axes, Drawing, save
+from tests.outcome import fails_with
 
 
 def written(drawing: Drawing) -> ElementTree.Element:
@@ -32,17 +33,23 @@ def test_axes_hold_their_data():
     np.testing.assert_allclose(axes.at(*xy.T), [[10, 45 - 5 / 3], [110, 45 + 5 / 3]])
 
 
-def test_a_view_in_space_holds_all_points_on_one_scale():
-    xyz = np.array([[0.0, 0, 0], [100, 0, 0], [0, 30, 0], [0, 0, 70], [100, 30, 70]])
-    drawing = Drawing(5, 4)
-    space = Space(drawing, xyz, 22, -58)
-    at = space.at(xyz)
-    assert (at > 0).all()
-    assert (at < [drawing.width, drawing.height]).all()
-    along = np.array([at[1] - at[0], (at[2] - at[0]) / 0.3, (at[3] - at[0]) / 0.7]) / 100
-    # Rows are the images of the unit vectors: an orthographic view scales both picture axes alike, without shear.
-    square = along.T @ along
-    np.testing.assert_allclose(square, square[0, 0] * np.eye(2), atol=1e-9)
-    assert along[2, 1] < 0  # Z is upwards
-    words = {text.text for text in written(drawing).iter("{http://www.w3.org/2000/svg}text")}
-    assert words >= {"X, mm", "Y, mm", "Z, mm"}
+def test_a_figure_that_is_broken_off_leaves_the_earlier_one(tmp_path, monkeypatch):
+    path = tmp_path / "plot.svg"
+    path.write_text("earlier")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", full)
+        with fails_with("E-OUTPUT-UNWRITABLE … No space left"):
+            save(Drawing(2, 2), path)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == "earlier"
+    save(Drawing(2, 2), path)
+    assert path.read_text().startswith("<svg")
+
+
+def test_other_forms_are_refused(tmp_path):
+    with fails_with("E-OUTPUT-SUFFIX … plot.png … .svg"):
+        save(Drawing(2, 2), tmp_path / "plot.png")

@@ -201,7 +201,7 @@ def budget(
 ) -> None:
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
     from stcal.report.document import pdf_of, require_pdf
-    from stcal.sfm.budget.page import budget_in_brief, uncertainty_budget
+    from stcal.sfm.budget.budget_page import budget_in_brief, uncertainty_budget
     from stcal.sfm.budget.sources import fields_of
 
     if pdf and page is None:

@@ -37,8 +37,8 @@ from stcal.report.document import (
     subheading,
     tiles,
     tone_of,
+    verdict_word,
 )
-from stcal.report.document import Verdict as VerdictWord
 from stcal.report.text import HEADS, NONE, number, transform_rows
 
 ERRORS = {
@@ -171,7 +171,7 @@ CHANCE = (
 
 def _findings(found: Verdict) -> Block:
     """Returns the findings that the verdict rests on, folded."""
-    rows = [[f.title, VerdictWord(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    rows = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
     table = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], rows, css="text")
     return fold("What the verdict rests on", table, CHANCE)
 

@@ -14,7 +14,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
-from stcal.sfm.budget.sources import Conditions, Source, Statement, conditions_of, sources_of, statement_of
+from stcal.sfm.budget.sources import BudgetSource, StatedConditions, Statement, conditions_of, sources_of, statement_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
@@ -42,7 +42,7 @@ class Measurand:
         freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
         freeze(self, "designed", (None, None), f"{self.name}: designed")
 
-    def covariance(self, source: Source, designed_sigma_mm: float) -> np.ndarray:
+    def covariance(self, source: BudgetSource, designed_sigma_mm: float) -> np.ndarray:
         """Covariance (r, r) from one source; ``designed_sigma_mm`` matters only for the source of placed circles."""
         if source.key == PLACED:
             return designed_sigma_mm**2 * self.designed @ self.designed.T
@@ -66,7 +66,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class GroupViews:
     """Number of photographs of a group, and the largest angle between two of their axes."""
 
     group: str
@@ -80,12 +80,12 @@ class Budget:
 
     joint: JointResult
     reference_face: str
-    sources: tuple[Source, ...]
+    sources: tuple[BudgetSource, ...]
     rows: tuple[Row, ...]
     circles_covariance_mm2: np.ndarray  # (c, 3, 3) by circle of ``joint``, target frame
-    views: tuple[View, ...]
+    views: tuple[GroupViews, ...]
     statement: Statement
-    conditions: Conditions  # for which lengths hold; their correction is not applied to the run's result
+    conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
 
     def of_kind(self, kind: Kind) -> list[Row]:
         """Returns the rows of one kind."""
@@ -104,11 +104,11 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
     stated = statement or statement_of(board.stated)
     heights, sigma_mm = run.rims_mm()
-    rims: tuple[Source, ...] = ()
+    rims: tuple[BudgetSource, ...] = ()
     if heights:
         row = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
         covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
-        rims = (Source("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance),)
+        rims = (BudgetSource("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance),)
     reference, camera_given = run.faces.reference_face, run.report["summary"].get("camera_given", True)
     return budget(
         found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
@@ -124,7 +124,7 @@ def budget(
     refined: bool,
     statement: Statement,
     reference_face: str,
-    more: tuple[Source, ...] = (),
+    more: tuple[BudgetSource, ...] = (),
     camera_given: bool = True,
 ) -> Budget:
     """Returns the budget of an adjustment, as :func:`stcal.sfm.budget.sources.sources_of`; ``more``: further rows."""
@@ -133,7 +133,7 @@ def budget(
         words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
         size, sigma_um = own.circles.shape[-1], 1e3 * own.designed_sigma_mm
         none = np.zeros((size, size))  # it moves faces, not circles
-        sources += (Source(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
+        sources += (BudgetSource(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
     rng, joint = np.random.default_rng(0), found.joint
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models)
@@ -183,7 +183,11 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
 
 
 def _row(
-    measurand: Measurand, sources: Sequence[Source], designed_sigma_mm: float, freedom: int, rng: np.random.Generator
+    measurand: Measurand,
+    sources: Sequence[BudgetSource],
+    designed_sigma_mm: float,
+    freedom: int,
+    rng: np.random.Generator,
 ) -> Row:
     covariances = {source.key: measurand.covariance(source, designed_sigma_mm) for source in sources}
     covariance = np.sum(list(covariances.values()), axis=0)
@@ -203,7 +207,7 @@ def _row(
     )
 
 
-def _view(model: MetricModel) -> View:
+def _view(model: MetricModel) -> GroupViews:
     axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
     spread = np.arccos(np.clip((axes @ axes.T).min(), -1, 1))
-    return View(model.group, len(model.images), float(np.degrees(spread)))
+    return GroupViews(model.group, len(model.images), float(np.degrees(spread)))

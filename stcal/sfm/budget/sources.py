@@ -36,14 +36,11 @@ DEFAULT = "; the default, which `design` writes too: measure it and state it"
 """Words for a σ that nobody has changed."""
 
 
-def _written(value: object) -> object:
-    """Returns a date or time of TOML as its text."""
-    if isinstance(value, datetime):
-        return value.isoformat(" ")
-    return value.isoformat() if isinstance(value, date | time) else value
-
-
-Text = Annotated[str, BeforeValidator(_written), Field(max_length=LONGEST)]
+Text = Annotated[
+    str,
+    BeforeValidator(lambda value: str(value) if isinstance(value, date | time) else value),  # as TOML has them
+    Field(max_length=LONGEST),
+]
 FieldName = Annotated[str, Field(min_length=1, max_length=60)]
 
 
@@ -122,7 +119,7 @@ REFERENCE_C = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class BudgetSource:
     """A row of the budget."""
 
     key: str  # name in files
@@ -146,16 +143,16 @@ def sources_of(
     refined: bool,  # whether its intrinsics were adjusted
     statement: Statement,
     camera_given: bool = True,  # False if the camera was found from the photographs
-) -> tuple[Source, ...]:
+) -> tuple[BudgetSource, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
     joint, covariance, sigma_px = contributions.joint, contributions.covariance_mm2, contributions.centre_sigma_px
     corners = bool(faces_of_known_shape(board))
     title, by_residuals = "corners and centres of faces" if corners else "centres of circles", "residuals; RMS per axis"
     points = ("estimated", by_residuals, sigma_px[CIRCLES], "px", covariance[CIRCLES])
-    rows = [Source("circle_centres", title, "A", *points)]
+    rows = [BudgetSource("circle_centres", title, "A", *points)]
     if board.rows:
         dots = ("estimated", by_residuals, sigma_px[DOTS], "px", covariance[DOTS])
-        rows.append(Source("dot_centres", "centres of dots", "A", *dots))
+        rows.append(BudgetSource("dot_centres", "centres of dots", "A", *dots))
         shape = f"{100 * joint.board_common:.0f} % of it common to all groups"
         origin, words = _stated_or_default(
             f"sigma_mm of board.toml × σ₀ {joint.sigma_scale:.3f}; "
@@ -163,7 +160,7 @@ def sources_of(
             board.sigma_mm == DOTS_SIGMA_MM,
         )
         sigma_um = 1e3 * board.sigma_mm * joint.sigma_scale
-        rows.append(Source("board_dots", "places of dots", "B", origin, words, sigma_um, "µm", covariance[BOARD]))
+        rows.append(BudgetSource("board_dots", "places of dots", "B", origin, words, sigma_um, "µm", covariance[BOARD]))
     rows += _own_size(contributions, board)
     if not corners or covariance[FLATNESS].any():
         rows.append(_flatness(contributions, flatness_mm))
@@ -186,7 +183,7 @@ def _stated_or_default(words: str, default: bool) -> tuple[Origin, str]:
     return ("assumed", words + DEFAULT) if default else ("stated", words)
 
 
-def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Source]:
+def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[BudgetSource]:
     """Yields the rows of faces of known shape and of known distances."""
     factor = contributions.joint.sigma_scale
     if faces := faces_of_known_shape(board):
@@ -197,7 +194,7 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
             f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness",
             within_stated == TAG_SIGMA_MM,
         )
-        yield Source(
+        yield BudgetSource(
             "print", "print of faces", "B", origin, words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
         )
         largest = max(faces, key=lambda face: face.size_sigma)
@@ -208,29 +205,31 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
         if by_statement:
             words = "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
-        yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES])
+        yield BudgetSource(
+            "print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES]
+        )
     if known := known_distances(board):
         sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
         words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
         covariance = contributions.covariance_mm2[DISTANCES]
         if known[0].drawn:
             words = "nothing of known size was in view: only the shape is known"
-            yield Source("distances", "size", "B", "not known", words, None, "µm", covariance)
+            yield BudgetSource("distances", "size", "B", "not known", words, None, "µm", covariance)
             return
-        yield Source("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
+        yield BudgetSource("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
 
 
-def _flatness(contributions: Contributions, flatness_mm: float | None) -> Source:
+def _flatness(contributions: Contributions, flatness_mm: float | None) -> BudgetSource:
     words, factor = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}", contributions.joint.sigma_scale
     row: tuple[Origin, str, float | None] = ("not stated", "--flatness off: faces need not be flat", None)
     if flatness_mm is not None:
         row = "stated", words, 1e3 * flatness_mm * factor
         if flatness_mm == FLATNESS_MM:
             row = "assumed", f"the default of {words}", row[2]
-    return Source("flatness", "flatness of faces", "B", *row, "µm", contributions.covariance_mm2[FLATNESS])
+    return BudgetSource("flatness", "flatness of faces", "B", *row, "µm", contributions.covariance_mm2[FLATNESS])
 
 
-def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
+def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
     adjusted = contributions.covariance_mm2[INTRINSICS]
     row: tuple[Literal["A", "B"], Origin, str, np.ndarray]
     if not camera_given:
@@ -244,21 +243,21 @@ def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, cam
         row = "B", "stated", "fixed; σ of the camera file", effect @ camera.covariance @ effect.T
     else:
         row = "B", "not stated", "fixed; no σ in the camera file", np.zeros_like(adjusted)
-    return Source("intrinsics", "intrinsics", *row[:3], None, "", row[3])
+    return BudgetSource("intrinsics", "intrinsics", *row[:3], None, "", row[3])
 
 
 def _stated(
     key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, effect_ppm: np.ndarray
-) -> Source:
+) -> BudgetSource:
     """Returns the row of an input that the user states; where keys are absent from the statement, it is exact.
     ``effect_ppm``: (3c,) of one σ on the circles, times a million."""
     covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)
     if absent:
-        return Source(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
-    return Source(key, title, "B", "stated", words, sigma, unit, covariance)
+        return BudgetSource(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
+    return BudgetSource(key, title, "B", "stated", words, sigma, unit, covariance)
 
 
-def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
+def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[BudgetSource]:
     """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
     warmer = warmer_k(stated)
     for key, name, needed, factor, unit in (
@@ -274,7 +273,7 @@ def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Sta
         yield _stated(f"{body}_{key}", f"{body}'s {key}", unit, absent, words, sigma, by_sigma)
 
 
-def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
+def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> BudgetSource:
     """Row of an error common to both temperatures (JCGM 100, 5.2.2, r = 1), nearly nil if bodies expand alike."""
     total, absent, sigmas = np.zeros(1), [], set()
     for body, stated, effect in bodies:
@@ -298,7 +297,7 @@ def reference_temperature_c(stated: StatedSize) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Conditions:
+class StatedConditions:
     """The temperature for which lengths and positions hold, and what they are corrected by for that."""
 
     size_known: bool  # False if nothing of known size was in view
@@ -307,41 +306,40 @@ class Conditions:
     words: str  # the same as a sentence without its stop
 
 
-def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
+def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
     """Returns the temperature for which lengths hold, and their correction for the expansion of the board and, only
     with it, of the target: that starts from the length at the photographs' temperature. A size stated of the target
     itself holds at its reference temperature (ISO 1), so that no expansion enters."""
     target = statement.target
     if any(known.drawn for known in known_distances(board)):
         words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"
-        return Conditions(False, 0.0, None, words)
+        return StatedConditions(False, 0.0, None, words)
     wanted = reference_temperature_c(target)
     if not board.rows:
         words = (
             f"Lengths and positions hold at {wanted:g} °C, as the sizes stated of the target do (ISO 1); they are its "
             "own, so that no expansion enters"
         )
-        return Conditions(True, 0.0, wanted, words)
+        return StatedConditions(True, 0.0, wanted, words)
     of_board, of_target = _growth(statement.board), _growth(target)
     if of_board is not None and of_target is not None:
         total = of_board - of_target
         words = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
-        return Conditions(True, total, wanted, f"Lengths and positions hold at {wanted:g} °C{words}")
+        return StatedConditions(True, total, wanted, f"Lengths and positions hold at {wanted:g} °C{words}")
     photographed = "the temperature at which the target was photographed"
     if target.temperature_c is not None:
         photographed = f"{target.temperature_c:g} °C, at which the target was photographed"
-    held = f"Lengths and positions hold at {photographed}"
+    words = f"Lengths and positions hold at {photographed}"
     if of_board is not None:
-        corrected = f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
-        words = f"{held}{corrected}: expansion and temperature of the target are not both stated"
-        return Conditions(True, of_board, target.temperature_c, words)
-    words = (
-        f"{held}, as far as the board's grid had the size of its file there: its expansion and temperature are not "
-        "both stated"
-    )
-    if of_target is not None:
-        words += ", and without them the target's are not corrected for"
-    return Conditions(True, 0.0, target.temperature_c, words)
+        words += f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
+        words += ": expansion and temperature of the target are not both stated"
+    else:
+        words += (
+            ", as far as the board's grid had the size of its file there: its expansion and temperature are not both "
+            "stated"
+        )
+        words += ", and without them the target's are not corrected for" if of_target is not None else ""
+    return StatedConditions(True, of_board or 0.0, target.temperature_c, words)
 
 
 def _growth(stated: StatedSize) -> float | None:

@@ -11,7 +11,7 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, parameter_names
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.json import ByName, Matrix, NamedReason, ResultFile
-from stcal.report.camera import distortion_figure
+from stcal.report.camera import field_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
@@ -194,7 +194,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     for folder, own in summary.prints.items():
         board = "the board" if folder == "." else f"the board of {folder}"
         parameters += stretch_in_words(board, own.stretch, own.shear)
-    parameters.append(plot(lambda: distortion_figure(lens), "What the lens moves"))
+    parameters.append(plot(lambda: field_figure(*moved_px(lens)), "What the lens moves"))
     uncertainty = [
         "How well it is known where the camera sees a known direction, up to a rotation of the camera, which poses "
         "absorb. White: dots",

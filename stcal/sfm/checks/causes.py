@@ -1,22 +1,26 @@
-"""Causes of the whole set: further parameters of the free networks (score test). The hypothesis that explains most of
-the squared residuals beyond chance with fewest parameters is named first."""
+"""Causes of the whole set: a table of further parameters of the free networks (score tests), of which the fewest that
+explain most of the squared residuals beyond chance are named."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtri, fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.images import summed
-from stcal.sfm.checks.verdict import FAILED, MOVED, MOVED_REMEDY, Check, Measured
+from stcal.sfm.checks.image_checks import NO_ELLIPSES, by_eccentricity, by_motion
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, apart
 from stcal.sfm.data.as_drawn import FAR_DEG, turned_faces
-from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, TestedValue
 
 EXPLAINS = 0.8
 """Smallest share of what the best hypothesis explains that another one with fewer parameters must explain."""
@@ -39,25 +43,58 @@ LEAST_SHIFT_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Cause:
+class Hypothesis:
+    """A row of the table of causes.
+
+    ``size`` : words from the estimates (q,) and their σ; ``by`` : direction (p, q) of the camera's parameters, or the
+    derivatives (n, 2, q) of the projections over σ; ``scope`` : whose parameters they are; ``whole`` : whether the
+    first one is 1 where the hypothesis is true (0 or 1 in each image), and so not free.
+    """
+
     name: str
     remedy: str
-    size: Callable[[np.ndarray, np.ndarray], str]  # its size in words, from the estimates (q,) and their σ
-    columns: Callable[[Network], np.ndarray]  # (n, 2, q) derivatives of the projections over σ
-    scope: str = "all"
-    # the first parameter is 1 where the hypothesis is true, or 0 or 1 in each image, and so not free
+    size: Callable[[np.ndarray, np.ndarray], str]
+    by: np.ndarray | Callable[[Network], np.ndarray]
+    scope: Literal["all", "group", "image"] = "all"
     whole: bool = False
-    # (p, q) derivatives of the camera's parameters; None: no matter of the camera file
-    direction: np.ndarray | None = None
+
+    def equations(self, network: Network, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the score equations of the parameters of a group, or of separate ones for each image."""
+        by, model = self.by, network.model
+        columns = by(network) if callable(by) else model.whiten(model.by_parameters(camera) @ by)
+        return network.score(apart(network, columns) if self.scope == "image" else columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fitted:
-    cause: _Cause
+class FittedCause:
+    """A hypothesis with its parameters; ``left`` : squared residuals per degree of freedom that it leaves;
+    ``probability`` : of what it explains by chance."""
+
+    cause: Hypothesis
     test: ScoreTest
-    explained: float
-    probability: float
     left: float
+    probability: float = 0.0
+
+
+def _named(
+    fitted: Sequence[FittedCause], misfit: Callable[[FittedCause], float], most: float, alike: float = 1.0
+) -> tuple[list[FittedCause], Check | None]:
+    """Returns the hypotheses with the fewest free parameters that explain the data, motions last; and their check."""
+    candidates = (
+        Candidate(f.cause.name, lambda f=f: f, (f.cause.by is _by_motion, f.test.freedom - f.cause.whole))
+        for f in fitted
+    )
+    best = [candidate.change() for candidate, _ in explain(candidates, misfit, most, alike)]
+    if not best:
+        return [], None
+    sizes = [f.cause.size(f.test.estimate, np.sqrt(np.maximum(np.diag(f.test.covariance), 0))) for f in best]
+    name, remedy = ("; or ".join(dict.fromkeys(getattr(f.cause, key) for f in best)) for key in ("name", "remedy"))
+    return best, failed_cause(name, "; or ".join(sizes), remedy, len(fitted))
+
+
+def failed_cause(name: str, reason: str, remedy: str, tested: int, names: tuple[str, ...] = ()) -> Check:
+    """Returns the failed check that names the cause of the whole set."""
+    return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), tested, names, remedy)
 
 
 def whole_set_cause(
@@ -65,44 +102,43 @@ def whole_set_cause(
 ) -> Check | None:
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals. What
     is beyond chance is what the most flexible hypothesis explains."""
-    possible = [cause for cause in _hypotheses(camera) if from_file or cause.direction is None]
-    fitted = [f for cause in possible if (f := _fit(cause, networks)) is not None]
+    possible = [cause for cause in _hypotheses(camera) if from_file or cause.scope != "all" or callable(cause.by)]
+    fitted = [f for cause in possible if (f := _fit(cause, networks, camera)) is not None]
     if not fitted:
         return None
-    richest = max(fitted, key=lambda f: f.explained)
-    most = richest.explained
+    square, redundancy = _square(networks), _redundancy(networks)
+    richest = min(fitted, key=lambda f: f.left)
+    most = square - redundancy * richest.left
     by_chance = 2 * richest.left * np.sqrt(2 * richest.test.freedom)  # two σ of what its parameters fit by chance
     enough = max(EXPLAINS * most, EXPLAINS_ALL * most - by_chance)
-    named = [
-        f
-        for f in fitted
-        if (moved or f.cause.columns is not _by_motion)
-        and f.probability * len(fitted) < FAILED
-        and f.explained >= enough
-        and _applies(f, networks)
-    ]
-    if not named:
+
+    def misfit(own: FittedCause) -> float:
+        is_possible = moved or own.cause.by is not _by_motion
+        is_certain = own.probability * len(fitted) < FAILED
+        return own.left if is_possible and is_certain and _applies(own, networks, camera) else np.inf
+
+    alike = 1 + float(chdtri(1, SUSPICIOUS)) / redundancy
+    best, check = _named(fitted, misfit, (square - enough) / redundancy, alike)
+    if check is None:
         return None
-    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom - f.cause.whole, -f.explained))
-    if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
+    first = best[0]
+    if first.cause.scope == "image" and _explained_by_one(networks, first.left) > EXPLAINS * most:
         return None  # its checks name that image
-    size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
-    square = sum(float((n.residual**2).sum()) for n in networks)
-    after = float(np.sqrt(best.left * _redundancy(networks) / square))
+    after = float(np.sqrt(first.left * redundancy / square))
     if after > most_left:
         return None
+    share = {id(f): 100 * (square - redundancy * f.left) / most for f in fitted}
+    freedom = first.test.freedom
+    parameters = "1 parameter explains" if freedom == 1 else f"{freedom} parameters explain"
     reason = (
-        f"{size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
-        f"{'s' * (best.test.freedom == 1)} {100 * best.explained / most:.0f} % of what any cause explains; residuals "
-        f"would be {after:.2f} times as large"
+        f"{check.reason}: {parameters} {share[id(first)]:.0f} % of what any cause explains; residuals would be "
+        f"{after:.2f} times as large"
     )
     measured = tuple(
-        Measured(f.cause.name, 100 * f.explained / most, None, "% explained", f.probability)
-        for f in sorted(fitted, key=lambda f: (f is not best, f.test.freedom))
+        TestedValue(f.cause.name, share[id(f)], None, "% explained", f.probability)
+        for f in sorted(fitted, key=lambda f: (f is not first, f.test.freedom))
     )
-    return Check(
-        CAUSE, f"{OF_WHOLE_SET}{best.cause.name}", "failed", reason, measured, len(fitted), (), best.cause.remedy
-    )
+    return replace(check, reason=reason, measured=measured)
 
 
 def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_model: str) -> Check | None:
@@ -113,20 +149,20 @@ def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_
     square = float(off @ weight @ off)
     fitted = []
     for cause in _hypotheses(camera):
-        if cause.direction is None:
-            continue
-        along = to_model @ cause.direction
-        test = solve_score(along.T @ weight @ along, along.T @ weight @ off)
-        if cause.whole and abs(test.estimate[0] - 1) > FILE_WITHIN + 3 * np.sqrt(test.covariance[0, 0]):
-            continue
-        if test.statistic > EXPLAINS_ALL * square:
-            fitted.append((test.freedom - cause.whole, -test.statistic, cause, test))
-    if not fitted:
+        if cause.scope == "all" and not callable(cause.by):  # what says that the file is wrong
+            along = to_model @ cause.by
+            test = solve_score(along.T @ weight @ along, along.T @ weight @ off)
+            fitted.append(FittedCause(cause, test, square - test.statistic))
+
+    def misfit(own: FittedCause) -> float:
+        within = FILE_WITHIN + 3 * np.sqrt(own.test.covariance[0, 0])
+        return np.inf if own.cause.whole and abs(own.test.estimate[0] - 1) > within else own.left
+
+    best, check = _named(fitted, misfit, (1 - EXPLAINS_ALL) * square)
+    if check is None:
         return None
-    _, explained, cause, test = min(fitted, key=lambda f: f[:2])
-    size = cause.size(test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0)))
-    share = Measured(cause.name, -100 * explained / square, None, "% explained", None)
-    return Check(CAUSE, f"{OF_WHOLE_SET}{cause.name}", "failed", size, (share,), len(fitted), (), cause.remedy)
+    share = TestedValue(best[0].cause.name, 100 * best[0].test.statistic / square, None, "% explained", None)
+    return replace(check, measured=(share,))
 
 
 def cause_of_drawing(target_from_face: Mapping[str, Rigid], design: TargetDesign) -> Check | None:
@@ -137,10 +173,13 @@ def cause_of_drawing(target_from_face: Mapping[str, Rigid], design: TargetDesign
     far = tuple(face for face, angle in turned.items() if angle > FAR_DEG)
     if not far:
         return None
-    name = f"face {', '.join(far)} is not where its rough_pose has it"
-    reason = f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name"
-    remedy = "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose"
-    return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(rough), far, remedy)
+    return failed_cause(
+        f"face {', '.join(far)} is not where its rough_pose has it",
+        f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name",
+        "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose",
+        len(rough),
+        far,
+    )
 
 
 OTHER_SIZE = 0.02
@@ -162,10 +201,12 @@ def cause_of_size(
     ratio = float(np.median(ratios)) if ratios else 1.0
     if board is None or abs(ratio - 1) < OTHER_SIZE:
         return None
-    name = f"the board in board.toml is {ratio:.4g} times as large as the drawing in target.toml has the faces"
-    reason = f"{len(ratios)} faces agree; they would fit a pitch of {board.pitch_mm / ratio:.4g} mm"
-    remedy = "measure the board over its full length with a calliper; correct pitch_mm, or the target's drawing"
-    return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(ratios), (), remedy)
+    return failed_cause(
+        f"the board in board.toml is {ratio:.4g} times as large as the drawing in target.toml has the faces",
+        f"{len(ratios)} faces agree; they would fit a pitch of {board.pitch_mm / ratio:.4g} mm",
+        "measure the board over its full length with a calliper; correct pitch_mm, or the target's drawing",
+        len(ratios),
+    )
 
 
 MOST_SHARE = 1 / 3
@@ -176,86 +217,64 @@ def _redundancy(networks: Sequence[Network]) -> float:
     return float(sum(n.redundancy.sum() for n in networks))
 
 
-def _fit(cause: _Cause, networks: Sequence[Network]) -> _Fitted | None:
+def _square(networks: Sequence[Network]) -> float:
+    return sum(float((n.residual**2).sum()) for n in networks)
+
+
+def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> FittedCause | None:
     """Returns the hypothesis fitted to all networks; None if it cannot be."""
+    if cause.scope == "image" and max(len(n.model.images) for n in networks) > MOST_IMAGES:
+        return None
+    equations = [cause.equations(network, camera) for network in networks]
     if cause.scope == "all":
-        test = solve_score(*summed(networks, cause.columns))
+        normal, right = zip(*equations, strict=True)
+        test = solve_score(np.sum(normal, axis=0), np.sum(right, axis=0))
     else:
-        if cause.scope == "image" and max(len(n.model.images) for n in networks) > MOST_IMAGES:
-            return None
-        tests = [solve_score(*n.score(_apart(cause, n))) for n in networks]
-        test = _together(tests)
+        tests = [solve_score(*own) for own in equations]
+        test = ScoreTest(
+            np.concatenate([t.estimate for t in tests]),
+            np.asarray(block_diag(*(t.covariance for t in tests))),
+            sum(t.statistic for t in tests),
+            sum(t.freedom for t in tests),
+        )
     redundancy = _redundancy(networks)
-    square = sum(float((n.residual**2).sum()) for n in networks)
     rest = redundancy - test.freedom
-    left = (square - test.statistic) / rest if rest > 0 else 0.0
+    left = (_square(networks) - test.statistic) / rest if rest > 0 else 0.0
     if not test.freedom or left <= 0 or test.freedom > MOST_SHARE * redundancy:
         return None
-    probability = float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left))
-    return _Fitted(cause, test, test.statistic - test.freedom * left, probability, left)
+    return FittedCause(cause, test, left, float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left)))
 
 
-def _apart(cause: _Cause, network: Network) -> np.ndarray:
-    """Returns the columns with separate parameters for each image, or for the group."""
-    columns = cause.columns(network)
-    if cause.scope == "group":
-        return columns
-    n, _, q = columns.shape
-    images = len(network.model.images)
-    apart = np.zeros((n, 2, images, q))
-    apart[np.arange(n), :, network.model.image_index] = columns
-    return apart.reshape(n, 2, images * q)
-
-
-def _together(tests: Sequence[ScoreTest]) -> ScoreTest:
-    sizes = [len(t.estimate) for t in tests]
-    covariance = np.zeros((sum(sizes), sum(sizes)))
-    for end, size, test in zip(np.cumsum(sizes), sizes, tests, strict=True):
-        covariance[end - size : end, end - size : end] = test.covariance
-    return ScoreTest(
-        np.concatenate([t.estimate for t in tests]),
-        covariance,
-        sum(t.statistic for t in tests),
-        sum(t.freedom for t in tests),
-    )
-
-
-def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
+def _applies(fitted: FittedCause, networks: Sequence[Network], camera: Camera) -> bool:
     """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, or in each image 1 or 0,
     groups differ, and a few images do not explain it alone."""
-    estimate = fitted.test.estimate
-    if fitted.cause.whole and fitted.cause.scope == "all":
+    cause, estimate, variance = fitted.cause, fitted.test.estimate, np.diag(fitted.test.covariance)
+    if cause.whole and cause.scope == "all":
         return bool(abs(estimate[0] - 1) < FIXED_WITHIN)
-    if fitted.cause.whole:
-        sigma = np.sqrt(fitted.left * np.diag(fitted.test.covariance))
-        if (np.abs(estimate - (estimate > 0.5)) > FIXED_WITHIN + 3 * sigma).any():
-            return False
-    if fitted.cause.scope == "group":
-        away = (estimate - np.median(estimate)) ** 2 / np.maximum(np.diag(fitted.test.covariance), 1e-300)
+    if cause.whole and (np.abs(estimate - (estimate > 0.5)) > FIXED_WITHIN + 3 * np.sqrt(fitted.left * variance)).any():
+        return False
+    if cause.scope == "group":
+        away = (estimate - np.median(estimate)) ** 2 / np.maximum(variance, 1e-300)
         return len(networks) > 1 and bool((away > fitted.left * chdtri(1, FAILED)).any())
-    if fitted.cause.scope == "image" and fitted.cause.columns is not _by_motion:
-        few = _explained_by_few(fitted, networks)
-        return few < ALONE * fitted.test.statistic
+    if cause.scope == "image" and cause.by is not _by_motion:
+        return _explained_by_few(cause, networks, camera) < ALONE * fitted.test.statistic
     return True
 
 
-def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
+def _explained_by_few(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> float:
     """Returns how much the parameters of a quarter of the images explain, of the images that explain most."""
-    equations = [network.score(_apart(fitted.cause, network)) for network in networks]
-    gains = []
-    for i, (network, (normal, right)) in enumerate(zip(networks, equations, strict=True)):
-        q = len(right) // len(network.model.images)
-        for k in range(len(network.model.images)):
-            own = slice(q * k, q * k + q)
-            gains.append((solve_score(normal[own, own], right[own]).statistic, i, np.arange(q * k, q * k + q)))
-    gains.sort(key=lambda gain: -gain[0])
-    few = gains[: max(round(FEW * len(gains)), 1)]
-    explained = 0.0
-    for i, (normal, right) in enumerate(equations):
-        if columns := [own for _, j, own in few if j == i]:
-            own = np.concatenate(columns)
-            explained += solve_score(normal[np.ix_(own, own)], right[own]).statistic
-    return explained
+    equations = [cause.equations(network, camera) for network in networks]
+    q = len(equations[0][1]) // len(networks[0].model.images)
+
+    def explained(group: int, images: Sequence[int]) -> float:
+        normal, right = equations[group]
+        own = (q * np.array(images)[:, None] + np.arange(q)).ravel()
+        return solve_score(normal[np.ix_(own, own)], right[own]).statistic
+
+    images = [(i, k) for i, network in enumerate(networks) for k in range(len(network.model.images))]
+    images.sort(key=lambda image: -explained(image[0], [image[1]]))
+    few = sorted(images[: max(round(FEW * len(images)), 1)])
+    return sum(explained(i, [k for _, k in own]) for i, own in groupby(few, lambda image: image[0]))
 
 
 def _explained_by_one(networks: Sequence[Network], left: float) -> float:
@@ -284,88 +303,76 @@ def _listed(names: Sequence[str]) -> Size:
     return lambda value, _: ", ".join(f"{name} {v:+.2g}" for name, v in zip(names, value, strict=True))
 
 
+def _of_distortion(more: Size = lambda *_: "") -> Size:
+    return lambda value, sigma: (
+        f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is not in them{more(value, sigma)}"
+    )
+
+
 ANEW = "calibrate the camera again with this lens, zoom and focus, or run with --refine-camera"
+AS_RECORDED = "use them as the sensor recorded them, without the rotation that a viewer or converter applied"
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def _hypotheses(camera: Camera) -> list[_Cause]:
+def _hypotheses(camera: Camera) -> list[Hypothesis]:
     """Returns the causes that a set of photographs may have as a whole."""
-    fx, fy = camera.focal
-    cx, cy = camera.centre
+    (fx, fy), (cx, cy) = camera.focal, camera.centre
     unit = np.eye(len(camera.parameters()))
     focal = fx * unit[:, [0]] + fy * unit[:, [1]]
     scaled = focal + (cx + 0.5) * unit[:, [2]] + (cy + 0.5) * unit[:, [3]]
     removed = -camera.parameters()[:, None] * (np.arange(len(unit)) > 3)[:, None]
-
-    def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
-        return lambda network: network.model.whiten(network.model.by_parameters(camera) @ direction)
-
-    def of_file(name: str, remedy: str, size: Size, direction: np.ndarray, whole: bool = False) -> _Cause:
-        return _Cause(name, remedy, size, by(direction), whole=whole, direction=direction)
-
     causes = [
-        of_file("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
-               f"file belongs to another lens: {ANEW}", _percent("focal length"), focal),
-        of_file("the photographs are scaled relative to the camera file", "use the photographs at the size of the "
-               "calibration, or scale focal length and principal point in the camera file by the same factor",
-               _percent("size"), scaled),
-        of_file("width and height are scaled differently", "the photographs were resized without keeping their "
-               "proportions, or fx and fy of the camera file are wrong: use the original photographs",
-               _percent("fx over fy"), fx * unit[:, [0]]),
-        of_file("the principal point is not that of the camera file", "the photographs are cropped, or from another "
-               f"sensor: use them uncropped, or correct cx and cy in the camera file; or {ANEW}",
-               _listed(("cx", "cy")), unit[:, 2:4]),
-        of_file("the distortion is not that of the camera file", f"another lens or focus, or its signs or order are "
-               f"wrong in the file: {ANEW}", _listed(("k1", "k2", "p1", "p2")), unit[:, 4:8]),
-        of_file("the intrinsics are not those of the camera file", f"the camera file belongs to another camera: {ANEW}",
-               _listed(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")), unit[:, :8]),
-        _Cause("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom and "
-               "focus, and take the photographs again; or run each group with a camera file of its own",
-               _spread("focal lengths"), by(focal), "group"),
-        _Cause("zoom or focus changed from image to image", "the focal length differs from image to image: turn "
-               "autofocus and stabiliser off, and take the photographs again", _spread("focal lengths"), by(focal),
-               "image"),
-        _Cause("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, or "
-               "stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
-        _Cause("the centres are not those of ellipses (eccentricity)", "the measured centres do not move as those of "
-               "ellipses: check radii, polarity and exposure; centroids of grey values or of contours need another "
-               "correction", lambda value, sigma: f"{1 + value[0]:.3f} ± {sigma[0]:.2g} of the eccentricity found",
-               lambda network: network.model.whiten(network.model.shift_px[:, :, None])),
-        _Cause(MOVED, MOVED_REMEDY, lambda value, _: "in more than one image", _by_motion, "image"),
+        Hypothesis("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or "
+                   f"the file belongs to another lens: {ANEW}", _percent("focal length"), focal),
+        Hypothesis("the photographs are scaled relative to the camera file", "use the photographs at the size of the "
+                   "calibration, or scale focal length and principal point in the camera file by the same factor",
+                   _percent("size"), scaled),
+        Hypothesis("width and height are scaled differently", "the photographs were resized without keeping their "
+                   "proportions, or fx and fy of the camera file are wrong: use the original photographs",
+                   _percent("fx over fy"), fx * unit[:, [0]]),
+        Hypothesis("the principal point is not that of the camera file", "the photographs are cropped, or from another "
+                   f"sensor: use them uncropped, or correct cx and cy in the camera file; or {ANEW}",
+                   _listed(INTRINSICS[2:4]), unit[:, 2:4]),
+        Hypothesis("the distortion is not that of the camera file", "another lens or focus, or its signs or order are "
+                   f"wrong in the file: {ANEW}", _listed(INTRINSICS[4:]), unit[:, 4:8]),
+        Hypothesis("the intrinsics are not those of the camera file", "the camera file belongs to another camera: "
+                   f"{ANEW}", _listed(INTRINSICS), unit[:, :8]),
+        Hypothesis("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom "
+                   "and focus, and take the photographs again; or run each group with a camera file of its own",
+                   _spread("focal lengths"), focal, "group"),
+        Hypothesis("zoom or focus changed from image to image", "the focal length differs from image to image: turn "
+                   "autofocus and stabiliser off, and take the photographs again", _spread("focal lengths"), focal,
+                   "image"),
+        Hypothesis("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, "
+                   "or stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
+        Hypothesis("the centres are not those of ellipses (eccentricity)", NO_ELLIPSES, lambda value, sigma:
+                   f"{1 + value[0]:.3f} ± {sigma[0]:.2g} of the eccentricity found", by_eccentricity),
+        Hypothesis(MOVED, MOVED_REMEDY, lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
-        causes.append(
-            of_file("the photographs are already undistorted", "the camera file has a distortion that they no longer "
-                   "have: use the original photographs, or set the distortion in the camera file to 0",
-                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
-                   "not in them", removed, whole=True)
-        )  # fmt: skip
-        causes.append(
-            of_file("the photographs are already undistorted, with another camera matrix", "give the original "
-                   "photographs, or a camera file with the matrix that they were undistorted to, and a distortion of 0",
-                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
-                   f"not in them, {_listed(('fx', 'fy', 'cx', 'cy'))(value[1:], sigma[1:])}",
-                   np.hstack([removed, unit[:, :4]]), whole=True)
-        )  # fmt: skip
-        causes.append(
-            of_file("the distortion of the camera file has its sign reversed", "the program that wrote it undistorts "
-                   "where this one distorts: change the signs of all coefficients in the camera file",
-                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
-                   2 * removed, whole=True)
-        )  # fmt: skip
+        causes += [
+            Hypothesis("the photographs are already undistorted", "the camera file has a distortion that they no "
+                       "longer have: use the original photographs, or set the distortion in the camera file to 0",
+                       _of_distortion(), removed, whole=True),
+            Hypothesis("the photographs are already undistorted, with another camera matrix", "give the original "
+                       "photographs, or a camera file with the matrix that they were undistorted to, and a distortion "
+                       "of 0", _of_distortion(lambda v, s: f", {_listed(INTRINSICS[:4])(v[1:], s[1:])}"),
+                       np.hstack([removed, unit[:, :4]]), whole=True),
+            Hypothesis("the distortion of the camera file has its sign reversed", "the program that wrote it "
+                       "undistorts where this one distorts: change the signs of all coefficients in the camera file",
+                       lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way", 2 * removed,
+                       whole=True),
+        ]  # fmt: skip
     for quarters in (1, 2, 3) if camera.width == camera.height else (2,):
-        turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
+        turned = (_turned(camera, quarters) - camera.parameters())[:, None]
         if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
-            causes.append(
-                of_file(f"the photographs are turned by {90 * quarters}° relative to the camera file", "use "
-                       "them as the sensor recorded them, without the rotation that a viewer or converter applied",
-                       lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", turned, whole=True)
-            )  # fmt: skip
-            causes.append(
-                _Cause(f"some photographs are turned by {90 * quarters}° relative to the others", "use them as the "
-                       "sensor recorded them, without the rotation that a viewer or converter applied",
-                       lambda value, _: f"{(value > 0.5).sum()} of {len(value)} are turned", by(turned), "image",
-                       whole=True)
-            )  # fmt: skip
+            by = f"turned by {90 * quarters}° relative to the"
+            causes += [
+                Hypothesis(f"the photographs are {by} camera file", AS_RECORDED,
+                           lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", turned, whole=True),
+                Hypothesis(f"some photographs are {by} others", AS_RECORDED,
+                           lambda value, _: f"{(value > 0.5).sum()} of {len(value)} are turned", turned, "image", True),
+            ]  # fmt: skip
     return causes
 
 
@@ -387,9 +394,5 @@ def _by_row(network: Network) -> np.ndarray:
 
 
 def _by_motion(network: Network) -> np.ndarray:
-    """Returns the columns of a motion of all faces against the board."""
-    model = network.model
-    on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
-    arm = model.xyz_model[model.point_index] - model.xyz_model.mean(0)
-    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-    return network.by_point @ (motion * on_face[model.point_index][:, None, None])
+    """Returns the columns of a motion of all faces against the board, about the middle of all points."""
+    return by_motion(network, network.model.xyz_model.mean(0))

@@ -1,6 +1,7 @@
 """All checks of a run. Each tests for an error that small residuals may hide."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,45 +26,18 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
-from stcal.sfm.checks.board import (
-    KINDS,
-    board_checks,
-    measure_radii,
-    pitch_check,
-    radius_checks,
-    rim_check,
-    rim_limit_mm,
-)
+from stcal.sfm.checks import board_checks, face_checks, image_checks
 from stcal.sfm.checks.causes import whole_set_cause
-from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
-from stcal.sfm.checks.images import (
-    camera_check,
-    evenness_check,
-    field_check,
-    image_check,
-    labels_check,
-    moved_check,
-    sharpness_check,
-    sigma_check,
-    summed,
-)
-from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
+from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
-JOINT = (
-    ("agreement", "Groups, board and faces against one another"),
-    ("halves", "Two halves of the images against each other"),
-    ("groups", "The result without each group"),
-    ("loops", "Ways to a face through different groups"),
-)
+JOINT = ("agreement", "halves", "groups", "loops")
 """Checks that need the joint result and its covariances."""
-CONTROL = "Uncorrected control"
-GROUPS, BESIDE_A_GROUP = "groups", 0.9
-"""Check that names a group without which all is well, and largest factor on the residuals that a cause of the whole set
-may leave to be named in place of that group."""
+BESIDE_A_GROUP = 0.9
+"""Largest factor on the residuals that a cause of the whole set may leave to be named in place of a group without which
+all is well."""
 MICRO = 1e3
-IN_PAIRS = 2
-"""Number of functions that make two checks each: of the board, and of the radii."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,14 +90,14 @@ def shows_rim(evidence: Evidence) -> bool:
     if evidence.calibration.joint is None or evidence.target.rim_of():
         return False
     rims, sigma_mm, _ = _rims(evidence)
-    return "circles" in rims and rims["circles"].height_mm > rim_limit_mm(rims["circles"], sigma_mm)
+    return "circles" in rims and rims["circles"].height_mm > board_checks.rim_limit_mm(rims["circles"], sigma_mm)
 
 
 def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check) -> dict[Label, float]:
     """Heights of the rims in front of circles and dots: estimated if allowed for or found, else as stated."""
     stated = {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
     of_label = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
-    found = {kind for kind in rims if evidence.rim or KINDS[kind][0] in check.names}
+    found = {kind for kind in rims if evidence.rim or board_checks.KINDS[kind][0] in check.names}
     return {k: rims[kind].height_mm if kind in found else stated.get(k, 0.0) for k, kind in of_label.items()}
 
 
@@ -132,44 +106,45 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     rims, sigma_mm, allowed = _rims(evidence)
-    of_rims = rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
+    of_rims = board_checks.rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
     before_mm = _before_circles_mm(evidence, rims, of_rims)
-    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
+    radii = board_checks.measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
     joint, known_faces = calibration.joint, {face.id for face in faces_of_known_shape(board)}
     factors = (1.0, 1.0) if joint is None else (joint.print_factor, joint.bend_factor)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
-        lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
-        lambda: field_check(networks, camera),
-        lambda: sigma_check(networks, calibration.sigma_factors.all),
+        lambda: image_checks.camera_check(
+            networks, evidence.camera, calibration, evidence.prior, evidence.camera_given
+        ),
+        lambda: image_checks.field_check(networks, camera),
+        lambda: image_checks.sigma_check(networks, calibration.sigma_factors.all),
         *_joint_checks(evidence, networks),
-        lambda: moved_check(networks),
-        lambda: image_check(networks),
-        lambda: sharpness_check(networks, evidence.blur_px),
-        lambda: evenness_check(networks, evidence.images, camera, bool(evidence.radius_mm())),
-        lambda: labels_check(networks, evidence.outliers, evidence.images, camera),
-        lambda: board_checks(networks, board),
-        lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
-        lambda: radius_checks(radii),
+        lambda: image_checks.moved_check(networks),
+        lambda: image_checks.image_check(networks),
+        lambda: image_checks.sharpness_check(networks, evidence.blur_px),
+        lambda: image_checks.evenness_check(networks, evidence.images, camera, bool(evidence.radius_mm())),
+        lambda: image_checks.labels_check(networks, evidence.outliers, evidence.images, camera),
+        lambda: board_checks.board_checks(networks, board),
+        lambda: board_checks.pitch_check(calibration.target, target, radii, bool(board.rows)),
+        lambda: board_checks.radius_checks(radii),
         lambda: of_rims,
-        lambda: flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
+        lambda: face_checks.flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
         lambda: control_check(evidence, networks),
     )
     if isinstance(board, ScaleReference):  # the target tells its size itself
         makers += (lambda: scales_check(networks, board, factors[0]),)
-    step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
+    step = counted(progress or (lambda *_: None), "check", len(makers))
     checks: list[Check] = []
     for make in makers:
         result = make()
-        for check in [result] if isinstance(result, Check) else result:
-            checks.append(check)
-            step(None)
-    failed = any(check.verdict == "failed" for check in checks)
-    moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
-    # A group without which all is well is the cause, unless another one explains far more than chance of the residuals.
-    of_group = any(check.key == GROUPS and check.verdict == "failed" and len(check.names) == 1 for check in checks)
-    most_left = BESIDE_A_GROUP if of_group else 1.0
+        checks += [result] if isinstance(result, Check) else result
+        step(None)
+    failed = {check.key: check for check in checks if check.verdict == "failed"}
     cause = evidence.cause
     if cause is None and any(check.verdict in ("failed", "suspicious") for check in checks):
+        moved = "moved" in failed and not failed["moved"].names
+        # A group without which all is well is the cause, unless another one explains far more of the residuals.
+        of_group = "groups" in failed and len(failed["groups"].names) == 1
+        most_left = BESIDE_A_GROUP if of_group else 1.0
         cause = whole_set_cause(networks, camera, moved, evidence.camera_given, most_left)
         cause = replace(cause, verdict="failed" if failed else "suspicious") if cause else None
     return (cause, *checks) if cause else tuple(checks)
@@ -178,58 +153,47 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[[], Check]]:
     joint = evidence.calibration.joint
     if not evidence.calibration.target.target_from_face:
-        return [partial(impossible, key, title, "the board alone, no face", "") for key, title in JOINT]
+        return [partial(impossible, key, "the board alone, no face", "") for key in JOINT]
     if joint is None:
         reason = "needs the covariances of the joint adjustment"
-        return [partial(impossible, key, title, reason, "run with --solve joint") for key, title in JOINT]
-    again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
+        return [partial(impossible, key, reason, "run with --solve joint") for key in JOINT]
+    again = face_checks.Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
     linked = {model.group for model in joint.models}
     linked_networks = [n for n in networks if n.model.group in linked]
     return [
-        partial(agreement_check, joint, linked_networks),
-        partial(halves_check, again),
-        partial(groups_check, again, linked_networks),
-        partial(loops_check, again),
+        partial(face_checks.agreement_check, joint, linked_networks),
+        partial(face_checks.halves_check, again),
+        partial(face_checks.groups_check, again, linked_networks),
+        partial(face_checks.loops_check, again),
     ]
 
 
 def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     """Compares the run with a control without eccentricity, chained with three-point frames, and tests the correction:
     a factor on it is 1 up to chance, and 0 if the centres are not those of ellipses."""
-    key = "control"
     if not evidence.radius_mm():
-        return impossible(key, CONTROL, "corners alone, which have no eccentricity", "")
+        return impossible("control", "corners alone, which have no eccentricity", "")
     if not evidence.options.eccentricity:
-        return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
+        return impossible("control", "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
-        return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
+        return impossible("control", "no circle is in the result", "add views of the faces with circles")
+    test = solve_score(*image_checks.summed(networks, image_checks.by_eccentricity))
     if not test.freedom:
-        return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
+        return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy = sum(n.redundancy.sum() for n in networks)
-    remedy = (
-        "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
-        "values or of contours need another correction"
-    )
-    trial = Trial(
-        "share of the eccentricity found, minus 1",
-        float(test.estimate[0]),
-        "",
-        test.statistic,
-        test.freedom,
-        redundancy,
-    )
-    check = judge(key, CONTROL, [trial], "corrections", remedy)
+    share = float(test.estimate[0])
+    trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
+    check = assess("control", [trial], "corrections", image_checks.NO_ELLIPSES)
     try:
         whole = evidence.calibration.target.target_from_face
         message, measured = _control(evidence) if whole else ("no face that it could move", ())
     except StcalError as error:
         message, measured = f"no uncorrected result ({error})", ()
-    reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
+    reason = f"{1 + share:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
     return replace(check, reason=reason, measured=check.measured + measured)
 
 
-def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
+def _control(evidence: Evidence) -> tuple[str, tuple[TestedValue, ...]]:
     camera, whole = evidence.calibration.camera, evidence.calibration.target
     models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
     options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
@@ -241,7 +205,7 @@ def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
     }
     rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
     rows = tuple(
-        Measured(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
+        TestedValue(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
     )
     largest = max(shifts.values(), default=0.0)
     return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", rows
@@ -255,58 +219,45 @@ MOST_PRINT_FACTOR = 10.0
 """Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Source:
-    """A source of the scale."""
-
-    name: str
-    log_scale: float  # of the model over the known size
-    gradient: np.ndarray  # (3p,) of ``log_scale`` by the points
-    variance: float  # of the known size
-
-
 def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: float) -> Check:
     """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
-    key, title = "scales", "Scales against one another"
+    key, (title, _) = "scales", CHECKS["scales"]
     remedy = (
         "one print, distance or board has another size than stated: measure a side of each print and correct "
         "target.toml, or state size_sigma_mm"
     )
+    name, times = _alone(networks, board) or ("", 1.0)
+    fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
     if print_factor > MOST_PRINT_FACTOR:
         # σ that have grown so much would hide the contradiction that made them grow.
-        measured = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
-        if alone := _alone(networks, board):
-            name, times = alone
-            reason = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
-            size = Measured(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
-            return Check(key, title, "failed", reason, (size, measured), 1, (name,), f"correct the size of {name}")
+        grown = TestedValue("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        if name:
+            size = TestedValue(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
+            return Check(key, title, "failed", fits, (size, grown), 1, (name,), f"correct the size of {name}")
         why = "the size or drawing of the print is another one, or its σ too small"
-        reason = f"{measured.name} at {measured.words()}: {why}"
-        return Check(key, title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
+        reason = f"{grown.name} at {grown.words()}: {why}"
+        return Check(key, title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
     trials: list[Trial] = []
     for network in networks:
-        sources = _sources(network, board, print_factor)
-        if len(sources) < 2:
+        names, log_scale, gradient, variance = _sources(network, board, print_factor)
+        if len(names) < 2:
             continue
-        gradient = np.array([source.gradient for source in sources])
-        value = np.array([source.log_scale for source in sources])
-        own = np.diag([source.variance for source in sources])
-        covariance = gradient @ network.covariance_mm2 @ gradient.T + own
+        covariance = gradient @ network.covariance_mm2 @ gradient.T + np.diag(variance)
         weight = np.linalg.inv(covariance)
-        mean = float(weight.sum(0) @ value / weight.sum())
-        away = value - mean
+        away = log_scale - float(weight.sum(0) @ log_scale / weight.sum())
         spread = np.diag(covariance) - 1 / weight.sum()
         freedom = float(network.redundancy.sum())
-        for source, off, variance in zip(sources, away.tolist(), spread.tolist(), strict=True):
-            if variance > 0:
-                trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
+        trials += [
+            Trial(source, PPM * off, "ppm", off**2 / own, 1, freedom)
+            for source, off, own in zip(names, away.tolist(), spread.tolist(), strict=True)
+            if own > 0
+        ]
     if not trials:
-        return impossible(key, title, "only one source of the scale", "state a known distance with scale")
-    check = judge(key, title, trials, "sources of the scale", remedy)
-    if check.names and (alone := _alone(networks, board)):
-        name, times = alone
-        size = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
-        return replace(check, reason=f"{size}; {check.reason}", names=(name,), remedy=f"correct the size of {name}")
+        return impossible(key, "only one source of the scale", "state a known distance with scale")
+    check = assess(key, trials, "sources of the scale", remedy)
+    if check.names and name:
+        reason = f"{fits}; {check.reason}"
+        return replace(check, reason=reason, names=(name,), remedy=f"correct the size of {name}")
     return check
 
 
@@ -314,10 +265,9 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
     """Returns the one source that contradicts all others, which agree, and its size over the stated one."""
     off: dict[str, list[float]] = {}
     for network in networks:
-        sources = _sources(network, board, 1.0)
-        middle = float(np.median([source.log_scale for source in sources])) if sources else 0.0
-        for source in sources:
-            off.setdefault(source.name, []).append(source.log_scale - middle)
+        names, log_scale, *_ = _sources(network, board, 1.0)
+        for name, value in zip(names, (log_scale - np.median(log_scale)).tolist() if names else (), strict=True):
+            off.setdefault(name, []).append(value)
     ratio = {name: float(np.median(values)) for name, values in off.items()}
     if len(ratio) < LEAST_AGREEING + 1:
         return None
@@ -326,7 +276,11 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
     return (name, float(np.exp(ratio[name]))) if abs(ratio[name]) > max(ALONE, FAR * others) else None
 
 
-def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[_Source]:
+def _sources(
+    network: Network, board: BoardDesign, print_factor: float
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the s sources of the scale: their names, the logarithm of the model's scale over the known size (s,), its
+    gradient by the points (s, 3p), and the variance of the known size (s,)."""
     model = network.model
     parts = [
         (f"face {face.id}", members, face.places_mm(model.labels[i].circle for i in members),
@@ -336,28 +290,27 @@ def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     if len(dots) >= MIN_DOTS:
         parts.append(("board", dots, board.places_mm(model.labels[i] for i in dots), board.sigma_mm, 0.0))
-    sources = []
+    names, values, gradients = [], [], []
     for name, members, design, sigma_mm, size_sigma in parts:
-        try:
+        with suppress(DegenerateError):
             found = align_similarity(model.xyz_model[members], design)
-        except DegenerateError:
-            continue
-        middle = design - design.mean(0)
-        square = float((middle**2).sum())
-        gradient = np.zeros((len(model.labels), 3))
-        gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
-        variance = sigma_mm**2 / square + size_sigma**2
-        sources.append(_Source(name, float(np.log(found.scale)), gradient.ravel(), variance))
+            middle = design - design.mean(0)
+            square = float((middle**2).sum())
+            gradient = np.zeros((len(model.labels), 3))
+            gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
+            names.append(name)
+            values.append((np.log(found.scale), sigma_mm**2 / square + size_sigma**2))
+            gradients.append(gradient.ravel())
     place = {label: i for i, label in enumerate(model.labels)}
     for known in known_distances(board):
         if known.first in place and known.second in place:
             i, j = place[known.first], place[known.second]
             apart = model.xyz_model[i] - model.xyz_model[j]
-            length = float(np.linalg.norm(apart))
             gradient = np.zeros((len(model.labels), 3))
-            gradient[i], gradient[j] = apart / length**2, -apart / length**2
-            name = f"distance {known.first} to {known.second}"
-            sources.append(
-                _Source(name, float(np.log(length / known.mm)), gradient.ravel(), (known.sigma_mm / known.mm) ** 2)
-            )
-    return sources
+            gradient[i] = apart / float(apart @ apart)
+            gradient[j] = -gradient[i]
+            names.append(f"distance {known.first} to {known.second}")
+            values.append((np.log(np.linalg.norm(apart) / known.mm), (known.sigma_mm / known.mm) ** 2))
+            gradients.append(gradient.ravel())
+    log_scale, variance = np.array(values).reshape(-1, 2).T
+    return names, log_scale, np.array(gradients), variance

@@ -184,21 +184,24 @@ def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray,
 
 
 def missed_notes(missed: dict[Label, str]) -> list[str]:
-    """Returns one note for each face, and one for the board, on circles that were expected in view and not measured."""
-    notes = []
-    for plane in dict.fromkeys(label.plane for label in missed):
-        place, rows = (
-            "board" if plane == BOARD else f"face {plane}",
-            [label for label in missed if label.plane == plane],
-        )
-        others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(f"{place}: {rows[0]}{others} should be in view and not measured; {rows[0]}: {missed[rows[0]]}")
-    return notes
+    """Returns notes on circles that were expected in view and not measured."""
+    return _by_plane(missed, "should be in view and not measured")
 
 
 def contradicted_notes(found: dict[Label, str]) -> list[str]:
-    """Returns one note for each circle."""
-    return [f"{label}: {reason}; partly hidden or something else, left out" for label, reason in found.items()]
+    """Returns notes on circles that contradict the others."""
+    return _by_plane(found, "left out, partly hidden or something else")
+
+
+def _by_plane(reasons: dict[Label, str], what: str) -> list[str]:
+    """Returns one note for each face, and one for the board, on circles with the reason of the first one."""
+    notes = []
+    for plane in dict.fromkeys(label.plane for label in reasons):
+        place = "board" if plane == BOARD else f"face {plane}"
+        first, *more = [label for label in reasons if label.plane == plane]
+        others = f" and {len(more)} more" if more else ""
+        notes.append(f"{place}: {first}{others} {what}; {first}: {reasons[first]}")
+    return notes
 
 
 SEARCH = 5.0

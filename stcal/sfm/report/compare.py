@@ -1,9 +1,10 @@
 """Comparison of a result with the truth, or with another result."""
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,7 +16,7 @@ from stcal.io.files import MODEL_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import FARTHEST, LENGTHS, csv_rows, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
-from stcal.report.text import NONE, number, text_table
+from stcal.report.text import NONE, cells, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
@@ -35,7 +36,7 @@ MOST_LISTED = 20
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
 
 
-class Answer(Part):
+class ComparedFaces(Part):
     """Content of ``faces.json`` that is compared."""
 
     format: Literal["stcal faces 1"] = "stcal faces 1"
@@ -132,10 +133,15 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         A file is missing or has another form, the reference faces differ, or one of both is in another unit.
     """
     run = Path(run)
-    answer = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
+    answer = read_result(run / FACES if run.is_dir() else run, ComparedFaces, "run", REMEDY)
     known = read_result(truth, TruthFile, "truth", REMEDY)
     for where, circles in ((run, answer.circles), (truth, known.circles)):
-        _require_near(str(where), circles)
+        for label, place in circles.items():
+            if (far := max(map(abs, place))) > FARTHEST:  # its square would overflow
+                raise InputError(
+                    "E-VALUE-TOO-FAR",
+                    f"{where}: circles.{label}: a length of {far:.3g}, up to {FARTHEST:g} possible; correct it",
+                )
     if answer.reference_face != known.reference_face:
         raise InputError(
             "E-COMPARE-REFERENCE",
@@ -147,19 +153,13 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
             "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
         )
     _require_one_unit(f"run {run}, truth {truth}", answer, known)
-    faces = {
-        face_id: _face(face_id, answer, known)
-        for face_id in known.target_from_face
-        if face_id in answer.target_from_face
-    }
+    faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None
     if run.is_dir() and known.groups:
         own = next((run / name for name in LABELS if (run / name).exists()), run / LABELS[0])
         labels = _labels(own, known.circles, known.groups)
-    worst = {
-        name: max((value for errors in faces.values() if (value := getattr(errors, name)) is not None), default=None)
-        for name in LargestErrors.model_fields
-    }
+    errors = {name: [getattr(face, name) for face in faces.values()] for name in LargestErrors.model_fields}
+    worst = {name: max((v for v in values if v is not None), default=None) for name, values in errors.items()}
     return CompareFile(
         reference_face=known.reference_face,
         faces=faces,
@@ -235,17 +235,7 @@ def _pose_errors(found: Rigid, true: Rigid, covariance: np.ndarray | None) -> Po
     )
 
 
-def _require_near(where: str, circles: Mapping[str, Vector3]) -> None:
-    """Refuses places so far away that their squares would overflow."""
-    for label, place in circles.items():
-        if (far := max(map(abs, place))) > FARTHEST:
-            raise InputError(
-                "E-VALUE-TOO-FAR",
-                f"{where}: circles.{label}: a length of {far:.3g}, up to {FARTHEST:g} possible; correct it",
-            )
-
-
-def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:
+def _require_one_unit(where: str, found: ComparedFaces, known: TruthFile) -> None:
     """Refuses lengths if distances show that those of one side are in another unit than mm."""
     labels = [label for label in known.circles if label in found.circles]
     faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
@@ -284,7 +274,9 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
         total = np.zeros(3, int)
         for group in groups.values():
             dots = group.board_circles_target
-            grid = np.arange(len(dots)).reshape(-1, _columns(dots))
+            steps = np.diff(dots, axis=0)
+            turned = np.flatnonzero(steps @ steps[0] < 0)  # the first step back ends a row
+            grid = np.arange(len(dots)).reshape(-1, int(turned[0]) + 1 if len(turned) else len(dots))
             turns = [grid, np.rot90(grid, 2)]
             turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
             counts = [_count(measured, group.images, turn) for turn in turns]
@@ -298,13 +290,6 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
     true = {name for group in groups.values() for name in group.images}
     counts = [*total.tolist(), len(true & measured.keys()), len(true)]
     return LabelCounts(**dict(zip(LabelCounts.model_fields, counts, strict=True)))
-
-
-def _columns(dots: np.ndarray) -> int:
-    """Returns the number of columns of a board from its dots in row-major order: the first step back ends a row."""
-    steps = np.diff(dots, axis=0)
-    turned = np.flatnonzero(steps @ steps[0] < 0)
-    return int(turned[0]) + 1 if len(turned) else len(dots)
 
 
 def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) -> tuple[int, int, int]:
@@ -325,29 +310,24 @@ def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) ->
     return wrong, found, visible
 
 
-def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
+def _face(face_id: str, found: ComparedFaces, known: TruthFile) -> FaceErrors:
     estimate, true = (Rigid.from_matrix(source.target_from_face[face_id]) for source in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([source.circles[label] for label in labels]).reshape(-1, 3) for source in (known, found))
     c = found.target_from_face_covariance.get(face_id)
-    row: dict[str, Any] = {
-        **_pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump(exclude_none=True),
-        "circles": len(labels),
-        "circles_mean_um": None,
-        "circles_max_um": None,
-    }
-    try:
+    error = sigma = None
+    with suppress(DegenerateError):  # with fewer than three circles in common there is no rigid fit
         error = 1e3 * np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
-        row |= {"circles_mean_um": float(error.mean()), "circles_max_um": float(error.max())}
-    except DegenerateError:
-        pass  # fewer than three circles in common: there is no rigid fit, and the row says how many there were
     if c is not None:
-        sigma = np.sqrt(np.maximum(np.diag(c), 0))
-        row |= {
-            "translation_sigma_um": 1e3 * sigma[3:],
-            "rotation_sigma_mdeg": 1e3 * np.degrees(sigma[:3]),
-        }
-    return FaceErrors.model_validate(row)
+        sigma = 1e3 * np.sqrt(np.maximum(np.diag(c), 0))
+    return FaceErrors(
+        **_pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump(),
+        circles=len(labels),
+        circles_mean_um=None if error is None else float(error.mean()),
+        circles_max_um=None if error is None else float(error.max()),
+        translation_sigma_um=None if sigma is None else sigma[3:],
+        rotation_sigma_mdeg=None if sigma is None else np.degrees(sigma[:3]),
+    )
 
 
 def poses_table(comparison: ComparePosesFile) -> str:
@@ -401,12 +381,9 @@ def comparison_cells(comparison: dict) -> tuple[list[str], list[list[str]]]:
              "± (µm)", "Residual (px)"]  # fmt: skip
     rows = []
     for row in comparison["rows"]:
-        differences, last = row["faces"], row is comparison["rows"][-1]
-        shown = [number(differences[face]["translation_um"], 2) if face in differences else NONE for face in faces]
-        turned = number(max((difference["rotation_mdeg"] for difference in differences.values()), default=None), 2)
-        if last:
-            shown = [f"σ {number(comparison['sigma'][face]['translation_um'], 2)}" for face in faces]
-            turned = f"σ {number(max(difference['rotation_mdeg'] for difference in comparison['sigma'].values()), 2)}"
-        board = [number(row[key], 1) for key in ("board_mean_um", "board_spread_um")]
-        rows.append([row["method"], *shown, turned, *board, number(row["residual_rms_px"], 4)])
+        is_last = row is comparison["rows"][-1]
+        values, sign = (comparison["sigma"], "σ ") if is_last else (row["faces"], "")
+        shown = [f"{sign}{number(values[face]['translation_um'], 2)}" if face in values else NONE for face in faces]
+        turned = sign + number(max((each["rotation_mdeg"] for each in values.values()), default=None), 2)
+        rows.append([row["method"], *shown, turned, *cells(row, "board_mean_um:1 board_spread_um:1 residual_rms_px:4")])
     return heads, rows

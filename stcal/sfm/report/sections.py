@@ -1,12 +1,14 @@
 """Sections of a run's page: how far to trust it, its settings, its checks, the cross-check and the published method."""
 
 from dataclasses import dataclass
+from itertools import product
 
 from stcal.labels import parse_label
-from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
+from stcal.report.document import Block, Table, alarms, fold, subheading, verdict_word
 from stcal.report.text import NONE, cells, join, number
+from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, TestedValue, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import CHANCE, SIZES, Judgement, applies
+from stcal.sfm.report.judgement import SIZES, Judgement
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
@@ -39,10 +41,8 @@ class Words:
 def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     """Returns for what σ hold, and the worst value of each kind."""
     summary, options = report["summary"], report["options"]
-    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
-    pitch = "the pitch as a whole (100 ppm is 4 K on aluminium)"
-    others = {"faces", "distances"} & set(summary.get("scale_from", []))
-    stated = ". The σ stated of the size are in them" if others else ""
+    sources = summary.get("scale_from", ["board"])
+    size = " and ".join(SIZES[source] for source in sources)
     if options["solve"] != "joint":
         scope = (
             "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
@@ -50,37 +50,28 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
         )
     elif judgement.verdict == "no":
         scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
-    elif options.get("refine_camera", False):
-        scope = f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}" + (
-            f". An error of {pitch} is not in them" if words.board else ""
-        )
     else:
-        scope = (
-            f"σ hold for the given intrinsics and {size}{stated}. An error of the camera calibration"
-            + (f", or of {pitch}," if words.board else "")
-            + " is not in them"
-        )
-    factor = f"group by group, {factor_in_words(summary['sigma_factor'])}"
-    if summary["sigma0"] is not None:
-        factor += (
-            ". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = "
-            f"{summary['sigma0']:.2f}; near 1, all observations agree with one another. The σ of the faces include "
-            "that factor, and σ₀ too where it is above 1: small residuals make no σ smaller. `budget` states the "
-            f"latter as {max(1.0, summary['sigma0']):.3f}"
+        refined = options.get("refine_camera", False)
+        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
+        scope += "; the intrinsics were adjusted, and their σ are in them" if refined else ""
+        scope += ". The σ stated of the size are in them" if {"faces", "distances"} & set(sources) else ""
+        absent = [] if refined else ["the camera calibration"]
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if words.board else []
+        if absent:
+            errors = ", or of ".join(absent) + "," * (len(absent) > 1)
+            scope += f". An error of {errors} is not in them, and residuals hardly show it"
+    factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
+    larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
+    of_groups = f"group by group, residuals are {larger} the centres' own σ"
+    if sigma0 is not None:
+        of_groups += (
+            f". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = {sigma0:.2f}; near 1, "
+            "all observations agree with one another. The σ of the faces include that factor, and σ₀ too where it is "
+            f"above 1: small residuals make no σ smaller. `budget` states the latter as {max(1.0, sigma0):.3f}"
         )
     single = [face for face, chains in report["chains"].items() if len(chains) == 1]
     one_way = "reached by only one chain, so that no second chain confirms them: face"
-    return [
-        f"{scope}, and residuals hardly show it" if scope.endswith("not in them") else scope,
-        factor,
-        f"{one_way} {join(single)}" if single else "",
-    ]
-
-
-def factor_in_words(factor: float) -> str:
-    if 0.95 <= factor <= 1.05:
-        return "residuals are as large as the centres' own σ"
-    return f"residuals are {factor:.1f} times the centres' own σ"
+    return [scope, of_groups, f"{one_way} {join(single)}" if single else ""]
 
 
 def settings(report: dict, words: Words) -> list[list[str]]:
@@ -128,22 +119,20 @@ LIMITS = (
     ("camera_um", "µm", "of cameras"),
     ("camera_mdeg", "mdeg", "of cameras"),
 )
-COMPARISONS = ("mapping", "result", "plain")
 
 
 def crosscheck_section(check: dict) -> list[Block]:
     """Returns the section on the cross-check with the native COLMAP."""
     limits, mapping = check["tolerances"], check["mapping"]
-    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
+    allowed = [f"{limits[key]:g} {unit} {what}" for key, unit, what in LIMITS if limits[key] is not None]
     faces: dict[str, list[tuple[float, str]]] = {}
     for label, value in mapping["circles_um"].items():
         faces.setdefault(parse_label(label).plane, []).append((value, label))
-    programs = {
-        "native": f"COLMAP {check['native']}",
-        "pycolmap": f"pycolmap {check['pycolmap']}",
-        "run": "this result",
-    }
-    models = [[name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()]
+    names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
+    models = [
+        [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
+        for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
+    ]
     circles = [
         [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
         for face, rows in sorted(faces.items())
@@ -151,6 +140,10 @@ def crosscheck_section(check: dict) -> list[Block]:
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
         largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
+    rows = [[face] for face in mapping["faces"]]
+    for row, key in product(rows, ("mapping", "result", "plain")):
+        entry = check[key]["faces"].get(row[0])
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3 sigmas:2")] if entry else [NONE] * 3
     over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
     return [
         f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
@@ -162,11 +155,7 @@ def crosscheck_section(check: dict) -> list[Block]:
         "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
         f"deviations. Allowed in the first two: {', '.join(allowed)}; the third shows what weights and the joint "
         "adjustment are worth",
-        Table(
-            ["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3,
-            [_face_row(check, f) for f in mapping["faces"]],
-            over,
-        ),
+        Table(["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3, rows, over),
         subheading("Circles"),
         "Native against pycolmap",
         Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
@@ -177,78 +166,50 @@ def crosscheck_section(check: dict) -> list[Block]:
     ]
 
 
-def _face_row(check: dict, face: str) -> list[str]:
-    """Returns the row of a face: position, rotation and σ of each comparison."""
-    row = [face]
-    for key in COMPARISONS:
-        entry = check[key]["faces"].get(face)
-        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
-    return row
-
-
-ORDER = ("failed", "suspicious", "passed", "not possible")
-NOT_APPLICABLE = "not applicable"
-"""What is told of checks that what was photographed has nothing for, such as those of circles where it shows tags."""
 FIRST_NAMES = 6
 """Number of names that a row has room for."""
 
 
-def count_verdicts(verdicts: list[tuple[str, str]]) -> str:
-    """Number of checks (verdict, remedy) by verdict, the worst first; one that does not apply is left out."""
-    told = [verdict if applies(verdict, remedy) else NOT_APPLICABLE for verdict, remedy in verdicts]
-    return ", ".join(f"{told.count(v)} {v}" for v in (*ORDER, NOT_APPLICABLE) if v in told) or "none"
-
-
-def checks_section(checks: list[dict]) -> list[Block]:
+def checks_section(rows: list[dict]) -> list[Block]:
     """Returns the checks that did not pass; the others, and what all of them measured, folded."""
+    checks = sorted(map(Check.read, rows), key=lambda check: ORDER.index(check.verdict))
     heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
-    ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
-    open_ = [_check_row(check) for check in ranked if check["verdict"] in ("failed", "suspicious")]
-    others = [_check_row(check) for check in ranked if check["verdict"] not in ("failed", "suspicious")]
+    is_open = [check.verdict in ("failed", "suspicious") for check in checks]
+    open_, others = ([_check_row(c) for c, own in zip(checks, is_open, strict=True) if own is k] for k in (True, False))
     measured = [
-        [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
-        for check in ranked
-        for m in check["measured"]
+        [check.title, m.name, *_number(m), NONE if m.probability is None else f"{m.probability:.1g}"]
+        for check in checks
+        for m in check.measured
     ]
-    counts = count_verdicts([(check["verdict"], check["remedy"]) for check in checks])
-    columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     return [
-        f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
-        f"many images or points it tested",
+        f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
+        "images or points it tested",
         Table(heads, open_, css="text"),
         fold(
             f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
         ),
-        fold("What was measured", Table(columns_measured, measured, css="text")),
+        fold(
+            "What was measured",
+            Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
+        ),
     ]
 
 
-def _check_row(check: dict) -> list:
-    return [
-        check["title"],
-        Verdict(check["verdict"] if applies(check["verdict"], check["remedy"]) else NOT_APPLICABLE),
-        *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
-        _names(check),
-        check["reason"],
-        check["remedy"],
-    ]
+def _check_row(check: Check) -> list:
+    surplus = len(check.names) - FIRST_NAMES
+    names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
+    value = _number(check.measured[0]) if check.measured else [NONE, NONE]
+    return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
 
 
-def _number(measured: dict) -> list[str]:
+def _number(measured: TestedValue) -> list[str]:
     """Returns value and limit with their unit."""
-    unit = f" {measured['unit']}" if measured["unit"] else ""
-    return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
 
+    def short(value: float) -> str:
+        return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
 
-def _short(value: float) -> str:
-    """Returns the value with about three digits."""
-    return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
-
-
-def _names(check: dict) -> str:
-    names = check["names"]
-    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
-    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE
+    unit = f" {measured.unit}" if measured.unit else ""
+    return [short(measured.value) + unit, NONE if measured.limit is None else short(measured.limit) + unit]
 
 
 def published_section(comparison: dict) -> list[Block]:

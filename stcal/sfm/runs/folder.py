@@ -45,9 +45,9 @@ from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
-from stcal.sfm.report.page import report_html
+from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, shown_overlays
+from stcal.sfm.report.run_page import report_html
 from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, as_written, folder_of, require_run, verify

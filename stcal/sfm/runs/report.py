@@ -14,7 +14,7 @@ from stcal.io.images import Skipped, name_fault
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, ResultFile, Vector, Vector3
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.chain import FaceChain
-from stcal.sfm.checks.verdict import Check
+from stcal.sfm.checks.significance import Check
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
 from stcal.sfm.data.note import Note, lost_groups
 from stcal.sfm.detect.defocus import Focus

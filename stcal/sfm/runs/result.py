@@ -22,8 +22,8 @@ from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.scale import ScaleSource
+from stcal.sfm.checks.significance import Check
 from stcal.sfm.checks.suite import Evidence
-from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage

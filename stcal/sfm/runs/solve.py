@@ -27,7 +27,7 @@ from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
-from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, Check, moved_apart
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, Check, moved_apart
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint
@@ -45,7 +45,6 @@ from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
-from stcal.sfm.report.judgement import OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.transaction import RunFolder
 
@@ -366,7 +365,7 @@ def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardD
         yield
     except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
         if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
-            name = cause.title.removeprefix(OF_WHOLE_SET)
+            name = cause.cause
             error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
         raise
 

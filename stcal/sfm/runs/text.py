@@ -10,14 +10,13 @@ from stcal.io.files import REFINED_CAMERA
 from stcal.labels import DotLabel
 from stcal.report.document import Block, Document, Printed, Section, Table
 from stcal.report.text import join, wrapped
-from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.predict import REMEDIES
+from stcal.sfm.report.check import BY_CHANCE, Check, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, without_sigma_of
-from stcal.sfm.report.page import CONTROL, PUBLISHED, faces_table
-from stcal.sfm.report.sections import count_verdicts
+from stcal.sfm.report.run_page import CONTROL, PUBLISHED, faces_table
 from stcal.sfm.runs.report import face_row
 from stcal.sfm.runs.result import RunResult
 
@@ -200,8 +199,7 @@ def _boards(result: RunResult) -> list[Block]:
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
     """Yields the checks that did not pass, the worst first."""
     if any(check.verdict in ("failed", "suspicious") for check in checks):
-        counts = count_verdicts([(check.verdict, check.remedy) for check in checks])
-        yield f"checks: {counts} ({BY_CHANCE})"
+        yield f"checks: {count_verdicts(checks)} ({BY_CHANCE})"
     for check in ranked(checks, images):
         if check.verdict in ("failed", "suspicious"):
             yield f"{check.verdict}: {check.title}: {check.reason}{'; ' * bool(check.remedy)}{check.remedy}"

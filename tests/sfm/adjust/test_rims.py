@@ -10,7 +10,7 @@ from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
-from stcal.sfm.checks.board import rim_check
+from stcal.sfm.checks.board_checks import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single

@@ -13,12 +13,12 @@ from stcal.errors import StcalError
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.sfm.budget import combine
+from stcal.sfm.budget.budget_file import BudgetFile, _unusual
+from stcal.sfm.budget.budget_page import budget_report
 from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.file import BudgetFile, _unusual
-from stcal.sfm.budget.lengths import against_stated
-from stcal.sfm.budget.page import budget_report
+from stcal.sfm.budget.length_test import against_stated
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
-from stcal.sfm.report.judgement import INVALIDATES
+from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
@@ -294,7 +294,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     assert (code, "--no-strict" in error) == (4, True)
     assert title in error or "No" in error
     assert title in text
-    assert all(what in text for what in INVALIDATES[report["checks"][1]["key"]])
+    assert all(what in text for what in CHECKS[report["checks"][1]["key"]][1])
     assert "expanded uncertainty U" not in text
     page, out = tmp_path / "budget.html", tmp_path / "budget.json"
     lengths = tmp_path / "lengths.csv"

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import StcalError
 from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.lengths import SHARED, against_run, against_stated
+from stcal.sfm.budget.length_test import SHARED, against_run, against_stated
 from stcal.sfm.budget.sources import statement_of
 from tests.outcome import INPUT, assert_error
 
@@ -64,16 +64,16 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     longest = budget.of_kind("distance")[0]
     assert plain.lengths[0].circles == longest.measurand.circles
     assert plain.lengths[0].error_um == 0
-    assert plain.lengths[0].expanded_mm == pytest.approx(np.sqrt(2) * longest.expanded)
+    assert plain.lengths[0].expanded_um == pytest.approx(1e3 * np.sqrt(2) * longest.expanded)
     path = tmp_path / "lab.toml"
     path.write_text(PITCH)
     stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
     same = against_run(stated, stated, saved.folder, (saved.board_design, saved.board_design))
-    assert same.lengths[0].expanded_mm == pytest.approx(plain.lengths[0].expanded_mm)
+    assert same.lengths[0].expanded_um == pytest.approx(plain.lengths[0].expanded_um)
     other = against_run(stated, stated, saved.folder, (saved.board_design, replace(saved.board_design, pitch_mm=20.0)))
     pitch = 50e-6 * longest.measurand.length_mm
-    wanted = np.hypot(plain.lengths[0].expanded_mm, 2 * np.sqrt(2) * pitch)
-    assert other.lengths[0].expanded_mm == pytest.approx(wanted, rel=2e-3)
+    wanted = np.hypot(plain.lengths[0].expanded_um, 2e3 * np.sqrt(2) * pitch)
+    assert other.lengths[0].expanded_um == pytest.approx(wanted, rel=2e-3)
     assert other.notes == ()
     assert "board_pitch" in SHARED
     at_20 = replace(budget, conditions=replace(budget.conditions, temperature_c=20.0))

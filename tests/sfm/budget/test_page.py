@@ -7,9 +7,9 @@ import pytest
 
 from stcal.report import document as pdf
 from stcal.report.text import significant
+from stcal.sfm.budget.budget_file import BudgetFile
+from stcal.sfm.budget.budget_page import REQUIRED, as_exact, budget_report
 from stcal.sfm.budget.combine import budget_of_run
-from stcal.sfm.budget.file import BudgetFile
-from stcal.sfm.budget.page import REQUIRED, as_exact, budget_report
 from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import INPUT, assert_error
 
@@ -80,7 +80,7 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
         assert re.search(
             f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
         )
-    care = full.model_copy(update={"use": "With care: 1 of 19 checks is suspicious."})
+    care = full.model_copy(update={"reserved": True})
     assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
     page = budget_report(full).page()
     assert re.search("<h1>Certificate of calibration no. rule 7, with uncertainty budget: .*</h1>", page)

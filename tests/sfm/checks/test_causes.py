@@ -12,8 +12,8 @@ from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
 from stcal.sfm.checks import suite
 from stcal.sfm.checks.causes import _turned, cause_of_file, whole_set_cause
-from stcal.sfm.checks.verdict import moved_apart, ranked
-from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.sfm.checks.significance import moved_apart
+from stcal.sfm.report.check import CAUSE, OF_WHOLE_SET, ranked
 from stcal.sfm.runs import solve
 from stcal.sfm.runs.solve import GroupSolution, refine_or_explain
 from stcal.synthetic.scene import SceneOptions, make_scene

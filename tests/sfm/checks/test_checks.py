@@ -16,13 +16,14 @@ from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.rims import lost_radius_mm
-from stcal.sfm.checks import faces
-from stcal.sfm.checks.board import board_checks
-from stcal.sfm.checks.images import moved_check
+from stcal.sfm.checks import face_checks
+from stcal.sfm.checks.board_checks import board_checks
+from stcal.sfm.checks.image_checks import moved_check
+from stcal.sfm.checks.significance import MOST_ENLARGED, Trial, culprits, judge
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.checks.verdict import FAILED, MOST_ENLARGED, SUSPICIOUS, Trial, culprits, judge
 from stcal.sfm.pipeline import run
-from stcal.sfm.report.sections import checks_section, count_verdicts
+from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
+from stcal.sfm.report.sections import checks_section
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
@@ -119,13 +120,13 @@ def test_the_joint_result_is_checked_by_its_parts(labels_only, lab, monkeypatch)
     for key, low, high in (("halves", 0.05, 50), ("groups", 0.05, 50), ("loops", 0.05, 50)):
         worst = checks[key].measured[0]
         assert low < worst.value < worst.limit < high
-    own = faces.calibrated_target
+    own = face_checks.calibrated_target
 
     def undetermined(*given):
         posed = own(*given)
         return replace(posed, face_covariance={face: np.zeros((6, 6)) for face in posed.face_covariance})
 
-    monkeypatch.setattr(faces, "calibrated_target", undetermined)
+    monkeypatch.setattr(face_checks, "calibrated_target", undetermined)
     checks = lab.check(scene, lab.observe(scene), solve="joint")
     assert {checks[key].verdict for key in ("halves", "groups")} == {"not possible"}
 
@@ -354,7 +355,7 @@ def test_a_run_of_photographs_passes(small_run):
     assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
     assert len({check["key"] for check in checks}) == len(checks) == 20
     assert all(set(check) == set(checks[0]) for check in checks)
-    assert "19 " not in count_verdicts([(check["verdict"], check["remedy"]) for check in checks])
+    assert "19 " not in count_verdicts(map(Check.read, checks))
     assert "not possible" in checks_section(checks)[0]
 
 
@@ -405,7 +406,7 @@ def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(l
 def test_a_group_that_tells_nothing_of_a_face_is_no_trial():
     """Without it the face's covariance is the same but for rounding, so that no change of it can be tested."""
     covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6])
-    assert faces._nested_trial("face 2 without group 15", np.zeros(6), covariance, covariance, 100) is None
-    trial = faces._nested_trial("face 2 without group 15", 1e-3 * np.ones(6), 2 * covariance, covariance, 100)
+    assert face_checks._nested_trial("face 2 without group 15", np.zeros(6), covariance, covariance, 100) is None
+    trial = face_checks._nested_trial("face 2 without group 15", 1e-3 * np.ones(6), 2 * covariance, covariance, 100)
     assert trial is not None
     assert trial.freedom == 6

@@ -6,11 +6,10 @@ import re
 from html import unescape
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
-from stcal.report.svg import Drawing
-from stcal.sfm.report import figures
-from stcal.sfm.report.page import report_html
+from stcal.sfm.report.run_page import report_html
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -38,18 +37,6 @@ def face(pose: list, sigma: bool) -> dict:
     }
 
 
-def pair(i: int) -> dict:
-    return {
-        "first": NASTY,
-        "second": f"a/{i}.jpg",
-        "shared": 20,
-        "median_angle_rad": 0.9 - 0.01 * i,
-        "in_front": 1.0,
-        "forward": 0.25,
-        "verdict": "usable" if i else "chosen",
-    }
-
-
 def group() -> dict:
     residuals = {f"board:{r}:{c}": [3.0 * r, -4.0 * c, 0.5] for r in range(2) for c in range(2)}
     return {
@@ -59,7 +46,7 @@ def group() -> dict:
         "points": 12,
         "seeded": "COLMAP's estimate of the chosen pair",
         "rounds": 3,
-        "pairs": [pair(i) for i in range(17)],
+        "pairs": [{"first": NASTY, "second": "a/0.jpg", "median_angle_rad": 0.9}],
         "scale": {
             "mm_per_unit": 116.2175381,
             "mm_per_unit_rows": 116.2175976,
@@ -77,15 +64,6 @@ def group() -> dict:
 
 def by_image(name: str) -> dict:
     return {"image": name, "group": "a", "observations": 12, "rms_px": 0.0035312, "max_px": 0.01079, "worst": "1:0"}
-
-
-def by_label(label: str, of_group: str | None) -> dict:
-    return {"label": label, "group": of_group, "observations": 2, "rms_px": 0.0046, "max_px": 0.0166}
-
-
-def camera_in_space(name: str, x: float) -> dict:
-    axes = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-    return {"image": name, "group": "a", "position_mm": [x, 0.0, 900.0], "axes": axes}
 
 
 def make(sigma: bool = True, eccentricity: bool = True) -> dict:
@@ -132,12 +110,23 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
         },
         "groups": [group()],
         "residuals_by_image": [by_image(NASTY), by_image("a/1.jpg")],
-        "residuals_by_label": [*(by_label(c, None) for c in CIRCLES), by_label("board:0:0", "a")],
+        "residuals_by_label": [
+            {"label": label, "group": of_group, "observations": 2, "rms_px": 0.0046, "max_px": 0.0166}
+            for label, of_group in (*((circle, None) for circle in CIRCLES), ("board:0:0", "a"))
+        ],
         "left_out": {"files": [], "images": [], "circles": [], "notes": []},
         "notes": [],
         "images": [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(OVERLAYS, start=1)],
         "scene": {
-            "cameras": [camera_in_space(NASTY, -100.0), camera_in_space("a/1.jpg", 400.0)],
+            "cameras": [
+                {
+                    "image": name,
+                    "group": "a",
+                    "position_mm": [x, 0.0, 900.0],
+                    "axes": np.diag([1.0, -1.0, -1.0]).tolist(),
+                }
+                for name, x in ((NASTY, -100.0), ("a/1.jpg", 400.0))
+            ],
             "boards": {"a": [[200.0, 0.0, 0.0], [230.0, 0.0, 0.0], [200.0, 30.0, 0.0], [230.0, 30.0, 0.0]]},
             "circles": CIRCLES,
         },
@@ -218,7 +207,7 @@ def test_the_page_is_whole_and_stands_alone(page):
 
 def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
-    assert len(plots) == 1 + 4  # board of the one group, four views in space
+    assert len(plots) == 1  # board of the one group
     for plot in plots:
         references = re.findall(r'(?:href|src)="([^"]*)"', base64.b64decode(plot).decode())
         assert all(reference.startswith(("#", "data:image/png")) for reference in references)
@@ -226,10 +215,6 @@ def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     assert [base64.b64decode(each) for each in found] == [JPEG] * 3
     assert "a/not mapped.jpg not mapped" in Page(joint).text
     assert report_html(copy.deepcopy(make()), OVERLAYS) == joint
-
-
-def test_a_control_without_eccentricity_raises_an_alarm(joint, chained):
-    assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
 
 
 def test_numbers_have_their_digits(joint):
@@ -246,7 +231,8 @@ def test_numbers_have_their_digits(joint):
     assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
 
 
-def test_what_was_not_computed_is_a_dash(chained):
+def test_what_was_not_computed_is_a_dash_and_a_control_without_eccentricity_raises_an_alarm(joint, chained):
+    assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
     face_row = next(row for row in rows_of(chained, "faces") if row[0] == "2")
     assert face_row[4:] == ["–"] * 6
     assert "None" not in Page(chained).text
@@ -269,18 +255,6 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-
-
-def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
-    """Their numbers are coordinates; only the scene that turns stands as the cameras did."""
-    drawn = []
-    monkeypatch.setattr(figures, "still", lambda parts, azimuth: drawn.append(parts) or Drawing(1, 1))
-    report = make()
-    report_html(report, {NASTY: JPEG})
-    assert len(drawn) == 4
-    for parts in drawn:
-        places = {part["name"]: part["xyz"] for part in parts if part["kind"] == "point" and "name" in part}
-        assert places == {label: [xyz] for label, xyz in report["scene"]["circles"].items()}
 
 
 def test_sigma0_is_what_the_certificate_says(joint):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.io.images import chosen_images
-from stcal.sfm.checks.verdict import Check, ranked
 from stcal.sfm.measurement.known_target import read_target
-from stcal.sfm.report.judgement import _first
+from stcal.sfm.report.check import Check, ranked
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error, fails_with
 
@@ -104,5 +103,3 @@ def test_a_check_that_another_one_explains_comes_after_it(later, why, verdict):
     checks = [Check(key, key, verdict, "", (), 1, (key,), "") for key in (later, why, "agreement")]
     assert [each.key for each in ranked(checks, frozenset())] == [why, later, "agreement"]
     assert [each.key for each in ranked(checks[::2], frozenset())] == [later, "agreement"]
-    rows = [{"key": c.key, "title": c.title, "verdict": c.verdict, "names": list(c.names)} for c in checks]
-    assert _first({"checks": rows, "images": []}, verdict)["key"] == why

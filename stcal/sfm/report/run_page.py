@@ -12,24 +12,23 @@ from stcal.report.document import (
     Document,
     Html,
     Section,
-    Swatch,
     Table,
     alarms,
     columns,
     fold,
-    html,
     legend,
     macro,
     page_only,
     plot,
     plots,
     subheading,
+    swatch,
     tone_of,
 )
 from stcal.report.text import cells, join, number
-from stcal.sfm.report import figures
-from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
+from stcal.sfm.report import run_figures
 from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
+from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, photographs, space_parts
 from stcal.sfm.report.sections import (
     Words,
     checks_section,
@@ -39,10 +38,6 @@ from stcal.sfm.report.sections import (
     trust,
 )
 
-SIDES = {-58: "", 122: ", from the other side"}
-"""Azimuths from which target and cameras are drawn."""
-BY_ROWS = (2, 3, 4)
-"""Columns of the scales that only a board has."""
 PUBLISHED = (
     "as published, for comparison: centres of contours with equal weights, without the eccentricity; faces are off by "
     "tens of µm, and no residual shows it"
@@ -65,9 +60,16 @@ def report_html(
     if judgement.verdict == "no":
         report = without_sigma(report)
     report = _with_named_groups(report)
-    colours = figures.group_colours([group["name"] for group in report["groups"]])
+    colours = run_figures.group_colours([group["name"] for group in report["groups"]])
     summary, words, options = report["summary"], Words.of(report), report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
+    shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
+    pictures = [
+        macro("photographs", shown, rest, words) if shown["each"] else "" if gone else "There are none",
+        f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
+        if gone
+        else "",
+    ]
     answers = macro("answers", judgement.answers(), tone_of(judgement.verdict))
     sections = [
         Section("Faces", _answer(report, colours, words)),
@@ -81,15 +83,18 @@ def report_html(
         Section("Left out", _left_out(report, words)),
         *(Section(title, make(report[key]), name=key) for key, (title, make) in others.items() if key in report),
         Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")]),
-        Section("Overlays", _overlays(report, overlays, residuals or {}, gone, words)),
+        Section("Overlays", pictures),
     ]
     counts = (
         f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
         f"{summary['images_mapped']} mapped, {summary['faces']} faces"
     )
-    warnings = [(ALONE, not report["faces"]), (PUBLISHED, options["solve"] == "paper")]
-    warnings.append((CONTROL, not options["eccentricity"]))
-    warning = [text for text, applies in warnings if applies][:1]
+    warnings = {
+        ALONE: not report["faces"],
+        PUBLISHED: options["solve"] == "paper",
+        CONTROL: not options["eccentricity"],
+    }
+    warning = [text for text, applies in warnings.items() if applies][:1]
     banner = [alarms(warning), macro("answers", judgement.answers()[:1], tone_of(judgement.verdict))]
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
@@ -139,18 +144,11 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     others = [face for face in report["faces"] if face != report["reference_face"]]
     with_it = "boards and cameras" if words.board else "cameras"
     origin = "origin circle" if words.point == "circle" else "origin"
-    parts, stills = space_parts(report, colours), []
-    own = [part for part in parts if part.get("target")]
-    for azimuth, side in SIDES.items():
-        for shown, text in (
-            (parts, f"Target and {with_it}"),
-            (own, f"{words.points.capitalize()} and frames of faces"),
-        ):
-            stills.append(plot(partial(figures.still, shown, azimuth), f"{text}{side}", css=""))
+    parts = space_parts(report, colours)
     space = [
         macro(
             "turned",
-            lambda: figures.upright(parts, report["scene"]["cameras"]),
+            lambda: run_figures.upright(parts, report["scene"]["cameras"]),
             f"Target, {with_it} in space",
             [("target", "Target"), ("all", f"With {with_it}")],
         ),
@@ -171,7 +169,6 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
         else "",
         faces_table(report["faces"], report["reference_face"]),
         columns(space, use) if others else page_only(*space),
-        macro("group", "plots still", lambda: [html(*stills)]),
     ]
 
 
@@ -215,28 +212,23 @@ def _faces_in_detail(report: dict, words: Words) -> list[Block]:
 
 def _scale(report: dict, words: Words) -> list[Block]:
     """Returns λ and the board's residuals of each group."""
-    heads = [
-        "<Group",
-        "λ, least squares (mm/unit)",
-        "λ, by rows (mm/unit)",
-        "Rows",
-        "Difference (ppm)",
-        "σ (ppm)",
-        "Dots" if words.board else "Points",
+    by_rows = [("λ, by rows (mm/unit)", "mm_per_unit_rows:6"), ("Rows", ""), ("Difference (ppm)", "difference_ppm:1")]
+    columns_of = [
+        ("λ, least squares (mm/unit)", "mm_per_unit:6"),
+        *(by_rows if words.board else ()),
+        ("σ (ppm)", "sigma_ppm:1"),
+        ("Dots" if words.board else "Points", "dots"),
+        ("Residual, mean (µm)", "board_mean_um:1"),
+        ("± (µm)", "board_spread_um:1"),
+        ("Residual, RMS (µm)", "board_rms_um:1"),
     ]
-    shown = [k for k in range(11) if words.board or k not in BY_ROWS]
-    heads += ["Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]
-    spec = "difference_ppm:1 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1"
-    rows = [
-        [
-            group["name"],
-            *cells(scale := group["scale"], "mm_per_unit:6 mm_per_unit_rows:6"),
-            " and ".join(str(row) for row in scale["rows"]),
-            *cells(scale, spec),
-            number(max((math.hypot(*v) for v in scale["board_residuals_um"].values()), default=None), 1),
-        ]
-        for group in report["groups"]
-    ]
+    rows = []
+    for group in report["groups"]:
+        scale = group["scale"]
+        most = max((math.hypot(*v) for v in scale["board_residuals_um"].values()), default=None)
+        two = " and ".join(str(row) for row in scale["rows"])
+        own = [value for _, spec in columns_of for value in (cells(scale, spec) if spec else [two])]
+        rows.append([group["name"], *own, number(most, 1)])
     pictures = _board_residuals(report["groups"])
     without = (
         "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
@@ -254,7 +246,7 @@ def _scale(report: dict, words: Words) -> list[Block]:
         if words.board
         else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
         "distances between points. σ is that of λ from their stated σ",
-        Table([heads[k] for k in shown], [[row[k] for k in shown] for row in rows]),
+        Table(["<Group", *(head for head, _ in columns_of), "Residual, max (µm)"], rows),
         without if words.board and len(pictures) < len(report["groups"]) else "",
         *(of_boards if pictures else []),
     ]
@@ -268,7 +260,7 @@ def _board_residuals(groups: list[dict]) -> list[Html]:
     height = max((abs(vector[2]) for vector in vectors), default=0.0)
     return [
         plot(
-            partial(figures.board_residuals, scale["board_residuals_um"], reach, height),
+            partial(run_figures.board_residuals, scale["board_residuals_um"], reach, height),
             f"Residual vectors of the board, group {name}",
             f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
             "",
@@ -291,7 +283,7 @@ def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
         [
             i,
             row["image"],
-            Swatch(row["group"], colours.get(row["group"], "")),
+            swatch(row["group"], colours.get(row["group"], "")),
             *cells(row, "observations rms_px:4 max_px:4 worst"),
         ]
         for i, row in enumerate(report["residuals_by_image"], 1)
@@ -372,16 +364,3 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     if unseen:
         blocks.append(f"Faces of the design that are not in the result: {join(unseen)}")
     return blocks or ["Nothing was left out"]
-
-
-def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int, words: Words) -> list[Block]:
-    """Returns the photographs with their circles."""
-    rest = len(report["images"]) - len(overlays) - gone
-    shown = photographs(report, overlays, residuals)
-    lost = (
-        f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
-    )
-    return [
-        macro("photographs", shown, rest, words) if shown.each else "" if gone else "There are none",
-        lost if gone else "",
-    ]

@@ -20,8 +20,9 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
-from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Guilt, Measured, Trial, impossible, judge
+from stcal.sfm.checks.significance import Guilt, Trial, assess
 from stcal.sfm.data.model import MetricModel
+from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_HALF = 2
 """Smallest number of images of a group in each half."""
@@ -43,7 +44,7 @@ class Again:
     def loop_remedy(self) -> str:
         """Returns what makes comparisons of groups possible; nothing where all images are one group without a board."""
         needed = self.board.rows or len(self.joint.models) > 1
-        return "to be able to make it, add a group that closes a loop of faces" if needed else ""
+        return "add a group that closes a loop of faces" if needed else ""
 
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
         """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
@@ -86,42 +87,47 @@ def _difference(a: Rigid, b: Rigid) -> np.ndarray:
     return np.concatenate([Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.translation - b.translation])
 
 
+def _face_trial(name: str, a: Rigid, b: Rigid, covariance: np.ndarray, redundancy: float) -> Trial:
+    """Returns the trial of two independent poses of a face; ``covariance`` : (6, 6) of their difference."""
+    apart = _difference(a, b)
+    statistic = float(apart @ np.linalg.solve(covariance, apart))
+    return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
+
+
 def halves_check(again: Again) -> Check:
     """Compares two halves of the images, alternate ones of every group; the board's deviations are common to both."""
-    key, title = "halves", "Two halves of the images against each other"
     models, reference = again.joint.models, again.calibration.target.reference_face
     fewest = min(models, key=lambda model: len(model.images))
     if len(fewest.images) < 2 * MIN_HALF:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
-        return impossible(key, title, reason, "add images")
+        return impossible("halves", reason, "add images")
     faces = [reference, *(f for f in again.calibration.target.target_from_face if f != reference)]
     joints = again.adjust([[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
     try:
         (first, joint), (second, second_joint) = (again.posed(joint, faces) for joint in joints)
     except StcalError as error:
-        return impossible(key, title, f"half of the images do not determine the result ({error})", "add images")
+        return impossible("halves", f"half of the images do not determine the result ({error})", "add images")
     redundancy = joint.redundancy + second_joint.redundancy
-    trials = []
-    for face in faces[1:]:
-        difference = _difference(first.target_from_face[face], second.target_from_face[face])
-        covariance = first.face_covariance[face] + second.face_covariance[face]
-        trials.append(_face_trial(f"face {face}", difference, covariance, redundancy))
+    trials = [
+        _face_trial(
+            f"face {face}",
+            first.target_from_face[face],
+            second.target_from_face[face],
+            first.face_covariance[face] + second.face_covariance[face],
+            redundancy,
+        )
+        for face in faces[1:]
+    ]
     remedy = (
         "images of one group contradict one another more than their residuals show: look for images in which something "
         "moved, or that are blurred; trust no σ below this difference"
     )
-    return judge(key, title, trials, "faces", remedy, covered=True)
-
-
-def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy: float) -> Trial:
-    statistic = float(apart @ np.linalg.solve(covariance, apart))
-    return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
+    return assess("halves", trials, "faces", remedy, covered=True)
 
 
 def groups_check(again: Again, networks: Sequence[Network]) -> Check:
     """Compares the result without one group with the whole, with the covariance of a nested adjustment. A group is
     named only if the others agree without it, and do not if another one is left out instead."""
-    key, title = "groups", "The result without each group"
     calibration = again.calibration
     models, whole = again.joint.models, calibration.target
     reference = whole.reference_face
@@ -152,20 +158,20 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
             trials += [trial] if trial else []
     if not trials:
         reason = "every group holds a face that no other links"
-        return impossible(key, title, reason, again.loop_remedy())
-    check = judge(key, title, trials, "faces", "", covered=True)
+        return impossible("groups", reason, again.loop_remedy())
+    check = assess("groups", trials, "faces", "", covered=True)
     if not check.names:
         return check
     curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
-    guilt = Guilt("groups", tuple(curing) if len(curing) == 1 else (), tuple(curing))
-    if guilt.culprits:
+    if len(curing) == 1:
         remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
         return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
     remedy = (
         "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
         "the faces in further groups, which show which one is wrong"
     )
-    return replace(check, reason=f"{check.reason}; {guilt.words()}", names=(), remedy=remedy)
+    words = Guilt("groups", rivals=tuple(curing)).words()
+    return replace(check, reason=f"{check.reason}; {words}", names=(), remedy=remedy)
 
 
 def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
@@ -198,16 +204,13 @@ def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, re
 def _linked(members: list[set[str]], start: str) -> set[str]:
     """Returns the faces that the groups link to ``start``."""
     reached = {start}
-    while True:
-        linked = set().union(*(faces for faces in members if faces & reached)) - reached
-        if not linked:
-            return reached
+    while linked := set().union(*(faces for faces in members if faces & reached)) - reached:
         reached |= linked
+    return reached
 
 
 def loops_check(again: Again) -> Check:
     """Compares two ways to one face through different groups, with each group adjusted alone with its board."""
-    key, title = "loops", "Ways to a face through different groups"
     calibration = again.calibration
     pairs = [
         (face, first, second)
@@ -228,24 +231,19 @@ def loops_check(again: Again) -> Check:
     redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
     for face, first, second in pairs:
         try:
-            ends = [_along(step_of, way) for way in (first, second)]
+            (one, of_one), (other, of_other) = (_along(step_of, way) for way in (first, second))
         except StcalError:
             continue
-        difference = _difference(ends[0][0], ends[1][0])
         name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
-        trials.append(_face_trial(name, difference, ends[0][1] + ends[1][1], redundancy))
+        trials.append(_face_trial(name, one, other, of_one + of_other, redundancy))
     if not trials:
         reason = "no face is reached in two ways that share no group"
-        return impossible(key, title, reason, again.loop_remedy())
+        return impossible("loops", reason, again.loop_remedy())
     remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
-    return judge(key, title, trials, "loops", remedy, covered=True)
+    return assess("loops", trials, "loops", remedy, covered=True)
 
 
-Step = Callable[[str, str, str], tuple[Rigid, np.ndarray]]
-"""Returns a_from_b by a group alone, and its covariance (6, 6), from the names of group, face a and face b."""
-
-
-def _along(step_of: Step, way: FaceChain) -> tuple[Rigid, np.ndarray]:
+def _along(step_of: Callable[[str, str, str], tuple[Rigid, np.ndarray]], way: FaceChain) -> tuple[Rigid, np.ndarray]:
     """Returns reference_from_face along a way, with each group adjusted alone, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
@@ -261,17 +259,16 @@ def _along(step_of: Step, way: FaceChain) -> tuple[Rigid, np.ndarray]:
 def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     """Tests what one target, the board's σ and flat faces add to the residuals (F test of nested models). An adjustment
     that has not settled is suspicious: contradictory observations make its last steps slow."""
-    key, title = "agreement", "Groups, board and faces against one another"
     extra, freedom, free = _added(joint, networks)
     if freedom < 1:
-        return impossible(key, title, "one target and board add no condition to the groups", "add images")
+        return impossible("agreement", "one target and board add no condition to the groups", "add images")
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)
-    check = judge(key, title, [trial], "adjustments", remedy, covered=True)
+    check = assess("agreement", [trial], "adjustments", remedy, covered=True)
     if joint.settled:
         return check
-    last = Measured("last step", joint.last_move_px, SETTLED_PX, "px", None)
+    last = TestedValue("last step", joint.last_move_px, SETTLED_PX, "px", None)
     return replace(
         check,
         verdict="suspicious" if check.verdict == "passed" else check.verdict,
@@ -287,9 +284,8 @@ def flatness_check(
 ) -> Check:
     """Tests the distance of each circle from the plane of the other circles of its face in all free networks.
     ``printed``: ids of faces of known shape, whose flatness is ``factor`` times the stated one."""
-    key, title = "flatness", "Each point against the plane of its face"
     if flatness_mm is None:
-        return impossible(key, title, "the run was asked not to use flatness", "state it with --flatness")
+        return impossible("flatness", "the run was asked not to use flatness", "state it with --flatness")
     heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = {}
     for network in networks:
         for face, members in network.model.points_by_face().items():
@@ -316,7 +312,7 @@ def flatness_check(
     remedy = "a point out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
     # Bent paper does no harm: its corners are where they are, and the frame is laid over all of them.
     worst = "suspicious" if heights.keys() <= set(printed) else "failed"
-    return judge(key, title, trials, "points", remedy, worst)
+    return assess("flatness", trials, "points", remedy, worst)
 
 
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """Checks of images, labels, single observations and camera from the residuals of the free networks."""
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -12,24 +13,22 @@ from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.io.cameras.model import CameraPrior
-from stcal.labels import CircleLabel, Label
+from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.verdict import (
+from stcal.sfm.checks.significance import (
+    FREE,
     MOST_SIGMAS,
     SHOWN,
-    SUSPICIOUS,
-    Check,
     Guilt,
-    Measured,
     Trial,
+    assess,
     culprits,
     culprits_by_score,
-    impossible,
-    judge,
-    without_image,
+    on_face,
 )
 from stcal.sfm.data.model import ImageObservations, Outlier
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_CIRCLES = 3
 """Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
@@ -55,10 +54,9 @@ def camera_check(
 ) -> Check:
     """Tests whether the intrinsics are those of the images: in the residuals of all free networks (score test) if they
     are as given, by their distance from the given ones if they were refined."""
-    key, title = "camera", "Intrinsics against the images"
     if not given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
-        return impossible(key, title, reason, "")
+        return impossible("camera", reason, "")
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera again"
@@ -67,29 +65,25 @@ def camera_check(
         change = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
         change = change @ (calibration.camera.parameters() - camera.parameters())
         gained = prior.covariance - calibration.joint.camera_covariance
-        estimate, sigma = change, np.sqrt(np.diag(prior.covariance))
+        model, estimate, sigma = prior.colmap_model, change, np.sqrt(np.diag(prior.covariance))
         test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ change)
-        names, redundancy = _names(prior.colmap_model), sum(n.redundancy.sum() for n in networks)
+        redundancy = sum(n.redundancy.sum() for n in networks)
     else:
-        richest = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
-        richest = "THIN_PRISM_FISHEYE" if camera.fisheye else richest
-        basis, found = intrinsic_basis(richest), calibration.camera
+        model = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
+        model = "THIN_PRISM_FISHEYE" if camera.fisheye else model
+        basis, found = intrinsic_basis(model), calibration.camera
         test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
-        estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(richest)
+        estimate, sigma = test.estimate, np.sqrt(np.diag(test.covariance))
+    names = [PARAMETER_NAMES[i] for i in intrinsic_basis(model).argmax(0)]
     rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
-    check = judge(key, title, [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
+    check = assess("camera", [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
-        Measured(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
+        TestedValue(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
         for name, value, s in zip(names, estimate, sigma, strict=True)
     )
     values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
     reason = f"{check.reason}; the images suggest {values}" if check.names and values else check.reason
     return replace(check, reason=reason, measured=check.measured + single)
-
-
-def _names(colmap_model: str) -> list[str]:
-    basis = intrinsic_basis(colmap_model)
-    return [PARAMETER_NAMES[i] for i in basis.argmax(0)]
 
 
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -109,16 +103,15 @@ def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
             own = solve_score(normal, right - normal @ test.estimate)
             scatter, freedom = scatter + own.statistic, freedom + own.freedom
     redundancy = float(sum(n.redundancy.sum() for n in networks))
-    times = scatter / freedom if freedom > 0 else 1.0
-    if times <= 1:
+    if freedom <= 0 or scatter <= freedom:
         return test, redundancy
+    times = scatter / freedom
     fewer = replace(test, covariance=times * test.covariance, statistic=test.statistic / times)
     return fewer, min(redundancy, float(freedom))
 
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
     """Tests for a residual field that is the same in all images, cubics in x and y that no intrinsics explain."""
-    key, title = "residual-field", "Residuals over the image"
 
     def columns(network: Network) -> np.ndarray:
         size = np.array([camera.width, camera.height])
@@ -139,22 +132,21 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
         "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
         "(FULL_OPENCV), and keep focus and aperture as they were then"
     )
-    return judge(key, title, [trial], "residual fields", remedy)
+    return assess("residual-field", [trial], "residual fields", remedy)
 
 
 def sigma_check(networks: Sequence[Network], factor: float) -> Check:
     """Tests σ₀ of the images alone; the σ of the result include it, so that only a large factor is a fault."""
-    key, title = "centres", "Residuals against the centres' own σ"
     low, high = SIGMA_LIMITS
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
     redundancy = sum(n.redundancy.sum() for n in networks)
     if redundancy < 1:
-        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
+        return impossible("centres", FREE, "add images")
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
-    measured = (Measured("all images", factor, low, "×", None),)
+    measured = (TestedValue("all images", factor, low, "×", None),)
     names = () if verdict == "passed" else ("all images",)
-    return Check(key, title, verdict, reason, measured, 1, names, remedy if names else "")
+    return Check("centres", CHECKS["centres"][0], verdict, reason, measured, 1, names, remedy if names else "")
 
 
 def image_check(networks: Sequence[Network]) -> Check:
@@ -176,7 +168,7 @@ def image_check(networks: Sequence[Network]) -> Check:
     for name, ratio, own, others in found:
         freedom = max(round(own / fewer), 1)
         trials.append(Trial(name, float(np.sqrt(ratio)), "×", ratio * freedom, freedom, others / fewer))
-    check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
+    check = assess("image-residuals", trials, "images", "")
     remedy = "a blurred image, or one in which something had moved: look at its overlay, leave it out, and run again"
     return _take_out(check, remedy)
 
@@ -194,7 +186,7 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
         blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight and do no harm"
     trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
-    return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
+    return assess("sharpness", trials, "values", remedy, "suspicious")
 
 
 def evenness_check(
@@ -202,9 +194,8 @@ def evenness_check(
 ) -> Check:
     """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe. Their
     centres would be off alike in all views; a value is the error that the wider model avoids, µm at the circle."""
-    key, title = "evenness", "Brightness within the circles"
     if not round_:
-        return impossible(key, title, "corners alone, which have no rim", "")
+        return impossible("evenness", "corners alone, which have no rim", "")
     uneven = {image.name: image.uneven_px for image in images}
     shifts_of_label: dict[str, list[float]] = {}
     for network in networks:
@@ -222,7 +213,7 @@ def evenness_check(
         "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, check "
         "their light; their centres are measured by a wider model, with a larger σ"
     )
-    return judge(key, title, trials, "circles", remedy, "suspicious")
+    return assess("evenness", trials, "circles", remedy, "suspicious")
 
 
 def _dull(values: dict[str, float], unit: str) -> list[Trial]:
@@ -245,16 +236,16 @@ def moved_check(networks: Sequence[Network]) -> Check:
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
         model = network.model
-        on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
-        if on_face.all() or not on_face.any():
+        of_faces = on_face(model)
+        if of_faces.all() or not of_faces.any():
             continue
-        columns = _motion(network, on_face)
+        columns = by_motion(network, model.xyz_model[of_faces].mean(0))
         normal, right = network.score_by_image(columns)
         redundancy = float(network.redundancy.sum())
         square = float((network.residual**2).sum())
         tested = []
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
-            faces = on_face[model.point_index[rows]].sum()
+            faces = of_faces[model.point_index[rows]].sum()
             if min(faces, len(rows) - faces) < MIN_CIRCLES:
                 continue
             test = solve_score(normal[i], right[i])
@@ -269,8 +260,8 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 trials.append(Trial(name, shift_um, "µm", statistic, test.freedom, redundancy - test.freedom))
                 tested.append(i)
         tested_by_group[model.group] = network, columns, tested
-    check = judge("moved", "Target against board, image by image", trials, "images", "")
-    if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
+    check = assess("moved", trials, "images", "")
+    if not check.names or _nearly_all(check):
         return _take_out(check, "")
     guilt = [
         culprits_by_score(network, columns, tested, check.tested, f"group {group}")
@@ -285,12 +276,28 @@ def moved_check(networks: Sequence[Network]) -> Check:
     return with_culprits(check, guilt, remedy, causes)
 
 
-def _motion(network: Network, on_face: np.ndarray) -> np.ndarray:
-    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together, of points (p,) ``on_face``."""
+def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
+    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together about a ``centre`` (3,)."""
     model = network.model
-    arm = model.xyz_model[model.point_index] - model.xyz_model[on_face].mean(0)
+    arm = model.xyz_model[model.point_index] - centre
     motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-    return network.by_point @ (motion * on_face[model.point_index][:, None, None])
+    return network.by_point @ (motion * on_face(model)[model.point_index][:, None, None])
+
+
+NO_ELLIPSES = (
+    "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
+    "values or of contours need another correction"
+)
+
+
+def by_eccentricity(network: Network) -> np.ndarray:
+    """Returns the derivatives (n, 2, 1) over σ by a factor on the eccentricity."""
+    return network.model.whiten(network.model.shift_px[:, :, None])
+
+
+def without_image(name: str) -> str:
+    """Returns the option that excludes an image from a run."""
+    return f"--exclude {shlex.quote(name)}"
 
 
 def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:
@@ -308,9 +315,13 @@ NEARLY_ALL = 0.7
 """Share of the images beyond which a check that names them names none."""
 
 
+def _nearly_all(check: Check) -> bool:
+    return len(check.names) > max(NEARLY_ALL * check.tested, 1)
+
+
 def _take_out(check: Check, remedy: str) -> Check:
     """Returns the check with the remedy and the option that excludes the worst image, if it names one."""
-    if len(check.names) > max(NEARLY_ALL * check.tested, 1):
+    if _nearly_all(check):
         common = "nearly all images, so do not leave any out: look for what they have in common, first the camera"
         return replace(check, names=(), remedy=common)
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check
@@ -332,19 +343,25 @@ def labels_check(
         "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
         "that was left out does no harm where other images show it"
     )
-    check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
+    trials = []
+    for network in networks:
+        model, total = network.model, float(network.redundancy.sum())
+        square, freedom = network.squares_of_observations()
+        for k in np.flatnonzero(freedom):
+            name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
+            length = float(np.linalg.norm(network.residual[k]))
+            trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
+    check = assess("labels", trials, "centres", remedy, "suspicious")
+    if not outliers:
+        return check
     swapped = _exchanged(networks, outliers, images, camera)
     guilt = _images_of_outliers(networks, outliers)
     lost = tuple(name for own in guilt for name in own.culprits)
-    if not outliers:
-        return check
     named = tuple(f"{o.image} {o.label}" for o in outliers)
     measured = tuple(
-        Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
+        TestedValue(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
-    first = f"{named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
-    reason = f"{len(outliers)} left out, first {first}"
-    verdict = "suspicious"
+    verdict, reason = "suspicious", f"{len(outliers)} left out, first {named[0]}: {measured[0].words()}"
     if guilt:
         verdict = "failed"
         words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
@@ -359,15 +376,8 @@ def labels_check(
         verdict = "failed"
         reason = f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
-    shown = (*measured, *check.measured)[:SHOWN]
-    return replace(
-        check,
-        verdict=verdict,
-        reason=reason,
-        measured=shown,
-        names=(*swapped, *lost, *named, *check.names),
-        remedy=remedy,
-    )
+    shown, names = (*measured, *check.measured)[:SHOWN], (*swapped, *lost, *named, *check.names)
+    return replace(check, verdict=verdict, reason=reason, measured=shown, names=names, remedy=remedy)
 
 
 def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
@@ -385,18 +395,6 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
         if worst(()) is not None:
             found.append(culprits(names, worst, f"group {network.model.group}"))
     return found
-
-
-def _trials(networks: Sequence[Network]) -> list[Trial]:
-    trials = []
-    for network in networks:
-        model, total = network.model, float(network.redundancy.sum())
-        square, freedom = network.squares_of_observations()
-        for k in np.flatnonzero(freedom):
-            name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
-            length = float(np.linalg.norm(network.residual[k]))
-            trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
-    return trials
 
 
 def _exchanged(

@@ -5,17 +5,18 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 import stcal
 from stcal.design import StatedSize
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
-from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row, View
-from stcal.sfm.budget.lengths import LengthTest
+from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, GroupViews, Row
+from stcal.sfm.budget.length_test import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
-from stcal.sfm.report.judgement import invalidated
+from stcal.sfm.report.check import invalidated
+from stcal.sfm.report.judgement import Judgement, judgement_of
 from stcal.sfm.runs.saved import SavedRun, Verified
 
 MICRO = 1e3
@@ -98,28 +99,6 @@ class StatedRow:
     origin: str
 
 
-class LengthRow(Part):
-    circles: tuple[str, ...]
-    measured_mm: float
-    reference_mm: float
-    error_um: float
-    expanded_um: float | None
-    e_n: Finite
-
-
-class LengthTestPart(Part):
-    """Length test against one reference."""
-
-    reference: str
-    lengths: list[LengthRow]
-    largest_e_n: Finite
-    beyond: int | None
-    limit: float
-    agrees: bool | None
-    verdict: str
-    notes: tuple[str, ...]
-
-
 class BudgetFile(ResultFile):
     """The JSON file of ``budget``."""
 
@@ -136,7 +115,8 @@ class BudgetFile(ResultFile):
         "calibration), `traceability` and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
-    use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
+    use: str = Field(description='the run\'s own answer to "May I use it?"')
+    reserved: bool = Field(False, description="whether that answer is to use it with care, also as a part")
     usable: bool = Field(
         description="false where that answer is no or a check has failed: no uncertainty is given, `faces` and "
         "`distances` are empty"
@@ -156,7 +136,7 @@ class BudgetFile(ResultFile):
         description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
     )
     redundancy: int = Field(description="degrees of freedom of the adjustment")
-    views: list[View] = Field(
+    views: list[GroupViews] = Field(
         description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
     )
     sources: list[SourceRow] = Field(
@@ -192,7 +172,7 @@ class BudgetFile(ResultFile):
         "combined standard uncertainties of x, y, z, `position_xyz_um`; empty where the size is not known or the run "
         "must not be used",
     )
-    length_tests: list[LengthTestPart] = Field(
+    length_tests: list[LengthTest] = Field(
         description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
         "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
         "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); `largest_e_n`, how many "
@@ -248,7 +228,8 @@ class BudgetFile(ResultFile):
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
-            use=(run.report.get("judgement") or {}).get("use", ""),
+            use=(answer := answer_of(run)).use,
+            reserved=answer.reserved,
             usable=not refused,
             size_known=known,
             reference_temperature_c=conditions.temperature_c,
@@ -264,7 +245,7 @@ class BudgetFile(ResultFile):
             faces={} if refused else faces,
             distances=[] if refused or not known else distances,
             circles={} if refused or not known else circles,
-            length_tests=[LengthTestPart.model_validate(test) for test in tests],
+            length_tests=TypeAdapter(list[LengthTest]).validate_python([asdict(test) for test in tests]),
             notes=notes_of(budget, verified, run),
         )
 
@@ -302,18 +283,24 @@ def _definitions(run: SavedRun) -> list[str]:
     ]
 
 
+def answer_of(run: SavedRun) -> Judgement:
+    """Returns a run's answer to "May I use it?"; that of today's rules where an older version did not say it all."""
+    stated = run.report.get("judgement") or {}
+    return Judgement.model_validate(stated) if "reserved" in stated else judgement_of(run.report)
+
+
 def is_refused(run: SavedRun) -> bool:
     """Whether a run says that it must not be used, so that no uncertainty of it holds."""
-    return bool(run.failed_checks()) or (run.report.get("judgement") or {}).get("verdict") == "no"
+    return bool(run.failed_checks()) or answer_of(run).verdict == "no"
 
 
-def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
+def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTest]) -> list[str]:
     """Returns why a budget must not be used, in words: the answer of each run, and length tests that differ."""
     reasons = []
     for run in filter(is_refused, runs):
-        answer = run.report.get("judgement") or {}
+        answer = answer_of(run)
         failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
-        own = answer["use"].removesuffix(".") if answer.get("verdict") == "no" else failed
+        own = answer.use.removesuffix(".") if answer.verdict == "no" else failed
         reasons.append(f"may run {run.folder} be used? {own}")
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
@@ -340,37 +327,33 @@ def _unusual(statement: Statement) -> list[str]:
 
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
-    notes, statement, conditions = [], budget.statement, budget.conditions
-    if failed := run.failed_checks():
+    statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
+    failed, unknown = run.failed_checks(), [source.title for source in budget.sources if source.origin == "not stated"]
+    notes = []
+    if failed:
         invalid = join(invalidated(check["key"] for check in failed))
         notes.append(
             f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
             f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given"
         )
     elif is_refused(run):
-        notes.append(f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
-    if not conditions.size_known:
-        notes.append(f"{conditions.words}; lengths of the run are in the unit of the drawing")
-    if unknown := [source.title for source in budget.sources if source.origin == "not stated"]:
-        notes.append(
-            f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
-            "are"
-        )
-    if conditions.size_known and conditions.correction and not is_refused(run):
-        notes.append(
-            f"for the stated expansion, lengths in faces.json are still to be changed by "
-            f"{PPM * conditions.correction:+.1f} ppm; the tables here have them changed, and U holds for these"
-        )
-    if not run.board_design.rows and statement.board != StatedSize():
-        notes.append("no board was in view: what is stated of [board] is not used")
+        notes.append(f"may the run be used? {answer_of(run).use} No uncertainty of it is given")
+    corrected = conditions.size_known and conditions.correction and not is_refused(run)
     both = statement.board.temperature_sigma_k and statement.target.temperature_sigma_k
-    if run.board_design.rows and both and not statement.one_thermometer:
-        notes.append(
-            "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
-            "both (one_thermometer of the statement), U is too large"
-        )
+    told = {
+        f"{conditions.words}; lengths of the run are in the unit of the drawing": not conditions.size_known,
+        f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
+        "are": unknown,
+        f"for the stated expansion, lengths in faces.json are still to be changed by "
+        f"{PPM * conditions.correction:+.1f} ppm; the tables here have them changed, and U holds for these": corrected,
+        "no board was in view: what is stated of [board] is not used": not has_board
+        and statement.board != StatedSize(),
+        "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured both "
+        "(one_thermometer of the statement), U is too large": has_board and both and not statement.one_thermometer,
+    }
     return [
         *notes,
+        *(note for note, applies in told.items() if applies),
         *_unusual(statement),
         *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "

@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 from stcal.design import BoardDesign
 from stcal.errors import InputError
+from stcal.io.json import Finite
 from stcal.io.table import LENGTHS, read_table
-from stcal.labels import CircleLabel
 from stcal.report.text import number
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
 from stcal.sfm.budget.sources import reference_temperature_c
@@ -24,79 +24,54 @@ SHARED = ("board_pitch", "board_expansion", "target_expansion")
 """Sources whose errors two calibrations of one target with one board share: they scale all lengths by one factor."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Length:
-    """A measured and a reference length, mm. ``expanded_mm`` : U of the difference, None where none holds."""
+@dataclass(frozen=True, slots=True)
+class TestedLength:
+    """A measured length against a reference; U of their difference, and E_n with its sign, None where none holds."""
 
-    circles: tuple[CircleLabel, CircleLabel]
+    circles: tuple[str, ...]
     measured_mm: float
     reference_mm: float
-    expanded_mm: float | None
-
-    @property
-    def error_um(self) -> float:
-        """Length measurement error."""
-        return 1e3 * (self.measured_mm - self.reference_mm)
-
-    @property
-    def expanded_um(self) -> float | None:
-        return None if self.expanded_mm is None else 1e3 * self.expanded_mm
-
-    @property
-    def e_n(self) -> float | None:
-        """E_n of ISO 13528, with its sign; infinite if both lengths are exact and differ."""
-        if self.expanded_um:
-            return self.error_um / self.expanded_um
-        exact = float(np.copysign(np.inf, self.error_um)) if self.error_um else 0.0
-        return None if self.expanded_um is None else exact
+    error_um: float
+    expanded_um: float | None
+    e_n: Finite  # infinite if both lengths are exact and differ
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class LengthTest:
     """A length test. ``reference`` : what the lengths are compared with; ``notes`` : what the test cannot detect."""
 
     reference: str
-    lengths: tuple[Length, ...]
+    lengths: list[TestedLength]
+    largest_e_n: Finite
+    beyond: int | None
+    limit: float
+    agrees: bool | None
+    verdict: str
     notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, reference: str, lengths: Sequence[TestedLength], notes: tuple[str, ...]) -> "LengthTest":
+        """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
+        chance (Bonferroni)."""
+        count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
+        limit = float(norm.isf(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
+        if not e_n:
+            verdict = f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
+            return cls(reference, list(lengths), None, None, limit, None, verdict, notes)
+        largest, beyond = max(e_n), sum(each > 1 for each in e_n)
+        agrees = largest <= limit * (1 + 1e-9)
+        verdict = f"agrees: all {count} lengths within U, largest |E_n| {number(largest, 2)}"
+        if beyond:
+            verdict = (
+                f"{'may agree' if agrees else 'differs'}: {beyond} of {count} lengths beyond U, where 1 in 22 is by "
+                f"chance; largest |E_n| {number(largest, 2)}, which reaches {limit:.2f} by chance in one of 22 tests "
+                f"of {count}"
+            )
+        return cls(reference, list(lengths), largest, beyond, limit, agrees, verdict, notes)
 
     def without_u(self) -> "LengthTest":
         """Returns the test of a run that must not be used, of which no U holds: nothing is judged."""
-        return replace(self, lengths=tuple(replace(length, expanded_mm=None) for length in self.lengths))
-
-    @property
-    def largest_e_n(self) -> float | None:
-        """Largest magnitude of E_n."""
-        e_n = [abs(length.e_n) for length in self.lengths if length.e_n is not None]
-        return max(e_n, default=None)
-
-    @property
-    def beyond(self) -> int | None:
-        """Number of lengths whose error is larger than U."""
-        return None if self.largest_e_n is None else sum(abs(length.e_n or 0.0) > 1 for length in self.lengths)
-
-    @property
-    def limit(self) -> float:
-        """Limit of the largest E_n: 1 for one length, more for many, as more go beyond by chance (Bonferroni)."""
-        return float(norm.isf(BY_CHANCE / 2 / len(self.lengths)) / COVERAGE_FACTOR)
-
-    @property
-    def agrees(self) -> bool | None:
-        """True if no length is beyond the limit."""
-        return None if self.largest_e_n is None else self.largest_e_n <= self.limit * (1 + 1e-9)
-
-    @property
-    def verdict(self) -> str:
-        """The verdict in words."""
-        count = len(self.lengths)
-        if self.largest_e_n is None:
-            return f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
-        if not self.beyond:
-            return f"agrees: all {count} lengths within U, largest |E_n| {number(self.largest_e_n, 2)}"
-        return (
-            f"{'may agree' if self.agrees else 'differs'}: {self.beyond} of {count} lengths beyond U, where 1 in 22 is "
-            f"by chance; largest |E_n| {number(self.largest_e_n, 2)}, which reaches {self.limit:.2f} by chance in one "
-            f"of 22 tests of {count}"
-        )
+        return self.of(self.reference, [replace(own, expanded_um=None, e_n=None) for own in self.lengths], self.notes)
 
 
 def against_stated(budget: Budget, path: Path) -> LengthTest:
@@ -128,7 +103,7 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
             f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
             "not corrected to another",
         )
-    return LengthTest(str(path), tuple(tested), notes)
+    return LengthTest.of(str(path), tested, notes)
 
 
 def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[BoardDesign]) -> LengthTest:
@@ -149,7 +124,7 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     tested = []
     for i, j in pairs:
         reference = _length(other, (other_rows[i], other_rows[j]), 0.0, 0.0, shared)
-        sigma_mm = (reference.expanded_mm or 0.0) / COVERAGE_FACTOR
+        sigma_mm = 1e-3 * (reference.expanded_um or 0.0) / COVERAGE_FACTOR
         tested.append(_length(budget, (rows[i], rows[j]), reference.measured_mm, sigma_mm, shared))
     note = (
         "both calibrations rest on boards of the same description: if it is one board, what its pitch and expansion "
@@ -162,7 +137,7 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
             "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
             "board and target for both",
         )
-    return LengthTest(str(folder), tuple(tested), notes)
+    return LengthTest.of(str(folder), tested, notes)
 
 
 SAME_VIEW_PX = 0.2
@@ -202,12 +177,14 @@ def _require_size(budget: Budget) -> None:
 
 def _length(
     budget: Budget, ends: tuple[int, int], reference_mm: float, sigma_mm: float, without: Sequence[str] = ()
-) -> Length:
+) -> TestedLength:
     """Returns a corrected length of the run, with U by all sources except ``without`` and by the reference's σ."""
     measurand = distance(budget.joint, *ends)
     variance = sum(
         float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
     )
     measured = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
-    one, two = measurand.circles
-    return Length((one, two), measured, reference_mm, COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm)))
+    expanded = 1e3 * COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm))
+    error = 1e3 * (measured - reference_mm)
+    e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
+    return TestedLength(measurand.circles, measured, reference_mm, error, expanded, e_n)

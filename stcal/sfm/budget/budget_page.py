@@ -7,22 +7,21 @@ from pathlib import Path
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.report.document import (
+    Answer,
     Block,
     Document,
     Notes,
-    Printed,
     Section,
     Table,
     bullets,
-    macro,
     page_only,
     subheading,
     tiles,
 )
 from stcal.report.text import NONE, join, number, significant
+from stcal.sfm.budget.budget_file import BudgetFile, SourceRow, Uncertainty, refusals
 from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.file import BudgetFile, LengthTestPart, Uncertainty, refusals
-from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
+from stcal.sfm.budget.length_test import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
 
@@ -60,7 +59,6 @@ variance up to which a source is not among those that limit a result."""
 
 def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
-    tone = "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
     hashes = [
         ["folder of the run", Path(file.run.folder).name],
         ["folder of the photographs", Path(file.run.images).name],
@@ -89,7 +87,7 @@ def budget_report(file: BudgetFile) -> Document:
             Section("Signature", [RELATES, signature] if certifies(file) else []),
         ],
         banner=[
-            macro("answers", [("May the run be used?", file.use)], tone) if file.use else None,
+            _answer(file),
             Table(["<Field", "<"], fields, css="text facts"),
         ],
     )
@@ -100,7 +98,7 @@ def budget_in_brief(file: BudgetFile) -> str:
     tests = [f"lengths against {test.reference}: {test.verdict}" for test in file.length_tests]
     lines = [
         _about(file),
-        f"May the run be used? {file.use}" if file.use else "",
+        *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
         _no_certificate(file) if _is_valid(file) and not certifies(file) else "",
@@ -108,6 +106,11 @@ def budget_in_brief(file: BudgetFile) -> str:
         f"inputs, contributions and {len(file.notes)} notes: -v, or --report FILE.html",
     ]
     return "\n".join(filter(None, lines))
+
+
+def _answer(file: BudgetFile) -> Answer:
+    word = "no" if not file.usable else "with care" if file.reserved else "yes"
+    return Answer(word, question="May the run be used?", said=file.use)
 
 
 def _about(file: BudgetFile) -> str:
@@ -147,14 +150,10 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
 
 def _result(file: BudgetFile) -> list[Block]:
     """Returns headline, notes, and the tables of positions, rotations and distances with their U."""
-    lengths = [
-        [
-            "–".join(e.circles),
-            *(as_exact(v, 1e-3 * e.distance_um.expanded) for v in (e.length_mm, e.corrected_mm)),
-            significant(e.distance_um.expanded),
-        ]
-        for e in file.distances
-    ]
+    lengths = []
+    for own in file.distances:
+        exact = [as_exact(v, 1e-3 * own.distance_um.expanded) for v in (own.length_mm, own.corrected_mm)]
+        lengths.append(["–".join(own.circles), *exact, significant(own.distance_um.expanded)])
     positions = [
         [face, *_with_u(e.position_mm, e.position_um.axes, file)]
         for face, e in file.faces.items()
@@ -166,7 +165,6 @@ def _result(file: BudgetFile) -> list[Block]:
         tiles(_headline(file) + tests),
         WHAT_U_IS.format(k=file.coverage_factor) if file.faces else None,
         Notes([*([_no_certificate(file)] if _is_valid(file) and not certifies(file) else []), *file.notes]),
-        Printed([f"May the run be used? {file.use}"] if file.use else []),
         file.holds if file.size_known else None,
         Table(_heads("position of face", "mm", "µm"), positions),
         Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
@@ -206,51 +204,48 @@ def _contributions(file: BudgetFile) -> list[Block]:
         ("rotations of faces, x, y, z together", "mdeg", rotations),
         ("longest distances", "µm", distances),
     )
-    return [_table(title, unit, columns, file) for title, unit, columns in kinds if columns]
+    return [
+        Table(
+            [f"<{title}, {unit}", f"sensitivity, {next(iter(columns))}", *columns],
+            [
+                *(_source_row(source, unit, columns) for source in file.sources),
+                ["combined standard uncertainty u", "", *(number(u.standard, 2) for u in columns.values())],
+                [f"expanded uncertainty U, k = {file.coverage_factor:g}", "",
+                 *(significant(u.expanded) for u in columns.values())],
+                ["coverage of U, simulated, %", "", *(number(100 * u.coverage, 1) for u in columns.values())],
+                ["effective degrees of freedom", "",
+                 *(f"{u.degrees_of_freedom:.0f}" if (u.degrees_of_freedom or MANY) < MANY else "∞"
+                   for u in columns.values())],
+            ],
+        )
+        for title, unit, columns in kinds
+        if columns
+    ]  # fmt: skip
 
 
-def _table(title: str, unit: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Table:
-    """Returns contributions by input, with the sensitivity of the first measurand, then the sums."""
-    name, first = next(iter(columns.items()))
-    rows = []
-    for source in file.sources:
-        own = {column: u.contributions[source.key] for column, u in columns.items()}
-        visible = source.sigma and first.standard and own[name] / first.standard > NEGLIGIBLE
-        slope = f"{own[name] / source.sigma:.3g} {unit}/{source.unit}" if visible and source.sigma else NONE
-        parts = [number(contribution, 2) for contribution in own.values()]
-        if source.origin == "not stated":
-            parts = [NONE] * len(parts)
-        elif (source.key, source.origin) == ("intrinsics", "estimated") and all(
-            own[column] <= IN_OTHERS * u.standard for column, u in columns.items()
-        ):  # what they do is in the rows of the centres, with which they were adjusted
-            parts = ["in the other rows"] * len(parts)
-        rows.append([source.title, slope, *parts])
-    every = columns.values()
-    freedom = [u.degrees_of_freedom or MANY + 1 for u in every]
-    return Table(
-        [f"<{title}, {unit}", f"sensitivity, {name}", *columns],
-        [
-            *rows,
-            ["combined standard uncertainty u", "", *(number(u.standard, 2) for u in every)],
-            [f"expanded uncertainty U, k = {file.coverage_factor:g}", "", *(significant(u.expanded) for u in every)],
-            ["coverage of U, simulated, %", "", *(number(100 * u.coverage, 1) for u in every)],
-            ["effective degrees of freedom", "", *("∞" if own > MANY else f"{own:.0f}" for own in freedom)],
-        ],
-    )
+def _source_row(source: SourceRow, unit: str, columns: dict[str, Uncertainty]) -> list[str]:
+    """Returns the contributions of an input, with the sensitivity of the first measurand."""
+    own = [u.contributions[source.key] for u in columns.values()]
+    first, slope = next(iter(columns.values())), NONE
+    if source.sigma and first.standard and own[0] / first.standard > NEGLIGIBLE:
+        slope = f"{own[0] / source.sigma:.3g} {unit}/{source.unit}"
+    parts = [number(contribution, 2) for contribution in own]
+    in_others = all(part <= IN_OTHERS * u.standard for part, u in zip(own, columns.values(), strict=True))
+    if source.origin == "not stated":
+        parts = [NONE] * len(parts)
+    elif (source.key, source.origin) == ("intrinsics", "estimated") and in_others:
+        # What they do is in the rows of the centres, with which they were adjusted.
+        parts = ["in the other rows"] * len(parts)
+    return [source.title, slope, *parts]
 
 
-def _length_test(test: LengthTestPart) -> list[Block]:
+def _length_test(test: LengthTest) -> list[Block]:
     """Returns the verdict of a length test, and its lengths."""
     rows = [
-        [
-            "–".join(length.circles),
-            *(number(v, 4) for v in (length.measured_mm, length.reference_mm)),
-            number(length.error_um, 2),
-            significant(length.expanded_um),
-            number(length.e_n, 2),
-        ]
-        for length in test.lengths
-    ]
+        ["–".join(own.circles), number(own.measured_mm, 4), number(own.reference_mm, 4), number(own.error_um, 2),
+         significant(own.expanded_um), number(own.e_n, 2)]
+        for own in test.lengths
+    ]  # fmt: skip
     return [
         subheading(f"Against {test.reference}"),
         f"length test against {test.reference}: {test.verdict}",
@@ -265,12 +260,7 @@ def _length_test(test: LengthTestPart) -> list[Block]:
 
 def certifies(file: BudgetFile) -> bool:
     """Returns whether the page is a certificate: the run may be used, inputs and required fields are stated."""
-    return _is_valid(file) and not _unstated(file) and not _is_reserved(file)
-
-
-def _is_reserved(file: BudgetFile) -> bool:
-    """Returns whether the run's own answer has a reservation, which no certificate can have."""
-    return file.use.startswith(("With care", "Part, with care"))
+    return _is_valid(file) and not _unstated(file) and not file.reserved
 
 
 def _is_valid(file: BudgetFile) -> bool:
@@ -285,7 +275,7 @@ def _unstated(file: BudgetFile) -> list[str]:
 
 
 def _no_certificate(file: BudgetFile) -> str:
-    if _is_reserved(file):
+    if file.reserved:
         return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
     unstated = _unstated(file)
     camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""

@@ -15,8 +15,10 @@ from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
-from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
+from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05
 """σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
@@ -26,8 +28,6 @@ RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
 """Smallest number of circles of one design radius that are compared with each other."""
-MAD_EFFICIENCY = 0.37
-"""Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,12 +83,8 @@ def measure_radii(
             faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / design_mm[label]
             ratio.setdefault(label, []).append(views.ratio[own] + hidden + faded)
             size.setdefault(label, []).append(views.size_px[own])
-    return Radii(
-        tuple(ratio),
-        np.array([design_mm[label] for label in ratio]),
-        np.array([np.median(np.concatenate(values)) for values in ratio.values()]),
-        np.array([np.median(np.concatenate(values)) for values in size.values()]),
-    )
+    medians = (np.array([np.median(np.concatenate(v)) for v in each.values()]) for each in (ratio, size))
+    return Radii(tuple(ratio), np.array([design_mm[label] for label in ratio]), *medians)
 
 
 def radius_checks(radii: Radii) -> list[Check]:
@@ -117,8 +113,8 @@ def radius_checks(radii: Radii) -> list[Check]:
         "both files are of this body, measure a circle, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge("radius", "Radius of each circle against others of its design radius", single, "circles", single_remedy),
-        judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
+        assess("radius", single, "circles", single_remedy),
+        assess("radius-design", whole, "kinds of circle", class_remedy),
     ]
 
 
@@ -140,19 +136,18 @@ def rim_check(
     has_circles: bool = True,
 ) -> Check:
     """Tests whether circles lie behind a rim, from the change of their radii with tilt."""
-    key, title = "rim", "Rim in front of the circles"
     if not has_circles:
-        return impossible(key, title, "corners alone, which have no rim", "")
+        return impossible("rim", "corners alone, which have no rim", "")
     if not rims:
-        return impossible(key, title, "too few different tilts of circles", "photograph faces from several angles")
-    measured, names, reasons, settled = [], [], [], []
+        return impossible("rim", "too few different tilts of circles", "photograph faces from several angles")
+    measured, names, reasons, settled, title = [], [], [], [], CHECKS["rim"][0]
     for kind, rim in rims.items():
         limit = rim_limit_mm(rim, sigma_mm)
         allowed = allowed_mm.get(kind, 0.0)
         beyond = 0.0 if allowed is None else rim.height_mm - allowed
         what, surface = KINDS[kind]
         look = f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep"
-        measured.append(Measured(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
+        measured.append(TestedValue(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
         if abs(beyond) > limit:
             names.append(what)
             where = "in front of" if beyond > 0 else "behind"
@@ -163,12 +158,12 @@ def rim_check(
     if not names:
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
-        return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
+        return Check("rim", title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
         "faces are where their circles appear; for the luminous surface, run without --no-rim, or state rim_mm in "
         "target.toml, of dots in board.toml"
     )
-    return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
+    return Check("rim", title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 
 
 def size_by_radii(radii: Radii) -> Size | None:
@@ -192,7 +187,6 @@ def size_by_radii(radii: Radii) -> Size | None:
 DESIGN_SCALE = 1e-4
 """Relative σ of the target's size against its design: the effect of 4 K on aluminium, or of a printer on a film."""
 MIN_DOTS = 4
-PITCH = "Scale of the board against the target's design"
 
 
 def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]:
@@ -212,10 +206,9 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
         lines += _lines(name, gap, weight, cells, board, max(1.0, square / freedom), redundancy)
     remedy = "a bent, swollen or badly printed board, or a stated σ too small: measure it, state its σ in board.toml"
     of_line = "check this line of the board for damage, and rows, columns and pitch in board.toml"
-    scale = "Scale of each row and column of the board against the rest"
     return [
-        judge("board", "Board against its stated σ", whole, "groups", remedy),
-        judge("board-lines", scale, lines, "rows and columns", of_line),
+        assess("board", whole, "groups", remedy),
+        assess("board-lines", lines, "rows and columns", of_line),
     ]
 
 
@@ -244,16 +237,17 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
 def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redundancy: float) -> list[Trial]:
     """Tests the stretch of each row along X and of each column along Y, in ppm."""
     trials = []
-    for kind, across, axis in (("row", 0, 0), ("column", 1, 1)):
-        for line in np.unique(cells[:, across]):
-            members = np.flatnonzero(cells[:, across] == line)
+    for axis, kind in enumerate(("row", "column")):
+        for line in np.unique(cells[:, axis]):
+            members = np.flatnonzero(cells[:, axis] == line)
             if len(members) < 3:
                 continue
             pattern = np.zeros((len(cells), 3))
             place = board.places_mm([DotLabel(*cell) for cell in cells[members].tolist()])[:, axis]
             pattern[members, axis] = place - place.mean()
-            information = float(pattern.ravel() @ weight @ pattern.ravel())
-            stretch = float(pattern.ravel() @ weight @ gap) / information
+            weighted = pattern.ravel() @ weight
+            information = float(weighted @ pattern.ravel())
+            stretch = float(weighted @ gap) / information
             statistic = stretch**2 * information / inflation
             trials.append(Trial(f"{name} {kind} {line}", 1e6 * stretch, "ppm", statistic, 1, redundancy))
     return trials
@@ -263,16 +257,18 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     """Tests the measured size of the target, by positions and by radii of circles, against its design, with its own σ
     of 100 ppm: no residual shows a wrong pitch. Radii that contradict the positions are left out."""
     if target.up_to_scale:
-        return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
+        return impossible("pitch", "the drawing defines the size", "state a known distance with scale")
     positions, of_radii = _size_by_positions(calibrated, target), size_by_radii(radii)
     measures = [m for m in (positions, of_radii) if m is not None]
     if not measures:
         reason = f"no face with {MIN_DOTS} circles, and no circles of two sizes"
         has_circles = any(face.printed is None for face in target.faces)
-        return impossible("pitch", PITCH, reason, "add views of the faces" if has_circles else "")
+        return impossible("pitch", reason, "add views of the faces" if has_circles else "")
     shown = measures
-    if positions and of_radii and _contradict(positions, of_radii):
-        measures = [positions]
+    if positions and of_radii:
+        square = (positions.size - of_radii.size) ** 2 / (positions.sigma**2 + of_radii.sigma**2)
+        if fdtrc(1, min(positions.freedom, of_radii.freedom), square) < SUSPICIOUS:  # they contradict each other
+            measures = [positions]
     weight = np.array([1 / m.sigma**2 for m in measures])
     size = float(weight @ [m.size for m in measures] / weight.sum())
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
@@ -287,16 +283,10 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     trial = Trial(
         "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
     )
-    check = judge("pitch", PITCH, [trial], "boards", remedy)
-    single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
+    check = assess("pitch", [trial], "boards", remedy)
+    single = tuple(TestedValue(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
     reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
     return replace(check, reason=reason, measured=check.measured + single)
-
-
-def _contradict(a: Size, b: Size) -> bool:
-    """Whether two sizes differ by more than chance."""
-    square = (a.size - b.size) ** 2 / (a.sigma**2 + b.sigma**2)
-    return float(fdtrc(1, min(a.freedom, b.freedom), square)) < SUSPICIOUS
 
 
 def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:

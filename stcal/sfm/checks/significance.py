@@ -4,32 +4,24 @@ the number of values tested (Bonferroni). One sound run in seventy shows somethi
 A culprit is named only if leaving it out cures the result, and leaving out another one does not.
 """
 
-import shlex
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.geometry.arrays import Brief, require_arguments, require_fields
+from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import ratio_limit
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import WorldModel
-from stcal.sfm.report.judgement import CAUSE, not_first
-from stcal.sfm.report.sections import ORDER
+from stcal.sfm.data.model import GroupModel, WorldModel
+from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 
-Verdict = Literal["passed", "suspicious", "failed", "not possible"]
-SUSPICIOUS = 1e-3
-FAILED = 1e-5
-"""Limits of the probability that, among all values of a check, one is as large or larger by chance."""
-BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
 MOST_ENLARGED = 3.0
@@ -37,71 +29,10 @@ MOST_ENLARGED = 3.0
 between laboratories are (Birge 1932, Phys. Rev. 40); beyond it something is wrong."""
 MOST_SIGMAS = 4.0
 """Residuals over the centres' own σ from which the model does not describe the images."""
+FREE = "free poses and points explain the images, whatever they show"
+"""Why too few images test nothing."""
 SHOWN = 8
 """Number of measurements that a check lists, the worst first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One tested value."""
-
-    name: str  # image, label, face, group, row …
-    value: float
-    limit: float | None  # in ``unit``; beyond it the value is suspicious
-    unit: str
-    probability: float | None  # of as much or more by chance, None if the value is not tested
-
-    def words(self) -> str:
-        """Returns value and limit as text."""
-        unit = f" {self.unit}" if self.unit else ""
-        limit = "" if self.limit is None else f", limit {_digits(self.limit)}"
-        return f"{_digits(self.value)}{unit}{limit}"
-
-
-def _digits(value: float) -> str:
-    """Returns a value to three digits, a large one without an exponent."""
-    text = f"{value:.3g}"
-    return f"{float(text):.0f}" if "e+" in text else text
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Check(Brief):
-    """Result of a check.
-
-    Parameters
-    ----------
-    key : str
-        Short name by which files and programs know the check.
-    title : str
-        Its name for people.
-    verdict : {"passed", "suspicious", "failed", "not possible"}
-        A failed check makes the answer of the run "no".
-    reason : str
-        The verdict in words.
-    measured : tuple of Measured
-        Values, the worst first.
-    tested : int
-        Number of values tested.
-    names : tuple of str
-        Names of the values beyond their limits, the worst first.
-    remedy : str
-        What to do about it; empty if there is nothing to do.
-    enlarges : float
-        Factor on the σ of the result by which they cover what the check found; 1 if it found nothing, or too much.
-    """
-
-    key: str
-    title: str
-    verdict: Verdict
-    reason: str
-    measured: tuple[Measured, ...]
-    tested: int
-    names: tuple[str, ...]
-    remedy: str
-    enlarges: float = 1.0
-
-    def __post_init__(self):
-        require_fields(self, f"check {self.key}", tested=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,11 +111,10 @@ def judge(
     Check
         "not possible" without trials.
     """
-    if not trials:
-        return impossible(key, title, f"no {what} to test", "")
-    trials = [trial for trial in trials if trial.redundancy > 0]
-    if not trials:
-        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
+    if not (usable := [trial for trial in trials if trial.redundancy > 0]):
+        reason, advice = (FREE, "add images") if trials else (f"no {what} to test", "")
+        return Check(key, title, "not possible", reason, (), 0, (), advice)
+    trials = usable
     count = len(trials)
     statistic, freedom, redundancy = np.array([(t.statistic, t.freedom, t.redundancy) for t in trials], float).T
     probability = fdtrc(freedom, redundancy, statistic / freedom)
@@ -200,7 +130,7 @@ def judge(
         ratio = max(float(np.sqrt(statistic.sum() / freedom.sum())), *beyond)
         verdict, enlarges = ("suspicious", ratio) if ratio <= MOST_ENLARGED else ("failed", 1.0)
     measured = tuple(
-        Measured(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
+        TestedValue(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
         for i in order[:SHOWN]
     )
     largest = f"{measured[0].name} at {measured[0].words()}"
@@ -212,26 +142,9 @@ def judge(
     return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", enlarges)
 
 
-def without_image(name: str) -> str:
-    """Returns the option that excludes an image from a run."""
-    return f"--exclude {shlex.quote(name)}"
-
-
-def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
-    """Returns the checks in the order in which to read them: the worst first, and of equal verdicts the cause of the
-    whole set, then those that name an image, last those that cannot name the cause."""
-    later = {verdict: not_first(check.key for check in checks if check.verdict == verdict) for verdict in ORDER}
-
-    def place(check: Check) -> tuple:
-        named = not images.isdisjoint(check.names)
-        return ORDER.index(check.verdict), check.key != CAUSE, not named, check.key in later[check.verdict]
-
-    return sorted(checks, key=place)
-
-
-def impossible(key: str, title: str, reason: str, remedy: str) -> Check:
-    """Returns the result of a check that this run cannot make."""
-    return Check(key, title, "not possible", reason, (), 0, (), remedy)
+def assess(key: str, trials: Sequence[Trial], what: str, remedy: str, *more: Verdict, covered: bool = False) -> Check:
+    """Returns :func:`judge` of a check that the package makes, by its title in :data:`CHECKS`."""
+    return judge(key, CHECKS[key][0], trials, what, remedy, *more, covered=covered)
 
 
 MOST = 0.5
@@ -282,39 +195,40 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
     return Guilt(where, tuple(names[i] for i in out))
 
 
+def on_face(model: GroupModel) -> np.ndarray:
+    """Returns which points of a model are those of faces, (p,)."""
+    return np.array([isinstance(label, CircleLabel) for label in model.labels])
+
+
+def apart(network: Network, columns: np.ndarray) -> np.ndarray:
+    """Returns columns (n, 2, q) of parameters with separate ones for each image, (n, 2, mq)."""
+    n, _, q = columns.shape
+    by_image = np.zeros((n, 2, len(network.model.images), q))
+    by_image[np.arange(n), :, network.model.image_index] = columns
+    return by_image.reshape(n, 2, -1)
+
+
 def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[int], count: int, where: str) -> Guilt:
     """Returns the images that further parameters, ``columns`` (n, 2, q) over σ, cure, of ``count`` values tested."""
-    n, _, q = columns.shape
-    images, place = len(network.model.images), network.model.image_index
-    apart = np.zeros((n, 2, images, q))
-    apart[np.arange(n), :, place] = columns
-    normal, right = network.score(apart.reshape(n, 2, images * q))
+    q = columns.shape[2]
+    normal, right = network.score(apart(network, columns))
     redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
 
-    def of(out: Collection[int]) -> np.ndarray:
-        return (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
-
-    def test(image: int, out: Collection[int]) -> ScoreTest:
-        own, held = of([image]), of(out)
-        if not len(held):
-            return solve_score(normal[np.ix_(own, own)], right[own])
-        away = normal[np.ix_(own, held)] @ np.linalg.pinv(normal[np.ix_(held, held)], hermitian=True)
-        return solve_score(normal[np.ix_(own, own)] - away @ normal[np.ix_(held, own)], right[own] - away @ right[held])
+    def explained(out: Collection[int]) -> ScoreTest:
+        own = (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
+        return solve_score(normal[np.ix_(own, own)], right[own])
 
     def worst(out: Collection[int]) -> int | None:
-        tests = {i: test(i, out) for i in suspects if i not in out}
-        taken = solve_score(normal[np.ix_(of(out), of(out))], right[of(out)]) if out else None
-        total, freedom = square, redundancy
-        if taken is not None:
-            total, freedom = square - taken.statistic, redundancy - taken.freedom
-        chance = {}
-        for i, t in tests.items():
-            if t.freedom:
-                rest = max(freedom - t.freedom, 1.0)
-                noise = max((total - t.statistic) / rest, 1.0)
-                chance[i] = fdtrc(t.freedom, rest, t.statistic / noise / t.freedom)
-        guilty = [i for i, probability in chance.items() if probability * count < SUSPICIOUS]
-        return max(guilty, key=lambda i: tests[i].statistic, default=None)
+        taken, gains = explained(out), {}
+        for i in (i for i in suspects if i not in out):
+            both = explained([*out, i])
+            gain, free = both.statistic - taken.statistic, both.freedom - taken.freedom
+            if free > 0:
+                rest = max(redundancy - both.freedom, 1.0)
+                noise = max((square - both.statistic) / rest, 1.0)
+                if fdtrc(free, rest, gain / noise / free) * count < SUSPICIOUS:
+                    gains[i] = gain
+        return max(gains, key=lambda i: gains[i], default=None)
 
     return culprits(network.model.images, worst, where)
 
@@ -322,12 +236,12 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
 def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign) -> bool:
     """Whether contradicting observations of a group agree if faces and board are taken by themselves: then the camera
     is right, and target and board moved relative to each other."""
-    on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])[model.point_index]
+    of_faces = on_face(model)[model.point_index]
     try:
         radius = {**target.radius_of(), **board.radius_of()}
         shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
         corrected = replace(model, shift_px=shift)
-        parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (on_face, ~on_face)]
+        parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (of_faces, ~of_faces)]
     except (StcalError, ValueError, np.linalg.LinAlgError):
         return False
     return all(n.redundancy.sum() > MIN_REDUNDANCY and n.noise() < MOST_SIGMAS**2 for n in parts)

@@ -2,8 +2,7 @@
 
 import base64
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from itertools import chain, groupby
+from itertools import chain
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from stcal.report.svg import (
     SMALL,
     Axes,
     Drawing,
-    Space,
     arrows,
     mixed_names,
     round_below,
@@ -80,24 +78,6 @@ def _points(places: Iterable) -> np.ndarray:
 def _length(share: float, points: np.ndarray) -> float:
     """Returns a share of the largest extent of points along an axis, mm; 1 if there are none."""
     return share * float(np.ptp(points, axis=0).max()) if len(points) else 1.0
-
-
-def still(parts: list[dict], azimuth: float) -> Drawing:
-    """Draws the parts of the scene from one side; sheets lie below all else."""
-    drawing = Drawing(5.4, 4.9)
-    space = Space(drawing, np.vstack([_points(part["xyz"]) for part in parts] or [np.zeros((1, 3))]), 24, azimuth)
-    for part in sorted(parts, key=lambda part: part["kind"] != "sheet"):
-        places, colour = space.at(_points(part["xyz"])), part["colour"]
-        if part["kind"] == "sheet":
-            drawing.lines([places], fill=colour, opacity=0.16)
-        elif part["kind"] == "line":
-            drawing.lines([places], colour, part["size"])
-        elif part["kind"] == "text":
-            drawing.words(places[0], part["name"], 11, colour=colour, weight="bold")
-    points = (part for part in parts if part["kind"] == "point")
-    for (size, colour), alike in groupby(points, lambda part: (part["size"], part["colour"])):
-        drawing.marks(space.at(_points(part["xyz"][0] for part in alike)), "dot", size, colour)
-    return drawing
 
 
 def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
@@ -179,51 +159,37 @@ Residuals = np.ndarray
 """Array (n, 4) of circles: centre x, y and residual x, y, px."""
 
 
-@dataclass(frozen=True, slots=True)
-class Photograph:
-    """One photograph."""
+def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> dict:
+    """Returns all photographs that the page shows, with vectors on one scale.
 
-    name: str
-    says: str  # what was found in it
-    jpeg: str  # as a data URI
-    vectors: str  # path of an SVG in px of the image
-
-
-@dataclass(frozen=True, slots=True)
-class Photographs:
-    """All photographs that the page shows, with the common scale of their vectors."""
-
-    each: tuple[Photograph, ...]
-    box: str  # the images' place in px, pixel centres integer
-    aspect: float  # width by height
-    factor: float  # by which all vectors are lengthened, 0 if there are none
-    stroke: float  # width of their lines, px
-    bar: str  # path of a bar, as long as the vector of a residual of ``bar_px``
-    bar_px: float
-
-
-def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> Photographs:
-    """Returns all photographs that the page shows, with vectors on one scale."""
+    ``each`` : of each its ``name``, what was found in it, its JPEG as a data URI, and the path of its ``vectors``;
+    ``box`` : the images' place in px, pixel centres integer; ``aspect`` : width by height; ``factor`` : by which all
+    vectors are lengthened, 0 if there are none; ``stroke`` : width of their lines, px; ``bar`` : path of a bar, as long
+    as the vector of a residual of ``bar_px``.
+    """
     width, height = report["camera"]["size_px"]
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
     lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])
     usual = float(np.quantile(lengths, 0.95)) if len(lengths) else 0.0
     factor = round_below(LONGEST * width / usual) if usual > 0 else 0.0
     bar_px = round_below(LONGEST * width / factor) if factor else 0.0
-    shown = []
+    each = []
     for name, jpeg in overlays.items():
         entry = mapped.get(name)
         says = f"{entry['observations']} centres, {number(entry['rms_px'], 4)} px RMS" if entry else "not mapped"
+        lines = residuals.get(name, np.zeros((0, 4))).tolist()
+        vectors = "".join(f"M{x:.1f} {y:.1f}l{factor * dx:.1f} {factor * dy:.1f}" for x, y, dx, dy in lines)
         uri = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
-        shown.append(Photograph(name, says, uri, _path(residuals.get(name, np.zeros((0, 4))), factor)))
-    box = f"-0.5 -0.5 {width} {height}"
-    bar = f"M{0.98 * width:.1f} {0.97 * height:.1f}h{-factor * bar_px:.1f}"
-    return Photographs(tuple(shown), box, round(width / height, 5), factor, round(width / 450, 2), bar, bar_px)
-
-
-def _path(residuals: Residuals, factor: float) -> str:
-    """Returns a path of lines from each centre along its residual."""
-    return "".join(f"M{x:.1f} {y:.1f}l{factor * dx:.1f} {factor * dy:.1f}" for x, y, dx, dy in residuals.tolist())
+        each.append({"name": name, "says": says, "jpeg": uri, "vectors": vectors})
+    return {
+        "each": each,
+        "box": f"-0.5 -0.5 {width} {height}",
+        "aspect": round(width / height, 5),
+        "factor": factor,
+        "stroke": round(width / 450, 2),
+        "bar": f"M{0.98 * width:.1f} {0.97 * height:.1f}h{-factor * bar_px:.1f}",
+        "bar_px": bar_px,
+    }
 
 
 def shown_overlays(report: dict) -> list[str]:
