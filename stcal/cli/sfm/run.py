@@ -138,7 +138,6 @@ def detect(
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.solve import require_no_calibration
     from stcal.sfm.runs.text import detection_text, found_in_all
 
     options = RunOptions(
@@ -147,7 +146,6 @@ def detect(
         workers=workers,
         exclude=tuple(exclude or ()),
     )
-    require_no_calibration(out)
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         found = detect_images(images, camera, out, target, board, options, progress)
     print_each("note", found.notes)

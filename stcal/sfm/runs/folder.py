@@ -4,7 +4,7 @@ import contextlib
 import csv
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,6 @@ import numpy as np
 
 from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
-from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
@@ -39,8 +38,7 @@ from stcal.parallel import Progress
 from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, plots, require_pdf
 from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.model import GroupModel, ImageObservations
-from stcal.sfm.detect.files import DetectedImage, DetectionResult
+from stcal.sfm.data.model import GroupModel, ImageObservations, detections_csv
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
@@ -51,8 +49,9 @@ from stcal.sfm.report.page import report_html
 from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, as_written, folder_of, require_run, verify
+from stcal.sfm.runs.start import DetectedImages, Task
 from stcal.sfm.runs.text import found_in_all
-from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
+from stcal.sfm.runs.transaction import added_results, complete_interrupted
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -61,40 +60,44 @@ HASH_DIGITS = 12
 
 
 @contextlib.contextmanager
-def overlays_beside(
-    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, run: RunFolder, progress: Progress
-) -> Iterator[dict[str, frozenset[Label]]]:
-    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block, which
-    adds to the yielded labels, by image, those that are to be crossed out."""
-    face_ids, focal_px = [face.id for face in target.faces], detection.camera.focal
+def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iterator[dict[str, frozenset[Label]]]:
+    """Writes ``detections.csv``, and draws the detections into every image while other work goes on.
 
+    All overlays exist at the end of the block, which adds to the yielded labels, by image, those that are to be crossed
+    out. Where the block fails, a page on why and what was found is written, and the error gets what most images have in
+    common; not without ``page``.
+    """
+    stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
+    save(stage / "detections.csv", detections_csv(seen.observations()))
+    pictures = {image.file.name: image for image in seen.detection.images}
     left_out: dict[str, frozenset[Label]] = {}
 
-    def draw(image: DetectedImage, each: LabelledImage, crossed: frozenset[Label] = frozenset()) -> None:
-        small = image.thumbnail, image.thumbnail_scale
-        seen, notes = each.observations, len(each.notes)
-        picture = kept_overlay(run.cache, image.digest, *small, seen, face_ids, focal_px, notes, crossed)
-        save(overlay_path(run.stage, image.file.name), picture)
+    def draw(image: LabelledImage) -> None:
+        name, picture = image.observations.name, pictures[image.observations.name]
+        small, crossed = (picture.thumbnail, picture.thumbnail_scale), left_out.get(name, frozenset())
+        drawn = image.observations, face_ids, focal_px, len(image.notes), crossed
+        save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
 
-    with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
-        drawn = pool.map(draw, _in_order(detection, labelled), labelled)
-        try:
-            yield left_out
-        except Exception:
-            raise
-        except BaseException:  # interrupted or exiting
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        for i, _ in enumerate(drawn):
-            progress("overlays", i + 1, len(labelled))
-        again = [each for each in labelled if left_out.get(each.observations.name)]
-        crosses = [left_out[each.observations.name] for each in again]
-        list(pool.map(draw, _in_order(detection, again), again, crosses))
-
-
-def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
-    by_name = {image.file.name: image for image in detection.images}
-    return [by_name[labelled_image.observations.name] for labelled_image in labelled]
+    try:
+        with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
+            drawn = [pool.submit(draw, image) for image in seen.labelled]
+            try:
+                yield left_out
+            except Exception:
+                raise
+            except BaseException:  # interrupted or exiting
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            for i, each in enumerate(drawn, 1):
+                each.result()
+                task.progress("overlays", i, len(drawn))
+            list(pool.map(draw, [image for image in seen.labelled if left_out.get(image.observations.name)]))
+    except StcalError as error:
+        if page:
+            found = found_in_all(seen.labelled)
+            save(stage / "report.html", _page_on_failure(task.target.name, str(error), found, seen))
+            error.append(f"; {found}")
+        raise
 
 
 def overlay_path(out: Path, name: str) -> Path:
@@ -265,38 +268,22 @@ def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObse
     ]
 
 
-@contextlib.contextmanager
-def shown_if_failed(
-    name: str, detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder
-) -> Iterator[None]:
-    """Where the block fails, writes a page on why and what was found, and adds what most images have in common."""
-    try:
-        yield
-    except StcalError as error:
-        seen = found_in_all(labelled)
-        save(folder.stage / "report.html", _page_on_failure(name, str(error), seen, detection, labelled))
-        error.append(f"; {seen}")
-        raise
-
-
-def _page_on_failure(
-    name: str, error: str, seen: str, detection: DetectionResult, labelled: Sequence[LabelledImage]
-) -> str:
+def _page_on_failure(name: str, error: str, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows = []
-    for each in labelled:
+    for each in seen.labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
-    left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
+    left_out = [f"{each.observations.name}: {note}" for each in seen.labelled for note in each.notes]
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
     shown = [macro("plot", place, image, image) for place, image in overlays[:FIRST_IMAGES]]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
-        Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
+        Section("What was found", [found, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
-        Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
+        Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in seen.detection.skipped])]),
         Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
-    return Document(name, f"{len(labelled)} images, no calibrated target", sections, [answer]).page()
+    return Document(name, f"{len(rows)} images, no calibrated target", sections, [answer]).page()

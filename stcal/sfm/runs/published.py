@@ -9,7 +9,7 @@ import numpy as np
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera
-from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import Scale
@@ -17,6 +17,7 @@ from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
 from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult
+from stcal.sfm.runs.solve import GroupSolution
 
 MICRO = 1e3
 AS_PUBLISHED = "as published"
@@ -32,6 +33,11 @@ class Answer:
     models: tuple[WorldModel, ...]  # without unit, one per group
     scales: dict[str, Scale]  # by group
 
+    @classmethod
+    def of(cls, solutions: Sequence[GroupSolution], calibration: Calibration) -> "Answer":
+        """Returns the answer of a run, group by group."""
+        return cls(calibration.target, tuple(s.model for s in solutions), calibration.scales)
+
 
 def require_comparable(options: AdjustOptions) -> None:
     """Refuses to compare a run that is itself a part of the published method."""
@@ -43,14 +49,14 @@ def require_comparable(options: AdjustOptions) -> None:
         )
 
 
-def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
+def compare_with_paper(result: RunResult, published: Answer | StcalError) -> Comparison:
     """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
     three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
     joint = result.calibration.joint
     if joint is None:
         raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
     whole = calibrated_target(joint, result.target, result.target_design, "three-point")
-    steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
+    steps = {AS_PUBLISHED: published, **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
@@ -77,11 +83,6 @@ def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
         except StcalError as error:
             answers[f"+ {step}"] = error
     return answers
-
-
-def answer_of(run: RunResult) -> Answer:
-    """Returns the answer of a run, group by group."""
-    return Answer(run.target, tuple(solution.model for solution in run.solutions), run.calibration.scales)
 
 
 def _alike(model: WorldModel) -> WorldModel:

@@ -1,151 +1,159 @@
-"""The first stages of a run: detection in all images, and the solution of each group, which is cached by its inputs."""
+"""The stage of a run that maps: which groups can be solved, and the solution of each, which is cached by its inputs."""
 
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from stcal.boards.design import CornerBoard
-from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError, ScaleError, StcalError
-from stcal.geometry.arrays import Brief
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape
+from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
-from stcal.io.cameras.model import CameraModel
-from stcal.io.files import save
-from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, ImageFiles, Skipped
+from stcal.io.cameras.model import CameraModel, refinable
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_in_order
 from stcal.report.text import significant
 from stcal.sfm.adjust.refine import Refined, refine
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, Check, moved_apart
-from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint
-from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
-from stcal.sfm.detect.labels import (
-    Detection,
-    LabelledImage,
-    is_board_alone,
-    label_boards,
-    label_images,
-    label_once,
-)
-from stcal.sfm.detect.published import PublishedPattern, detect_published
+from stcal.sfm.detect.labels import LabelledImage, is_board_alone
+from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
-from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
-from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
+from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model, place_with_camera
 from stcal.sfm.report.judgement import OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
-from stcal.sfm.runs.transaction import RunFolder
+from stcal.sfm.runs.start import DetectedImages, Task
 
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class DetectedImages(Brief):
-    """The circles and corners of all images.
-
-    ``detection`` : what was measured, and the images ``skipped``; ``labelled`` : images with their labels, in the
-    database's order; ``notes`` : on the camera, and on what no image shows.
-    """
-
-    detection: DetectionResult
-    labelled: tuple[LabelledImage, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def images(self) -> dict[str, Detection]:
-        """Labels, centres and covariances, px, by the name of the image."""
-        return {
-            (seen := image.observations).name: Detection(
-                seen.labels, seen.centre_px, seen.covariance_px2, tuple(image.notes)
-            )
-            for image in self.labelled
-        }
-
-
-def require_no_calibration(out: str | Path) -> None:
-    """Refuses a folder for detections that holds a finished calibration."""
-    if (Path(out) / "faces.json").exists():
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
-        )
-
-
-def require_dots(board: BoardDesign | None, option: str) -> None:
-    """Refuses a board of corners for an option whose method finds dots."""
-    if isinstance(board, CornerBoard):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Task:
-    """The subject of all stages of a run."""
-
-    files: ImageFiles
-    folder: RunFolder  # claimed
-    target: TargetDesign
-    board: BoardDesign  # without rows where there is none
-    options: RunOptions
-    progress: Progress
-
-
-def labelled_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images, and writes ``detections.csv`` into the folder."""
-    detection, labelled = detected_images(task, camera)
-    save(task.folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
-    return detection, labelled
-
-
-def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images by the rules that the options ask for."""
-    (chosen, skipped), target, options, cache = task.files, task.target, task.options, task.folder.cache
-    step = counted(task.progress, "detect", len(chosen))
-    dots = task.board if task.board.rows else None
-    published = options.solve == "paper"
-    if published:
-        require_dots(dots, "--solve paper")
-        PublishedPattern.of(target)
-    detector = detect_published if published else None
-    detection = detect_files(chosen, camera, target, dots, options.ellipses, cache, options.workers, step, detector)
-    detection = replace(detection, skipped=(*skipped, *detection.skipped))
-    require_upright(detection.images, task.board)
-    if dots is not None and (options.board_only or is_board_alone(detection)):
-        return detection, label_boards(detection, target, dots)
-    if published:
-        return detection, label_once(detection, target, dots)
-    return detection, label_images(detection, target, dots, options.ellipses, cache, options.workers)
-
-
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 LEAST_WITHOUT, MOST_WITHOUT = 3, 40
 """Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
 FEW_NAMED = 6
 SHOW_MORE = "show two faces of it at once, or one by more corners"
+UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)
+"""Errors by which one group has no solution, while others may."""
+LIKELY = "; the likely cause: "
+"""How the part of an error begins that says what the photographs that cannot be solved have in common."""
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+S = TypeVar("S")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupSolution:
     """Solution of one group in a world without unit."""
 
-    pairs: tuple[PairScore, ...]  # the ranking, the chosen pair first
+    pairs: tuple[PairScore, ...]  # the ranking, the chosen pair first; without poses
     model: WorldModel
     seeded: str  # how the pair was registered
     rounds: int  # of refinement
     left_out: dict[str, str]  # reason by image
     outliers: tuple[Outlier, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Groups:
+    """The images by the groups in which they are solved."""
+
+    labelled: tuple[LabelledImage, ...]
+    names: tuple[str, ...]  # of the groups that can be solved
+    graph: ImageGraph  # of all images
+    camera: Camera  # with which their solution begins
+    board: BoardDesign  # with the σ of its printed edges
+    options: RunOptions
+    board_alone: bool
+    notes: tuple[str, ...]  # on groups that cannot be solved
+
+    def observations(self) -> list[ImageObservations]:
+        """Returns the labelled centres of all images."""
+        return [image.observations for image in self.labelled]
+
+    def usable(self) -> list[ImageObservations]:
+        """Returns the labelled centres of the images whose groups can be solved."""
+        return [image for image in self.observations() if image.group in self.names]
+
+    def explained(self) -> AbstractContextManager[None]:
+        """Lets errors name what of the camera file is wrong, unless the file is a start alone."""
+        return nullcontext() if self.options.refine_camera else explained(self.usable(), self.camera, self.board)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """The solutions of groups, and notes on those that have none."""
+
+    groups: Groups
+    solutions: tuple[GroupSolution, ...]
+    notes: tuple[str, ...]
+
+
+def groups_of(task: Task, seen: DetectedImages) -> Groups:
+    """Returns the groups that can be solved. Without a board all images are one: nothing but the body is used, whatever
+    stands beside it. A board alone is chained, as there are no faces to adjust."""
+    options, labelled = task.options, seen.labelled
+    if not task.board.rows:
+        labelled = tuple(replace(i, observations=replace(i.observations, group=TOP_GROUP)) for i in labelled)
+    observations = [image.observations for image in labelled]
+    camera = start_of(seen.camera, seen, options)
+    board_alone = options.board_only or is_board_alone(seen.detection)
+    if board_alone and options.solve == "joint":
+        options = replace(options, solve="chain", refine_camera=False)
+    board = with_edge_sigma(task.board, observations)
+    skipped, needs_board = seen.detection.skipped, not task.target.has_scale
+    usable, notes = usable_groups(by_group(observations), skipped, board_alone, needs_board)
+    task.progress("map", 0, len(usable))
+    graph = image_graph(observations, board)
+    return Groups(labelled, tuple(usable), graph, camera, board, options, board_alone, tuple(notes))
+
+
+def start_of(model: CameraModel, seen: DetectedImages, options: RunOptions) -> Camera:
+    """Returns the camera with which a solution of the images begins."""
+    camera = model.calibrated(seen.detection.camera.width, seen.detection.camera.height)
+    return refinable(camera) if options.refine_camera else camera
+
+
+def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Mapped:
+    """Maps and refines the groups, or some of them: by the mapper; or, if faces of known shape are in view, which place
+    the whole body, by these."""
+    camera, target, board, options = groups.camera, task.target, groups.board, groups.options
+    known = () if groups.board_alone else faces_of_known_shape(board)
+    with groups.explained():
+        if known:
+            circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+            body = place_with_camera(groups.usable(), (*known, *circles), camera)
+            solutions, notes = _solve_body(task, groups, body)
+            notes += body.unlinked_notes()
+        else:
+            folders = task.folder.stage / "scratch", task.folder.cache
+            arguments = camera, target, board, options, task.progress, names or groups.names
+            solutions, notes = solve_groups(groups.observations(), groups.graph, *folders, *arguments)
+    return Mapped(groups, tuple(solutions), tuple(notes))
+
+
+def _each_group(names: Iterable[str], solve: Callable[[str], S]) -> tuple[dict[str, S], list[str]]:
+    """Returns the solutions by group, and notes on the others; raises the first error if no group has one."""
+    solutions: dict[str, S] = {}
+    errors: list[tuple[str, StcalError]] = []
+    for name in names:
+        try:
+            solutions[name] = solve(name)
+        except UNSOLVED as error:
+            errors.append((name, error))
+    if not solutions:
+        raise errors[0][1]
+    return solutions, [Note.of_group(name, error) for name, error in errors]
 
 
 def usable_groups(
@@ -155,75 +163,33 @@ def usable_groups(
     needs_board: bool = True,
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
     """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped."""
-    lost: dict[str, list[Skipped]] = {}
+    lost: dict[str, Skipped] = {}  # the first file of each group; a folder that holds only copies is not a group
     for file in skipped:
-        # A folder that holds only copies is not a group.
         group = file.name.rpartition("/")[0] or TOP_GROUP
         if file.name.lower().endswith(SUFFIXES) and (group in groups or file.gate != "copy"):
-            lost.setdefault(group, []).append(file)
-    usable: dict[str, list[ImageObservations]] = {}
-    errors: list[tuple[str, MappingError]] = []
-    for name in sorted(groups.keys() | lost.keys()):
-        group, first = groups.get(name, []), lost.get(name, [])[:1]
-        try:
-            if len(group) < 2:
-                count = f"1 usable image ({group[0].name})" if group else "0 usable images"
-                why = "".join(f", not {s.name}: {s.reason}" for s in first)
-                remedy = "add photographs from other places"
-                if name == TOP_GROUP and group and len(groups) > 1:
-                    others = _listed(g for g in groups if g != TOP_GROUP)
-                    remedy = (
-                        f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
-                        f"leave it out with --exclude {group[0].name}"
-                    )
-                raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
-            require_usable(group, board_alone, needs_board)
-        except MappingError as error:
-            errors.append((name, error))
-        else:
-            usable[name] = group
-    if not usable:
-        deeper = [f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason]
-        errors[0][1].append("".join(deeper[:1]))
-        raise errors[0][1]
-    return usable, [Note.of_group(name, error) for name, error in errors]
+            lost.setdefault(group, file)
 
+    def usable(name: str) -> list[ImageObservations]:
+        group = groups.get(name, [])
+        if len(group) < 2:
+            count = f"1 usable image ({group[0].name})" if group else "0 usable images"
+            why = f", not {lost[name].name}: {lost[name].reason}" if name in lost else ""
+            remedy = "add photographs from other places"
+            if name == TOP_GROUP and group and len(groups) > 1:
+                others = _listed([g for g in groups if g != TOP_GROUP])
+                remedy = (
+                    f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
+                    f"leave it out with --exclude {group[0].name}"
+                )
+            raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
+        require_usable(group, board_alone, needs_board)
+        return group
 
-def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
-    """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
-    images = [image for image in labelled if image.observations.group == TOP_GROUP]
-    if not images:
-        return []
-    dropped = [
-        image.observations.name
-        for image in images
-        if any(isinstance(note, Note) and note.code == BOARD_LEFT_OUT for note in image.notes)
-    ]
-    remark = (
-        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
-        "more than one group"
-        if dropped
-        else ""
-    )
-    return [
-        f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
-        f"moved{remark}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
-    ]
-
-
-def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]:
-    """Returns notes on faces that groups are named after and the target does not have."""
-    known = ", ".join(face.id for face in target.faces)
-    return [
-        f"group {group} seems to be named after face {face}, which the target does not have (faces {known}): add it to "
-        "target.toml, or rename the folder"
-        for face, group in unknown_faces(groups, target).items()
-    ]
-
-
-def _listed(names: Iterable[str], most: int = 4) -> str:
-    all_names = list(names)
-    return ", ".join(all_names[:most]) + (", …" if len(all_names) > most else "")
+    try:
+        return _each_group(sorted(groups.keys() | lost.keys()), usable)
+    except MappingError as error:
+        error.append("".join([f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason][:1]))
+        raise
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
@@ -241,6 +207,60 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False, ne
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
             "check board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
         )
+
+
+def _listed(names: Sequence[str], most: int = 4, more: str = ", …") -> str:
+    return ", ".join(names[:most]) + more * (len(names) > most)
+
+
+def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
+    """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
+    images = [image for image in labelled if image.observations.group == TOP_GROUP]
+    dropped = [
+        image.observations.name
+        for image in images
+        if any(isinstance(note, Note) and note.code == BOARD_LEFT_OUT for note in image.notes)
+    ]
+    remark = (
+        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
+        "more than one group"
+    )
+    note = (
+        f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
+        f"moved{remark if dropped else ''}; put the images of each setting of target and board into a folder of its "
+        "own, IMAGES/<group>/"
+    )
+    return [note] if images else []
+
+
+def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]:
+    """Returns notes on faces that groups are named after and the target does not have."""
+    known = ", ".join(face.id for face in target.faces)
+    return [
+        f"group {group} seems to be named after face {face}, which the target does not have (faces {known}): add it to "
+        "target.toml, or rename the folder"
+        for face, group in unknown_faces(groups, target).items()
+    ]
+
+
+def unseen_board(solutions: Sequence[GroupSolution], board: BoardDesign) -> list[str]:
+    """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
+    dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
+    return unseen_lines(dots, board.rows, board.columns)
+
+
+def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> list[str]:
+    """Returns a note on circles or corners of the faces in the result that no image shows as the design has them."""
+    mapped = {label for s in solutions for label in s.model.labels}
+    faces = {label.plane for label in mapped}
+    every = (label for face in target.faces if face.id in faces for label in face.labels())
+    missing = [str(label) for label in every if label not in mapped]
+    note = (
+        f"{_listed(missing, FEW_NAMED, ' …')}: not in the result, as too few images show "
+        f"{'it' if len(missing) == 1 else 'them'} as drawn; check radius and place in target.toml, unless something "
+        "hides it"
+    )
+    return [note] if missing else []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,13 +288,80 @@ class _Group:
             made_by(),
             self.skeleton,
             [self.camera.width, self.camera.height, self.camera.parameters()],
-            asdict(self.target.patterns_alone()),
-            asdict(self.board),
-            asdict(self.pair_options),
+            *map(asdict, (self.target.patterns_alone(), self.board, self.pair_options)),
             self.eccentricity,
         ]
         hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
         return hasher.hexdigest()[:40]
+
+
+def solve_groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    scratch: Path,  # a folder that is made and removed again
+    cache: Path,  # folder for what later runs take up
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+    names: Collection[str] | None = None,  # groups to solve, all if None
+) -> tuple[list[GroupSolution], list[str]]:
+    """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
+    solution, the error of the first group is raised."""
+    groups = {
+        name: _Group(
+            images,
+            [observations[i].name for i in graph.skeleton[name]],
+            _pairs_within(name, observations, graph),
+            camera,
+            target,
+            board,
+            options.pairs,
+            options.eccentricity,
+        )
+        for name, images in by_group(observations).items()
+        if names is None or name in names
+    }
+    paths = {name: cache / f"group-{group.key()}.npz" for name, group in groups.items()}
+    found: dict[str, GroupSolution | StcalError | None] = {name: kept(path, _stored) for name, path in paths.items()}
+    pending = [name for name, solution in found.items() if solution is None]
+    step = counted(progress, "map", len(groups))
+    for _ in range(len(groups) - len(pending)):
+        step(None)
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        jobs = [(groups[name], scratch / str(k)) for k, name in enumerate(pending)]
+        for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
+            found[name] = solution
+            if isinstance(solution, GroupSolution):
+                _save(paths[name], solution)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+    def scaled(name: str) -> GroupSolution:
+        solution = found[name]
+        try:
+            if not isinstance(solution, GroupSolution):
+                raise solution or KeyError(name)
+            find_scale(solution.model, board)
+        except UNSOLVED as error:
+            error.append(pitch_hint(groups[name].images, board))
+            raise
+        return solution
+
+    solutions, notes = _each_group(groups, scaled)
+    return list(solutions.values()), notes
+
+
+def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
+    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
+    members = [i for i, image in enumerate(observations) if image.group == group]
+    place = np.full(len(observations), -1)
+    place[members] = np.arange(len(members))
+    pairs = place[graph.pairs]
+    return pairs[(pairs >= 0).all(1)]
 
 
 def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
@@ -283,26 +370,60 @@ def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
     scratch.mkdir()
     ids, database = image_ids(images), scratch / "mapping.db"
     try:
-        pairs = rank_pairs(
-            [image for image in images if image.name in group.skeleton], camera, group.pair_options, board
-        )
+        first = [image for image in images if image.name in group.skeleton]
+        pairs = rank_pairs(first, camera, group.pair_options, board)
         write_database(database, camera, images, group.matched)
         mapping = map_group(database, scratch / "models", images, group.skeleton, ids, pairs, camera)
         refined = refine_or_explain(mapping.model, camera, group.target, board, group.eccentricity)
-    except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+    except UNSOLVED as error:
         return error
-    return GroupSolution(
-        tuple(pairs),
-        refined.model,
-        mapping.seeded,
-        refined.rounds,
-        mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model),
-        (*mapping.outliers, *refined.outliers),
-    )
+    missing = mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model)
+    outliers, ranked = (*mapping.outliers, *refined.outliers), [replace(p, second_from_first=None) for p in pairs]
+    return GroupSolution(tuple(ranked), refined.model, mapping.seeded, refined.rounds, missing, outliers)
 
 
-LIKELY = "; the likely cause: "
-"""How the part of an error begins that says what the photographs that cannot be solved have in common."""
+def _save(path: Path, solution: GroupSolution) -> None:
+    model = solution.model
+    poses = np.stack([pose.matrix() for pose in model.camera_from_model])
+    plain = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name != "model"}
+    plain |= {"pairs": [asdict(pair) for pair in solution.pairs], "outliers": [asdict(o) for o in solution.outliers]}
+    names = [model.group, model.images, model.labels]
+    keep(path, {"poses": poses} | {name: getattr(model, name) for name in _ARRAYS}, {"solution": plain, "names": names})
+
+
+def _stored(stored, meta) -> GroupSolution:
+    """Returns the solution that is kept in arrays and metadata."""
+    (group, images, labels), plain = meta["names"], meta["solution"]
+    poses = tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"])
+    arrays = {name: stored[name] for name in _ARRAYS}
+    plain["pairs"] = tuple(PairScore(**pair) for pair in plain["pairs"])
+    plain["outliers"] = tuple(Outlier(**outlier) for outlier in plain["outliers"])
+    return GroupSolution(model=WorldModel(group, tuple(images), poses, parse_labels(labels), **arrays), **plain)
+
+
+def _solve_body(task: Task, groups: Groups, body: PlacedBody) -> tuple[list[GroupSolution], list[str]]:
+    """Maps and refines the groups of a body that its faces have placed; returns the solutions, and why groups have
+    none. If there is no solution, the error of the first group is raised."""
+    camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
+    images = by_group(groups.usable())
+    step = counted(task.progress, "map", len(images))
+
+    def solved(name: str) -> GroupSolution:
+        try:
+            model = model_of_body(body, images[name], camera)
+            gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+            seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
+            is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+            refined = refine_or_explain(model.without(is_gross), camera, task.target, board, eccentricity)
+            find_scale(refined.model, board)
+        finally:
+            step(None)
+        missing = left_out(images[name], refined.model, SHOW_MORE) | left_out(images[name], model, SHOW_MORE)
+        pair, outliers = pair_of_model(refined.model), (*gross.values(), *refined.outliers)
+        return GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers)
+
+    solutions, notes = _each_group(images, solved)
+    return list(solutions.values()), notes
 
 
 def refine_or_explain(
@@ -324,16 +445,14 @@ def refine_or_explain(
         raise
 
 
-def _odd_one_out(
-    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool
-) -> str | None:
+def _odd_one_out(model: WorldModel, *arguments) -> str | None:
     """Returns the one image without which a group can be refined; None if there is none, or more than one."""
     cures: list[str] = []
     if not LEAST_WITHOUT < len(model.images) <= MOST_WITHOUT:
         return None
     for k, image in enumerate(model.images):
         with suppress(MappingError, ConvergenceError, DegenerateError):
-            refine(model.without(model.image_index == k), camera, target, board, eccentricity)
+            refine(model.without(model.image_index == k), *arguments)
             cures.append(image)
         if len(cures) > 1:
             return None
@@ -364,173 +483,8 @@ def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardD
     """Lets errors of a run that cannot be solved name what of the camera file is wrong, if the board tells it."""
     try:
         yield
-    except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+    except UNSOLVED as error:
         if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
             name = cause.title.removeprefix(OF_WHOLE_SET)
             error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
         raise
-
-
-def _save(path: Path, solution: GroupSolution) -> None:
-    model = solution.model
-    meta = {
-        "group": model.group,
-        "images": model.images,
-        "labels": model.labels,
-        "seeded": solution.seeded,
-        "rounds": solution.rounds,
-        "left_out": solution.left_out,
-        "outliers": [asdict(o) for o in solution.outliers],
-        "pairs": [
-            {f.name: getattr(p, f.name) for f in fields(PairScore) if f.name != "second_from_first"}
-            for p in solution.pairs
-        ],
-        "pair_poses": [
-            None if p.second_from_first is None else p.second_from_first.matrix().tolist() for p in solution.pairs
-        ],
-    }
-    arrays = {name: getattr(model, name) for name in _ARRAYS}
-    keep(path, {"poses": np.stack([pose.matrix() for pose in model.camera_from_model]), **arrays}, meta)
-
-
-def _stored(stored, meta) -> GroupSolution:
-    """Returns the solution that is kept in arrays and metadata."""
-    model = WorldModel(
-        meta["group"],
-        tuple(meta["images"]),
-        tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
-        parse_labels(meta["labels"]),
-        **{name: stored[name] for name in _ARRAYS},
-    )
-    pairs = tuple(
-        PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
-        for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
-    )
-    outliers = tuple(Outlier(**o) for o in meta["outliers"])
-    return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
-
-
-def solve_body(
-    observations: Sequence[ImageObservations],
-    body: PlacedBody,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    eccentricity: bool,
-    progress: Progress,
-) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines the groups of a body that its faces have placed; returns the solutions, and why groups have
-    none. If there is no solution, the error of the first group is raised."""
-    solutions: list[GroupSolution] = []
-    errors: list[tuple[str, StcalError]] = []
-    groups = by_group(observations)
-    for done, (name, group) in enumerate(groups.items(), 1):
-        try:
-            model = model_of_body(body, group, camera)
-            gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
-            seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
-            is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
-            refined = refine_or_explain(model.without(is_gross), camera, target, board, eccentricity)
-            find_scale(refined.model, board)
-        except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
-            errors.append((name, error))
-        else:
-            missing = left_out(group, refined.model, SHOW_MORE) | left_out(group, model, SHOW_MORE)
-            pair = pair_of_model(refined.model)
-            outliers = (*gross.values(), *refined.outliers)
-            solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers))
-        progress("map", done, len(groups))
-    if not solutions:
-        raise errors[0][1]
-    return solutions, [Note.of_group(name, error) for name, error in errors]
-
-
-def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
-    """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
-    dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
-    return unseen_lines(dots, board.rows, board.columns)
-
-
-def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> list[str]:
-    """Returns a note on circles or corners of the faces in the result that no image shows as the design has them."""
-    mapped = {label for s in solutions for label in s.model.labels}
-    faces = {label.plane for label in mapped}
-    every = (label for face in target.faces if face.id in faces for label in face.labels())
-    missing = [str(label) for label in every if label not in mapped]
-    if not missing:
-        return []
-    named = ", ".join(missing[:FEW_NAMED]) + (" …" if len(missing) > FEW_NAMED else "")
-    return [
-        f"{named}: not in the result, as too few images show {'it' if len(missing) == 1 else 'them'} as drawn; check "
-        "radius and place in target.toml, unless something hides it"
-    ]
-
-
-def solve_groups(
-    observations: Sequence[ImageObservations],
-    graph: ImageGraph,
-    scratch: Path,  # a folder that is made and removed again
-    cache: Path,  # folder for what later runs take up
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-    names: Collection[str] | None = None,  # groups to solve, all if None
-) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
-    solution, the error of the first group is raised."""
-    groups = [
-        _Group(
-            images,
-            [observations[i].name for i in graph.skeleton[name]],
-            _pairs_within(name, observations, graph),
-            camera,
-            target,
-            board,
-            options.pairs,
-            options.eccentricity,
-        )
-        for name, images in by_group(observations).items()
-        if names is None or name in names
-    ]
-    paths = [cache / f"group-{group.key()}.npz" for group in groups]
-    found: list[GroupSolution | StcalError | None] = [kept(path, _stored) for path in paths]
-    pending = [k for k, solution in enumerate(found) if solution is None]
-    step = counted(progress, "map", len(groups))
-    for _ in range(len(groups) - len(pending)):
-        step(None)
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    try:
-        jobs = [(groups[k], scratch / str(k)) for k in pending]
-        for k, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
-            found[k] = solution
-            if isinstance(solution, GroupSolution):
-                _save(paths[k], solution)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-    solutions: list[GroupSolution] = []
-    errors: list[tuple[str, StcalError]] = []
-    for group, solution in zip(groups, (each for each in found if each is not None), strict=True):
-        try:
-            if isinstance(solution, StcalError):
-                raise solution
-            find_scale(solution.model, board)
-        except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
-            error.append(pitch_hint(group.images, board))
-            errors.append((group.images[0].group, error))
-        else:
-            solutions.append(solution)
-    if not solutions:
-        raise errors[0][1]
-    return solutions, [Note.of_group(name, error) for name, error in errors]
-
-
-def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
-    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
-    members = [i for i, image in enumerate(observations) if image.group == group]
-    place = np.full(len(observations), -1)
-    place[members] = np.arange(len(members))
-    pairs = place[graph.pairs]
-    return pairs[(pairs >= 0).all(1)]

@@ -18,7 +18,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.report import unadjusted
-from stcal.sfm.runs.solve import Task, labelled_images
+from stcal.sfm.runs.start import Task, detect_with
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -82,8 +82,8 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     own = RunFolder(small.out, small.out / ".stcal/unfinished", small.out / ".stcal/cache")
     task = Task(find_images(folder / "images"), own, target, board, coarse, lambda *_: None)
-    detection, _ = labelled_images(task, read_camera(folder / "cameras.txt"))
-    assert not any(image.reused for image in detection.images)
+    seen = detect_with(task, read_camera(folder / "cameras.txt"))
+    assert not any(image.reused for image in seen.detection.images)
 
 
 def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
