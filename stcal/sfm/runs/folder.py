@@ -1,7 +1,6 @@
 """Files that a run writes into its folder: overlays, results, report."""
 
 import contextlib
-import csv
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
@@ -146,7 +145,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
 
 def write_report(out: Path, report: dict, run: Path) -> None:
     """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
-    page = _report_page(run, report)
+    page, _ = _report_page(run, report)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
 
@@ -209,15 +208,10 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
 
 def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
     """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
-    path = run / "report.json"
-    report = read_json(path, "run", AGAIN)
-    with as_written(path):
+    report = read_json(run / "report.json", "run", AGAIN)
+    with as_written(run / "report.json"):
         checked(report, ReportFile)
-        shown = shown_overlays(report)
-        overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
-    gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
-    with as_written(path):
-        page = report_html(report, overlays, residuals, gone=gone)
+        page, gone = _report_page(run, report)
     contents: dict[Path, str | bytes] = {out: page}
     if pdf:
         contents[out.with_suffix(".pdf")] = pdf_of(page)
@@ -226,29 +220,31 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     return tuple(contents), gone
 
 
-def _report_page(run: Path, report: dict) -> str:
-    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays)))
+def _report_page(run: Path, report: dict) -> tuple[str, int]:
+    """Returns the page with the overlays that are in the folder, and the number of those that are not."""
+    shown = shown_overlays(report)
+    overlays = {name: path.read_bytes() for name in shown if (path := overlay_path(run, name)).is_file()}
+    gone = len(shown) - len(overlays)
+    return report_html(report, overlays, _residuals(run, list(overlays)), gone), gone
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     """Returns centres and residuals of these images from ``labels.csv``."""
-    path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
-    try:
-        for row in csv_rows(read_bytes(path, MODEL_BYTES).decode()):
+    with as_written(run / "labels.csv"):
+        for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(values)
-    except (LookupError, TypeError, ValueError, csv.Error) as error:
-        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
 
 
 def require_report(saved: SavedRun) -> None:
     """Refuses a run whose report cannot be extended: of another version, without its overlays, or read-only."""
     with as_written(saved.folder / "report.json"):
-        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+        _, gone = _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+        if gone:
+            raise ValueError(f"{gone} of its overlays are missing")
     if not os.access(saved.folder, os.W_OK):
         raise InputError(
             "E-OUTPUT-UNWRITABLE",
@@ -258,14 +254,11 @@ def require_report(saved: SavedRun) -> None:
 
 def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
     """Returns all keypoints of every image as the models of the groups correct them, as measured without a model."""
-    rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
-    none = np.zeros(0, int)
-    return [
-        models[image.group].keypoints_px(image, rows.get(image.name, none))
-        if image.group in models
-        else image.centre_px
-        for image in observations
-    ]
+    corrected = {image.name: image.centre_px.copy() for image in observations}
+    for model in models.values():
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            corrected[name][model.keypoint[rows]] = model.corrected_px()[rows]
+    return list(corrected.values())
 
 
 def _page_on_failure(name: str, error: str, found: str, seen: DetectedImages) -> str:

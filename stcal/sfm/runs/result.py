@@ -1,6 +1,6 @@
 """Result of a run, and its comparison with the published method."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -113,27 +113,22 @@ def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResul
     by_pose = model.whiten(projection_jacobians(model, camera)[0])
     alone = np.linalg.inv(blocks_of(by_pose, by_pose[..., 0], model.image_index, len(model.images))[0])
     corrected, residuals = model.corrected_px(), model.residuals_px(camera)
+    images = zip(model.images, model.camera_from_model, scale**2 * alone, model.rows_by_image(), strict=True)
     return [
-        ImageResult(
-            name,
-            model.group,
-            pose,
-            scale**2 * covariance,
-            tuple(model.labels[k] for k in model.point_index[rows]),
-            corrected[rows],
-            residuals[rows],
-        )
-        for name, pose, covariance, rows in zip(
-            model.images, model.camera_from_model, alone, model.rows_by_image(), strict=True
-        )
+        ImageResult(name, model.group, pose, covariance, labels, corrected[rows], residuals[rows])
+        for name, pose, covariance, rows in images
+        for labels in [tuple(model.labels[k] for k in model.point_index[rows])]
     ]
 
 
-def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, float]:
-    """Returns the cells of a pose with σ (6,) of rotation and translation."""
-    names = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
-    values = {name: float(value) for name, value in zip(names, pose.log(), strict=True)}
-    return values | {f"sigma_{name}": float(value) for name, value in zip(names, sigma, strict=True)}
+OF_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
+
+
+def _cells(names: Sequence[str], values: np.ndarray, covariance: np.ndarray | None) -> dict[str, float]:
+    """Returns the cells of values and their σ, NaN without a covariance."""
+    sigma = np.full(len(names), np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sigmas = zip([f"sigma_{name}" for name in names], sigma.tolist(), strict=True)
+    return dict(zip(names, values.tolist(), strict=True)) | dict(sigmas)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,11 +188,13 @@ class RunResult(ByValue):
 
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
-        board = self.board_design
-        drawn = self.target_design.up_to_scale
-        distances = known_distances(board)
-        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": distances and not drawn}
-        known["drawing"] = drawn
+        board, drawn = self.board_design, self.target_design.up_to_scale
+        known = {
+            "board": board.rows,
+            "faces": faces_of_known_shape(board),
+            "distances": known_distances(board) and not drawn,
+            "drawing": drawn,
+        }
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
@@ -220,7 +217,7 @@ class RunResult(ByValue):
         """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
         return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.of_target)
 
-    def images(self) -> tuple["ImageResult", ...]:
+    def images(self) -> tuple[ImageResult, ...]:
         """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""
         calibration = self.calibration
         scale = 1.0 if calibration.joint is None else calibration.joint.sigma_scale
@@ -252,39 +249,31 @@ class RunResult(ByValue):
         return DataFrame(tables[rows]())
 
     def _faces(self) -> list[Cells]:
-        table = []
-        for face, pose in self.target.target_from_face.items():
-            covariance = self.target.face_covariance.get(face)
-            sigma = np.full(6, np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
-            table.append({"face": face} | _pose_cells(pose, sigma))
-        return table
+        covariance = self.target.face_covariance
+        poses = self.target.target_from_face.items()
+        return [{"face": face} | _cells(OF_POSE, pose.log(), covariance.get(face)) for face, pose in poses]
 
     def _circles(self) -> list[Cells]:
-        table = []
-        for label, xyz in self.target.circles.items():
-            covariance = self.target.circle_covariance.get(label)
-            sigma = np.full(3, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
-            cells = {f"{axis}_mm": float(value) for axis, value in zip("xyz", xyz, strict=True)}
-            cells |= {f"sigma_{axis}_mm": float(value) for axis, value in zip("xyz", sigma, strict=True)}
-            table.append({"label": str(label), "face": label.face} | cells)
-        return table
+        covariance, circles = self.target.circle_covariance, self.target.circles.items()
+        return [
+            {"label": str(label), "face": label.face} | _cells(OF_POSE[3:], xyz, covariance.get(label))
+            for label, xyz in circles
+        ]
 
     def _images(self) -> list[Cells]:
         return [
             {"image": image.name, "group": image.group}
-            | _pose_cells(image.camera_from_target, np.sqrt(np.diag(image.covariance)))
+            | _cells(OF_POSE, image.camera_from_target.log(), image.covariance)
             | {"circles": len(image.labels), "rms_px": image.rms_px}
             for image in self.images()
         ]
 
     def _seen(self) -> list[Cells]:
+        columns = ("x_px", "y_px", "residual_x_px", "residual_y_px")
         return [
-            {"image": image.name, "group": image.group, "label": str(label)}
-            | {"x_px": x, "y_px": y, "residual_x_px": dx, "residual_y_px": dy}
+            {"image": image.name, "group": image.group, "label": str(label)} | dict(zip(columns, row, strict=True))
             for image in self.images()
-            for label, (x, y), (dx, dy) in zip(
-                image.labels, image.xy_px.tolist(), image.residuals_px.tolist(), strict=True
-            )
+            for label, row in zip(image.labels, np.hstack([image.xy_px, image.residuals_px]).tolist(), strict=True)
         ]
 
     @property

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from stcal.sfm.adjust.uncertainty import with_differences
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
-from stcal.sfm.mapping.models import ReadModel, read_model
+from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
@@ -55,7 +55,7 @@ from stcal.sfm.runs.transaction import RESULTS, MarkerFile, complete_interrupted
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
 Value = TypeVar("Value")
-COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -238,18 +238,9 @@ def load_run(folder: str | Path) -> SavedRun:
 
 
 def _options(stored: dict) -> RunOptions:
-    for part in (stored, stored["pairs"], stored["ellipses"]):
-        for name, value in part.items():
-            if isinstance(value, list | dict) and name not in ("pairs", "ellipses", "exclude", "expect_faces"):
-                raise ValueError(f"options: {name} {value}: a single value needed")
-    lists = {key: stored.get(key, []) for key in ("exclude", "expect_faces")}
-    for key, names in lists.items():
-        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-            raise ValueError(f"options: {key} {names}: a list of names needed")
+    read: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
     pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
-    return RunOptions(
-        **(stored | {"pairs": pairs, "ellipses": ellipses, **{key: tuple(names) for key, names in lists.items()}})
-    )
+    return RunOptions(**read | {"pairs": pairs, "ellipses": ellipses})
 
 
 @contextmanager
@@ -282,24 +273,14 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         unknown = [label for label in labels if label not in known]
         if unknown or len(set(labels)) < len(labels):
             raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
-        columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
-        texts = [[row[column] for column in columns] for row in image_rows]
-        values = frozen(np.array(texts or np.zeros((0, 7)), float), (None, 7), name)
-        covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
+        texts = [[row[column] for column in COLUMNS] for row in image_rows]
+        values = frozen(np.array(texts, float).reshape(-1, len(COLUMNS)), (None, len(COLUMNS)), name)
+        centre_px, covariance = values[:, :2], values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
         fault = first_fault(covariance, OF_PIXEL, definite=True)
         if fault is not None:
             raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
-        observations.append(
-            ImageObservations(
-                name=name,
-                group=group,
-                labels=labels,
-                centre_px=values[:, :2],
-                centre=camera.normalised_from_pixel(values[:, :2]),
-                shape=np.zeros((len(image_rows), 2, 2)),
-                covariance_px2=covariance,
-            )
-        )
+        centre, shape = camera.normalised_from_pixel(centre_px), np.zeros_like(covariance)
+        observations.append(ImageObservations(name, group, labels, centre_px, centre, shape, covariance))
         corrected.append(values[:, 2:4])
     return tuple(observations), tuple(corrected)
 
@@ -313,15 +294,10 @@ class AdjustedRun:
     prior: CameraPrior | None  # of the intrinsics if they were adjusted
 
 
-def read_target_model(run: SavedRun) -> ReadModel:
-    """Reads the adjusted model of a run, mm, target frame."""
-    ids = image_ids(run.observations)
-    return read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
-
-
 def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """Repeats the final adjustment of a run, which moves nothing."""
-    read = read_target_model(run)
+    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame."""
+    ids = image_ids(run.observations)
+    read = read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
     start = CalibratedTarget(
         run.faces.reference_face,
@@ -371,11 +347,10 @@ def verify(run: AnyRun) -> Verified:
             "run it again",
         )
     present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
-    changed = [
-        name
-        for name, known in marker.sha256.items()
-        if name in present and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
-    ]
-    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - marker.sha256.keys())
-    missing = marker.sha256.keys() - present
-    return Verified(marker.version, tuple(sorted(missing)), tuple(sorted(changed)), tuple(sorted(added)))
+    known = marker.sha256
+    now = {
+        name: own_digest(content) if name == RUN_MARKER else digest_of(run / name) for name in known.keys() & present
+    }
+    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - known.keys())
+    changed = (name for name, digest in now.items() if digest != known.get(name))
+    return Verified(marker.version, *(tuple(sorted(names)) for names in (known.keys() - present, changed, added)))

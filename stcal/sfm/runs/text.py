@@ -62,11 +62,10 @@ def document_of(result: RunResult) -> Document:
 
 def _remarks(result: RunResult) -> Iterator[str]:
     """Yields what was left out, on what the size and the camera rest, and what was corrected."""
-    skipped = [f"skipped {file.name}: {file.reason}" for file in result.detection.skipped]
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
     noted = [image.observations.name for image in result.labelled if image.notes]
     outliers = sum(len(solution.outliers) for solution in result.solutions)
-    for lines in (skipped, unmapped):
+    for lines in (_skipped(result.detection), unmapped):
         yield from lines[:FIRST]
         if len(lines) > FIRST:
             yield f"and {len(lines) - FIRST} more, which the report names"
@@ -150,8 +149,11 @@ def _rims(result: RunResult) -> Iterator[str]:
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
     """Returns faces and dots of each image, and what was left out."""
-    skipped = [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
-    return "\n".join([*found_lines(labelled), *skipped, found_in_all(labelled)])
+    return "\n".join([*found_lines(labelled), *_skipped(detection), found_in_all(labelled)])
+
+
+def _skipped(detection: DetectionResult) -> list[str]:
+    return [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
 
 
 def found_in_all(labelled: Sequence[LabelledImage]) -> str:
@@ -186,9 +188,10 @@ def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
 def _boards(result: RunResult) -> list[Block]:
     """Returns λ and residuals of the board alone."""
     rows = [
-        [name, len(scale.labels), f"{scale.mm_per_unit:.6g}", f"{scale.rows_mm_per_unit:.6g}"]
-        + [f"{1e3 * value:.2f}" for value in (scale.mean_mm(), scale.spread_mm())]
-        for name, scale in result.calibration.scales.items()
+        [name, len(s.labels)]
+        + [f"{each:.6g}" for each in (s.mm_per_unit, s.rows_mm_per_unit)]
+        + [f"{1e3 * each:.2f}" for each in (s.mean_mm(), s.spread_mm())]
+        for name, s in result.calibration.scales.items()
     ]
     return [
         f"the board alone: no face of the target in {len(result.labelled)} images, so that there is no faces.json; "
@@ -199,9 +202,8 @@ def _boards(result: RunResult) -> list[Block]:
 
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
     """Yields the checks that did not pass, the worst first."""
-    if any(check.verdict in ("failed", "suspicious") for check in checks):
-        counts = count_verdicts([(check.verdict, check.remedy) for check in checks])
-        yield f"checks: {counts} ({BY_CHANCE})"
-    for check in ranked(checks, images):
-        if check.verdict in ("failed", "suspicious"):
-            yield f"{check.verdict}: {check.title}: {check.reason}{'; ' * bool(check.remedy)}{check.remedy}"
+    doubtful = [check for check in ranked(checks, images) if check.verdict in ("failed", "suspicious")]
+    if doubtful:
+        yield f"checks: {count_verdicts([(check.verdict, check.remedy) for check in checks])} ({BY_CHANCE})"
+    for check in doubtful:
+        yield f"{check.verdict}: {check.title}: {check.reason}{'; ' * bool(check.remedy)}{check.remedy}"

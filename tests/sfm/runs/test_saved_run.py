@@ -237,12 +237,12 @@ WRONG = {
     "a list for an option": (
         ".stcal/run.json",
         lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
-        "max_angle_rad [1]: a single value needed",
+        "options: max_angle_rad <1>: a finite number or None needed",
     ),
     "names that are none": (
         ".stcal/run.json",
         lambda c: c["options"].update(exclude=[7]),
-        "options: exclude [7]: a list of names needed",
+        "options: exclude <1>: a tuple, each a text, needed",
     ),
 }
 
