@@ -104,9 +104,9 @@ def run(
     )
     lines, notes = "", StringIO()  # of what was assumed and noted: the verdict is the first line
     try:
-        with redirect_stdout(notes), shared.designs_told(target, board), shared.handed_over(scheduler, send_images):
-            with StageProgress() as told:
-                result = pipeline.run(images, camera, out, target, board, options, told, every=every)
+        assumed, elsewhere = shared.designs_told(target, board), shared.handed_over(scheduler, send_images)
+        with redirect_stdout(notes), assumed, elsewhere, StageProgress() as told:
+            result = pipeline.run(images, camera, out, target, board, options, told, every=every)
         lines = run_text(result)
     except StcalError as error:
         if (page := out / "report.html").exists() and not is_finished(out):
