@@ -140,7 +140,7 @@ def run(
     options = read_options(options, model, design, scale)
     given = {"images": place, "--camera": camera, "--target": target, "--board": board}
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(place, options), given) as folder:
-        task = Task(files, folder, design, scale, options, progress, model)
+        task = Task(files, folder, design, scale, options, progress, model, Path(place).absolute())
         seen = detect(task)
         with overlays_beside(seen, task) as left_out:
             task = scaled_by_drawing(task, seen, board)
@@ -150,8 +150,7 @@ def run(
             left_out.update(unadjusted(result))
         if options.compare and result.target.target_from_face and model is not None:
             result = replace(result, comparison=compare_with_paper(result, as_published(task, model)))
-        result = checked(result, checks, progress)
-        return replace(result, judgement=write_run(result, folder.stage, progress))
+        return write_run(checked(result, checks, progress), folder.stage, progress)
 
 
 def read_images(
@@ -286,12 +285,14 @@ def result_of(task: Task, seen: DetectedImages, mapped: Mapped, calibration: Cal
     strange = tags_of_no_face(task.files[0], printed, [face for face in printed if face.id not in faces])
     return RunResult(
         out=task.folder.out,
+        photographs=task.photographs,
         camera=groups.camera,
         target_design=target,
         board_design=board,
         options=groups.options,
         detection=seen.detection,
         labelled=groups.labelled,
+        observations=tuple(observations),
         graph=groups.graph,
         solutions=solutions,
         calibration=calibration,
@@ -349,7 +350,7 @@ def _cause(result: RunResult) -> Check | None:
     cause = cause_of_drawing(result.target.target_from_face, target)
     is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
     if is_misfit and result.camera_given and not result.options.refine_camera:
-        return wrong_file(result.observations(), result.camera, board) or cause
+        return wrong_file(result.observations, result.camera, board) or cause
     return cause
 
 
@@ -381,7 +382,7 @@ def on_surface(result: RunResult, calibration: Calibration, rim: bool) -> Calibr
     heights, sigma_mm = design.rim_of(), 0.0
     if rim:
         radius = design.radius_of() | result.board_design.radius_of()
-        found = find_rims(calibration.models, result.observations(), radius, calibration.camera).get("circles")
+        found = find_rims(calibration.models, result.observations, radius, calibration.camera).get("circles")
         if found is None:
             raise InputError(
                 "E-RIM-UNKNOWN",

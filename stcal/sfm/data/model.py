@@ -194,8 +194,10 @@ class GroupModel(Measured):
         """Whitens values (n, 2) or (n, 2, k), px, by the covariances of their observations."""
         (xx, xy), (_, yy) = np.moveaxis(self.covariance_px2, (1, 2), (0, 1))
         across = np.sqrt(np.maximum(yy - xy * xy / xx, 1e-12 * yy))
-        first, second = np.moveaxis(values_px, (1, 0), (0, -1))  # observations last, as in the covariances
-        return np.moveaxis(np.stack([first / np.sqrt(xx), (second - xy / xx * first) / across]), (0, -1), (1, 0))
+        first, second = values_px[:, 0], values_px[:, 1]
+        expand = (...,) if values_px.ndim == 2 else (..., None)
+        slope, along, across = (xy / xx)[expand], np.sqrt(xx)[expand], across[expand]
+        return np.stack([first / along, (second - slope * first) / across], axis=1)
 
     def rows_by_image(self) -> list[np.ndarray]:
         """Returns the indices of the observations of each image, in the order of ``images``."""

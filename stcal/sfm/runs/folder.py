@@ -3,9 +3,9 @@
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +46,11 @@ from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
 from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
-from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, as_written, folder_of, require_run, verify
+from stcal.sfm.runs.result import AnyRun, RunResult, SavedRun, folder_of
+from stcal.sfm.runs.saved import require_run, verify
 from stcal.sfm.runs.start import DetectedImages, Task
 from stcal.sfm.runs.text import found_in_all
-from stcal.sfm.runs.transaction import added_results, complete_interrupted
+from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -109,9 +109,10 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{group}{slash}{file_name}{suffix}"
 
 
-def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
-    """Writes database, with corrected centres, models, faces and report beside the overlays; returns the judgement."""
-    observations = result.observations()
+def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
+    """Writes database, with corrected centres, models, faces and report beside the overlays; returns the run as it was
+    written."""
+    observations = result.observations
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
@@ -131,6 +132,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
         save_run_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
+    faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
@@ -140,7 +142,8 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
     progress("report", 1, 1)
-    return judgement
+    written = read_json(out / "report.json", "run", AGAIN)
+    return replace(result, corrected_px=tuple(corrected), faces_file=faces, report=written, judgement=judgement)
 
 
 def write_report(out: Path, report: dict, run: Path) -> None:
@@ -252,7 +255,7 @@ def require_report(saved: SavedRun) -> None:
         )
 
 
-def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+def _corrected_px(models: Mapping[str, GroupModel], observations: Sequence[ImageObservations]) -> list[np.ndarray]:
     """Returns all keypoints of every image as the models of the groups correct them, as measured without a model."""
     corrected = {image.name: image.centre_px.copy() for image in observations}
     for model in models.values():

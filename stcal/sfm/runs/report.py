@@ -247,7 +247,7 @@ def report_of(result: RunResult) -> ReportFile:
         "notes": [note if isinstance(note, Note) else Note(note) for note in result.notes],
         "images": [
             {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
-            for i, image in enumerate(result.observations(), start=1)
+            for i, image in enumerate(result.observations, start=1)
         ],
         "focus": [image.focus for image in result.labelled if image.focus is not None],
         "scene": _scene(result),
@@ -299,7 +299,7 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
 def residuals_px(result: RunResult) -> list[np.ndarray]:
     """Returns corrected minus projected keypoints of every image, (k, 2); NaN for keypoints not in the result."""
     models = _final_models(result)
-    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations()}
+    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations}
     for model in models.values():
         residual = model.residuals_px(result.calibration.camera)
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
@@ -311,7 +311,7 @@ def unadjusted(result: RunResult) -> dict[str, frozenset[Label]]:
     """Returns the labels of the keypoints that are not in the result, by image."""
     return {
         image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residual).any(axis=1)))
-        for image, residual in zip(result.observations(), residuals_px(result), strict=True)
+        for image, residual in zip(result.observations, residuals_px(result), strict=True)
     }
 
 

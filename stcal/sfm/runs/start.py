@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class Task:
     options: RunOptions
     progress: Progress
     camera: CameraModel | None = None  # as given
+    photographs: Path | str = ""  # the folder that they are in
 
     @property
     def camera_given(self) -> bool:

@@ -42,7 +42,7 @@ def document_of(result: RunResult) -> Document:
         blocks.append(faces_table(without_sigma_of(rows) if failed else rows, result.target.reference_face))
     else:
         blocks += _boards(result)
-    blocks += _checks(result.checks, frozenset(image.name for image in result.observations()))
+    blocks += _checks(result.checks, frozenset(image.name for image in result.observations))
     if result.comparison is not None:
         heads, compared = comparison_cells(result.comparison.model_dump())
         blocks += [

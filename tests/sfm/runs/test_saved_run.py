@@ -68,8 +68,8 @@ def grey(path) -> None:
 @pytest.mark.slow
 def test_labels_and_centres_are_the_same_numbers(written):
     result, saved = written
-    assert [image.name for image in saved.observations] == [image.name for image in result.observations()]
-    for found, known in zip(saved.observations, result.observations(), strict=True):
+    assert [image.name for image in saved.observations] == [image.name for image in result.observations]
+    for found, known in zip(saved.observations, result.observations, strict=True):
         assert (found.group, found.labels) == (known.group, known.labels)
         assert np.array_equal(found.centre_px, known.centre_px)  # all 64 bits
         # Undistorted again from the same pixels, by the same iteration to 1e-12.
@@ -119,7 +119,7 @@ def test_options_answers_and_places_are_the_same(written):
     result, saved = written
     assert saved.options == result.options
     assert saved.options.reference_face == saved.faces.reference_face == "2"
-    assert saved.images == result.out.parent / "data" / "images"
+    assert saved.photographs == result.photographs == result.out.parent / "data" / "images"
     assert saved.database == result.out / "colmap/database.db"
     found = {face: np.array(matrix) for face, matrix in saved.faces.target_from_face.items()}
     assert found.keys() == result.target.target_from_face.keys()
@@ -138,7 +138,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     shutil.copy(tmp_path / "new" / ".stcal/run.json", own / ".stcal")
     saved = load_run(own)
     assert saved.options == OTHER
-    assert saved.images == tmp_path / "some images"
+    assert saved.photographs == tmp_path / "some images"
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
 def test_a_dot_that_one_image_alone_shows_is_crossed_in_its_overlay(small_set, small_result):
     """Painted over in the three others; the overlay of the image of a dot that is used has no white there."""
     small, out = small_set("12"), DotLabel(3, 4)
-    seen = {image.name: image for image in small_result.observations() if image.group == "12"}
+    seen = {image.name: image for image in small_result.observations if image.group == "12"}
     assert all(out in image.labels for image in seen.values())
     for name in list(seen)[1:]:
         picture = cv2.imread(str(small.images / name))
