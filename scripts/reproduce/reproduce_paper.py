@@ -25,7 +25,7 @@ from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.published import AS_PUBLISHED, STEPS, Answer, in_steps
+from stcal.sfm.runs.paper import AS_PUBLISHED, STEPS, Answer, in_steps
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

@@ -33,11 +33,7 @@ from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.placed import plain_lens
 from stcal.sfm.runs.folder import overlays_beside, write_run
-from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.published import Answer, compare_with_paper, require_comparable
-from stcal.sfm.runs.report import unadjusted
-from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.solve import (
+from stcal.sfm.runs.groups import (
     Mapped,
     groups_of,
     map_groups,
@@ -48,6 +44,10 @@ from stcal.sfm.runs.solve import (
     unseen_circles,
     wrong_file,
 )
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.paper import Answer, compare_with_paper, require_comparable
+from stcal.sfm.runs.report_file import unadjusted
+from stcal.sfm.runs.run_result import RunResult
 from stcal.sfm.runs.start import (
     DetectedImages,
     Task,

@@ -84,7 +84,7 @@ def run(
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.text import found_lines, run_text
+    from stcal.sfm.runs.run_text import found_lines, run_text
     from stcal.sfm.runs.transaction import is_finished
 
     options = RunOptions(
@@ -145,7 +145,7 @@ def detect(
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.text import detection_text, found_in_all
+    from stcal.sfm.runs.run_text import detection_text, found_in_all
 
     options = RunOptions(
         solve=solve,

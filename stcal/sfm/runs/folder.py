@@ -45,11 +45,11 @@ from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
-from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
-from stcal.sfm.runs.result import AnyRun, RunResult, SavedRun, folder_of
+from stcal.sfm.runs.report_file import ReportFile, report_of, residuals_px
+from stcal.sfm.runs.run_result import AnyRun, RunResult, SavedRun, folder_of
+from stcal.sfm.runs.run_text import found_in_all
 from stcal.sfm.runs.saved import require_run, verify
 from stcal.sfm.runs.start import DetectedImages, Task
-from stcal.sfm.runs.text import found_in_all
 from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
 
 LONGEST_NAME = 200

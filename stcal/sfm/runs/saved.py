@@ -45,8 +45,8 @@ from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.report import ReportRead
-from stcal.sfm.runs.result import AnyRun, SavedRun, by_circle, folder_of, no_faces
+from stcal.sfm.runs.report_file import ReportRead
+from stcal.sfm.runs.run_result import AnyRun, SavedRun, by_circle, folder_of, no_faces
 from stcal.sfm.runs.transaction import AGAIN, RESULTS, MarkerFile, as_written, complete_interrupted, files_below
 
 COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")

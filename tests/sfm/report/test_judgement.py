@@ -18,7 +18,7 @@ from stcal.sfm.report.judgement import (
 )
 from stcal.sfm.report.page import report_html
 from stcal.sfm.report.sections import count_verdicts
-from stcal.sfm.runs.report import Remark
+from stcal.sfm.runs.report_file import Remark
 from tests.sfm.report.test_report import make
 
 KEYS = re.compile(r'(?:judge|impossible)\(\s*"([a-z-]+)"|key(?:, title)? = "([a-z-]+)"')

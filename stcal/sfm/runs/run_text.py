@@ -18,8 +18,8 @@ from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, without_sigma_of
 from stcal.sfm.report.page import CONTROL, PUBLISHED, faces_table
 from stcal.sfm.report.sections import count_verdicts
-from stcal.sfm.runs.report import face_row
-from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.report_file import face_row
+from stcal.sfm.runs.run_result import RunResult
 
 WEAK_FOCAL = 0.01
 """Relative σ of a focal length beyond which the views lack what determines it."""

@@ -32,14 +32,14 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs.groups import GroupSolution
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.solve import GroupSolution
 from stcal.sfm.runs.transaction import AGAIN, MarkerFile, as_written
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from stcal.sfm.runs.report import ReportCamera
+    from stcal.sfm.runs.report_file import ReportCamera
 
 ReportPart = TypeVar("ReportPart", bound=Part)
 Value = TypeVar("Value")
@@ -338,7 +338,7 @@ class RunResult(SavedRun):
 
     def _repr_html_(self) -> str:
         """Returns verdict, faces and checks as HTML, which notebooks show."""
-        from stcal.sfm.runs.text import document_of
+        from stcal.sfm.runs.run_text import document_of
 
         document = document_of(self)
         return html(document.about, *document.banner, *document.sections[0].blocks)

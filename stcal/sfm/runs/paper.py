@@ -16,8 +16,8 @@ from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
-from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult
-from stcal.sfm.runs.solve import GroupSolution
+from stcal.sfm.runs.groups import GroupSolution
+from stcal.sfm.runs.run_result import ComparedRow, Comparison, FaceOff, RunResult
 
 MICRO = 1e3
 AS_PUBLISHED = "as published"

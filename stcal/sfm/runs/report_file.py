@@ -21,9 +21,9 @@ from stcal.sfm.data.note import Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.judgement import Judgement
-from stcal.sfm.runs.crosscheck import Crosscheck
-from stcal.sfm.runs.result import Comparison, RunResult
-from stcal.sfm.runs.solve import GroupSolution
+from stcal.sfm.runs.groups import GroupSolution
+from stcal.sfm.runs.run_result import Comparison, RunResult
+from stcal.sfm.runs.tolerances import Crosscheck
 
 MICRO = 1e3
 Row = dict[str, Any]
