@@ -2,8 +2,8 @@
 
 import itertools
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of
 from stcal.io.cameras.read import camera_model
-from stcal.io.images import TOP_GROUP, ImageFiles, chosen_images
+from stcal.io.images import TOP_GROUP, chosen_images
 from stcal.io.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
@@ -130,56 +130,59 @@ def run(
     StcalError
         A subclass of it, with a one-line message that says what to do.
     """
-    options, progress = options or RunOptions(), progress or (lambda *_: None)
+    options = options or RunOptions()
     if out is None:
         with scratch_folder("run") as scratch:
             return replace(run(images, camera, scratch, target, board, options, progress, checks, every), out=None)
-    files, place = read_images(images, out, every, options)
-    model = None if camera is None else camera_model(camera)
-    design, scale = read_designs(target, board)
-    options = read_options(options, model, design, scale)
-    given = {"images": place, "--camera": camera, "--target": target, "--board": board}
-    with kept_processes(options.workers), run_folder(out, MarkerFile.of(place, options), given) as folder:
-        task = Task(files, folder, design, scale, options, progress, model, Path(place).absolute())
-        seen = detect(task)
+    images = frames_of_video(images, out, every)
+    with begun(images, camera, out, target, board, options, progress) as task:
+        seen = detect(task)  # and label
         with overlays_beside(seen, task) as left_out:
             task = scaled_by_drawing(task, seen, board)
             mapped = map_groups(task, groups_of(task, seen))
-            mapped, calibration = adjust(task, seen, mapped)
+            mapped, calibration = adjust(task, seen, mapped)  # scale, chain, adjust
             result = result_of(task, seen, mapped, calibration)
             left_out.update(unadjusted(result))
-        if options.compare and result.target.target_from_face and model is not None:
-            result = replace(result, comparison=compare_with_paper(result, as_published(task, model)))
-        return write_run(checked(result, checks, progress), folder.stage, progress)
+        if task.options.compare and result.target.target_from_face and task.camera is not None:
+            result = replace(result, comparison=compare_with_paper(result, as_published(task, task.camera)))
+        return write_run(checked(result, checks, task.progress), task.folder.stage, task.progress)
 
 
-def read_images(
-    images: Images, out: str | Path, every: str | int | None, options: RunOptions
-) -> tuple[ImageFiles, str | Path]:
-    """Returns the images of a folder or in memory, or the frames of a video, which are written below the folder of the
-    run; and the folder that they are in."""
-    if isinstance(images, Mapping):
-        place: str | Path = IN_MEMORY
-    elif Path(images).is_file():
+def frames_of_video(images: Images, out: str | Path, every: str | int | None) -> Images:
+    """Returns the images, of a video the folder of the chosen frames, which are written below the folder of the run."""
+    if not isinstance(images, Mapping) and Path(images).is_file():
         require_ours(Path(out))
-        place = frames_folder(out)
-        write_frames(images, place, every or AUTO)
-        every = None
-    else:
-        place = images
+        write_frames(images, frames_folder(out), every or AUTO)
+        return frames_folder(out)
     if every is not None:
         raise InputError("E-OPTION-VALUE", f"--every {every}: a video file in place of the images needed")
+    return images
+
+
+@contextmanager
+def begun(
+    images: Images,
+    camera: str | Path | Camera | CameraModel | None,
+    out: str | Path,
+    target: str | Path | TargetDesign | None,
+    board: str | Path | BoardDesign | None,
+    options: RunOptions,
+    progress: Progress | None,
+    settle: bool = True,
+) -> Iterator[Task]:
+    """Reads the inputs and claims the folder. Options are settled for a calibration, not for a detection alone."""
     if isinstance(images, Mapping):
-        return files_of_arrays(images, options.exclude), place
-    return chosen_images(place, options.exclude), place
-
-
-def read_designs(
-    target: str | Path | TargetDesign | None, board: str | Path | BoardDesign | None
-) -> tuple[TargetDesign, BoardDesign]:
-    """Returns the target, and what tells its size: also the board, if one is given or the target needs one."""
+        files, place = files_of_arrays(images, options.exclude), Path(IN_MEMORY)
+    else:
+        files, place = chosen_images(images, options.exclude), Path(images)
+    model = None if camera is None else camera_model(camera)
     design = body_of(target)
-    return design, scale_reference(None if board is None and design.has_scale else board_of(board), design)
+    scale = scale_reference(None if board is None and design.has_scale else board_of(board), design)
+    options = read_options(options, model, design, scale) if settle else options
+    given = {"images": place, "--camera": camera, "--target": target, "--board": board}
+    marker = MarkerFile.of(place, options if settle else None)
+    with kept_processes(options.workers), run_folder(out, marker, given) as folder:
+        yield Task(files, folder, design, scale, options, progress or (lambda *_: None), model, place.absolute())
 
 
 def read_options(
@@ -433,19 +436,11 @@ def detect_images(
         raise InputError(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
-    options, progress = options or RunOptions(), progress or (lambda *_: None)
-    design, scale = read_designs(target, board)
-    if isinstance(images, Mapping):
-        files, place = files_of_arrays(images, options.exclude), IN_MEMORY
-    else:
-        files, place = chosen_images(images, options.exclude), images
-    model = None if camera is None else camera_model(camera)
-    given = {"images": place, "--camera": camera, "--target": target, "--board": board}
-    with run_folder(out, MarkerFile.of(place, None), given) as folder:
-        task, notes = Task(files, folder, design, scale, options, progress, model), []
+    with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
+        notes, model = [], task.camera
         if model is None:
             model, told = camera_for_a_look(task)
-            if design.with_faces(printed=False).faces:
+            if task.target.with_faces(printed=False).faces:
                 notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
         seen = detect_with(task, model)
         if unseen := unseen_faces(task, seen.labelled):
