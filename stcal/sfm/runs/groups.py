@@ -309,16 +309,13 @@ def solve_groups(
 ) -> tuple[list[GroupSolution], list[str]]:
     """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
     solution, the error of the first group is raised."""
+    common = camera, target, board, options.pairs, options.eccentricity
     groups = {
         name: _Group(
             images,
             [observations[i].name for i in graph.skeleton[name]],
             _pairs_within(name, observations, graph),
-            camera,
-            target,
-            board,
-            options.pairs,
-            options.eccentricity,
+            *common,
         )
         for name, images in by_group(observations).items()
         if names is None or name in names
@@ -357,11 +354,9 @@ def solve_groups(
 
 def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
     """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
-    members = [i for i, image in enumerate(observations) if image.group == group]
-    place = np.full(len(observations), -1)
-    place[members] = np.arange(len(members))
-    pairs = place[graph.pairs]
-    return pairs[(pairs >= 0).all(1)]
+    within = np.array([image.group == group for image in observations])
+    pairs = graph.pairs[within[graph.pairs].all(1)]
+    return (np.cumsum(within) - 1)[pairs]
 
 
 def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:

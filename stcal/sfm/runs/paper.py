@@ -61,10 +61,7 @@ def compare_with_paper(result: RunResult, published: Answer | StcalError) -> Com
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
     sigma = {
-        face: FaceOff(
-            translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
-            rotation_mdeg=MICRO * float(np.degrees(np.sqrt(np.trace(c[:3, :3])))),
-        )
+        face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5)
         for face, c in whole.face_covariance.items()
         if face != whole.reference_face
     }
@@ -112,16 +109,21 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
         return ComparedRow(method=name, missing=others, reason=str(found))
-    faces = {}
-    for face, pose in found.target.target_from_face.items():
-        if face in others:
-            known = whole.target_from_face[face]
-            faces[face] = FaceOff(
-                translation_um=MICRO * float(np.linalg.norm(pose.translation - known.translation)),
-                rotation_mdeg=MICRO * float(np.degrees((pose @ known.inverse()).angle_rad())),
-            )
+    pairs = (
+        (face, pose, whole.target_from_face[face])
+        for face, pose in found.target.target_from_face.items()
+        if face in others
+    )
+    faces = {
+        face: _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
+        for face, pose, known in pairs
+    }
     missing = [face for face in others if face not in faces]
     return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
+
+
+def _off(translation_mm: float | np.floating, rotation_rad: float) -> FaceOff:
+    return FaceOff(translation_um=MICRO * float(translation_mm), rotation_mdeg=MICRO * float(np.degrees(rotation_rad)))
 
 
 def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, Scale]) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def _cells(names: Sequence[str], values: np.ndarray, covariance: np.ndarray | No
     return dict(zip(names, values.tolist(), strict=True)) | dict(sigmas)
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SavedRun(Brief):
     """A run: what it was given, and what it found. One that was just made is a :class:`RunResult`.
 

@@ -36,10 +36,10 @@ def document_of(result: RunResult) -> Document:
     """Returns the result of a run in short: the verdict, faces with σ, checks that did not pass, and remarks."""
     verdict, *others = [] if result.judgement is None else result.judgement.answers()
     blocks: list[Block] = []
-    if result.target.target_from_face:
-        rows = {face: face_row(result, face) for face in result.target.target_from_face}
+    faces = {face: face_row(result, face) for face in result.target.target_from_face}
+    if faces:
         failed = result.judgement is not None and result.judgement.verdict == "no"
-        blocks.append(faces_table(without_sigma_of(rows) if failed else rows, result.target.reference_face))
+        blocks.append(faces_table(without_sigma_of(faces) if failed else faces, result.target.reference_face))
     else:
         blocks += _boards(result)
     blocks += _checks(result.checks, frozenset(image.name for image in result.observations))
@@ -51,10 +51,10 @@ def document_of(result: RunResult) -> Document:
             *(f"{row.method}: {row.reason}" for row in result.comparison.rows if row.reason),
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
-    if result.out is not None:
-        camera = [f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
-        faces = [f"faces:  {result.out / 'faces.json'}"] if result.target.target_from_face else []
-        blocks.append(Printed([*faces, *camera, f"report: {result.out / 'report.html'}"]))
+    if (out := result.out) is not None:
+        files = [f"faces:  {out / 'faces.json'}"] if faces else []
+        files += [f"camera: {out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
+        blocks.append(Printed([*files, f"report: {out / 'report.html'}"]))
     first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
     return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
@@ -163,8 +163,8 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
     dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
     alike: dict[str, list[str]] = {}
     for each in labelled:
-        for note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
-            alike.setdefault(note[0], []).append(note[1])
+        for kind, note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
+            alike.setdefault(kind, []).append(note)
     most = max(alike.values(), key=len, default=[])
     reason = f"; in {len(most)} of {count}: {most[0]}" if most else ""
     return f"a face in {faces} of {count} images, the board in {dots}{reason}"
@@ -172,16 +172,15 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
 
 def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
     """Yields faces and dots of each image, and what was left out in it and helps."""
-    board_seen = any(isinstance(label, DotLabel) for each in labelled for label in each.observations.labels)
-    for labelled_image in labelled:
-        image = labelled_image.observations
-        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+    counts = [sum(isinstance(label, DotLabel) for label in each.observations.labels) for each in labelled]
+    for each, dots in zip(labelled, counts, strict=True):
+        image = each.observations
         faces = ", ".join(sorted(image.face_ids())) or "none"
         yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
-        yield from (f"  {note}" for note in labelled_image.notes)
+        yield from (f"  {note}" for note in each.notes)
         if not image.face_ids():
             yield f"  no face is read: {REMEDIES['face']}"
-        if board_seen and not dots:
+        if any(counts) and not dots:
             yield f"  the board is not read: {REMEDIES['board']}"
 
 

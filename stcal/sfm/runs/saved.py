@@ -121,18 +121,7 @@ def load_run(folder: str | Path) -> SavedRun:
     for name in (RUN_MARKER, *needed):
         if name != DATABASE:  # SQLite writes to it when it is read
             require_unchanged(folder / name)
-    return SavedRun(
-        out=folder,
-        photographs=photographs,
-        options=options,
-        camera=camera,
-        target_design=target,
-        board_design=board,
-        observations=observations,
-        corrected_px=corrected,
-        faces_file=result,
-        report=report,
-    )
+    return SavedRun(folder, photographs, options, camera, target, board, observations, corrected, result, report)
 
 
 def _options(stored: dict) -> RunOptions:
@@ -183,12 +172,8 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     ids = image_ids(run.observations)
     read = read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
-    start = CalibratedTarget(
-        run.faces.reference_face,
-        run.faces.poses(),
-        by_circle(run.faces.circles),
-        {model.group: Rigid() for model in models},
-    )
+    placed = {model.group: Rigid() for model in models}
+    start = CalibratedTarget(run.faces.reference_face, run.faces.poses(), by_circle(run.faces.circles), placed)
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     state = with_differences(state, start, run.target_design, run.faces.frame)

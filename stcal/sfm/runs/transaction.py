@@ -195,8 +195,7 @@ def is_finished(out: Path) -> bool:
 
 
 def _digests(stage: Path) -> dict[str, str]:
-    names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
-    return {name: digest_of(stage / name) for name in names}
+    return {name: digest_of(stage / name) for name in sorted(files_below(stage)) if name.split("/")[0] in RESULTS}
 
 
 def _exchange(out: Path, marker: MarkerFile, gone: Sequence[str]) -> None:
