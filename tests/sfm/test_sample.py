@@ -150,6 +150,12 @@ def test_the_report_says_what_the_files_say(calibrated):
             assert f"{value:.4f}" in html.replace("−", "-")
 
 
+def test_the_verdict_is_the_first_line_and_the_answer_is_short(calibrated):
+    lines = calibrated.text.splitlines()
+    assert lines[0].startswith("May I use it? ")
+    assert len(lines) <= 20 or calibrated.out.parent.name.startswith("small")
+
+
 def test_detections_are_where_the_truth_has_them(calibrated):
     """Ellipse centres against images of circle centres: eccentricity makes r²cosθ/D of difference, 0.1 px at most here
     (r = 7.5 mm, 1 m, f = 1678 px), noise a hundredth."""

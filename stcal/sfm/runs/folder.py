@@ -245,9 +245,10 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
 def require_report(saved: SavedRun) -> None:
     """Refuses a run whose report cannot be extended: of another version, without its overlays, or read-only."""
     with as_written(saved.folder / "report.json"):
-        _, gone = _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
-        if gone:
-            raise ValueError(f"{gone} of its overlays are missing")
+        report = {key: value for key, value in saved.report.items() if key != "crosscheck"}
+        for name in shown_overlays(report):
+            overlay_path(saved.folder, name).stat()
+        _report_page(saved.folder, report)
     if not os.access(saved.folder, os.W_OK):
         raise InputError(
             "E-OUTPUT-UNWRITABLE",

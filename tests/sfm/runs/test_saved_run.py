@@ -13,7 +13,7 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
-from stcal.sfm import run
+from stcal.sfm import run, uncertainty_budget
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.target import read_target
@@ -88,6 +88,12 @@ def test_corrected_centres_are_those_of_the_models(written):
         found = np.array([by_name[name][k] for name, k in zip(names, model.keypoint, strict=True)])
         assert np.array_equal(found, model.corrected_px())
         assert np.abs(model.shift_px).max() > 0.01  # they differ from the measured ones
+
+
+def test_a_run_just_made_gives_what_its_folder_gives(small_result, small_run):
+    made, read = (uncertainty_budget(each).file.content() for each in (small_result, small_run))
+    assert made == read
+    assert set(made["faces"]) == {"2", "4", "5"}
 
 
 def test_an_image_without_a_label_keeps_its_place(written):
