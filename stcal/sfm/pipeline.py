@@ -221,8 +221,7 @@ def read_options(
 
 
 def scaled_by_drawing(task: Task, seen: DetectedImages, board: str | Path | BoardDesign | None) -> Task:
-    """Returns the task in the unit of the drawing if nothing of known size was given, or is in view; refuses images in
-    which no printed face is seen, and no other one."""
+    """Returns the task, in the unit of the drawing if nothing of known size is seen; refuses unseen printed faces."""
     labels = [image.observations.labels for image in seen.labelled]
     if task.options.board_only:
         return task
@@ -236,9 +235,8 @@ def scaled_by_drawing(task: Task, seen: DetectedImages, board: str | Path | Boar
 
 
 def adjust(task: Task, seen: DetectedImages, mapped: Mapped) -> tuple[Mapped, Calibration]:
-    """Scales the groups, chains the faces and adjusts all together. What disagrees with the others by the first camera
-    may agree by the refined one: groups with gross errors are mapped again with it. If the faces do not tell the lens
-    of a camera that was not given, all is done again with a plain one."""
+    """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
+    agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
     calibration = adjusted(task, mapped)
     groups = mapped.groups
     doubted = {s.model.group for s in mapped.solutions if s.outliers and groups.options.refine_camera}
@@ -331,8 +329,7 @@ def as_published(task: Task, model: CameraModel) -> Answer | StcalError:
 
 
 def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> RunResult:
-    """Returns the result with its checks, the caller's ``own`` last, and with σ that cover what they found; behind rims
-    if these are stated, asked for, or certain."""
+    """Returns the result with its checks, the caller's ``own`` last, σ that cover their findings, and rims."""
     evidence = result.evidence(camera_prior(result.camera))
     if result.options.rim is None:
         evidence = replace(evidence, rim=shows_rim(evidence))

@@ -160,8 +160,7 @@ MOST_OFF = 0.05
 
 
 def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -> float | None:
-    """Returns the distance of neighbouring dots, mm, by their radius in the board file: the median over all dots of the
-    step by the image's homography, in units of the ellipse. None if too few dots, or corners, are seen."""
+    """Returns the median pitch of the dots, mm, by their radius in the board file; None if too few are seen."""
     if board.radius_mm <= POINT_RADIUS_MM:
         return None
     radius, pitches = board.radius_of(), []

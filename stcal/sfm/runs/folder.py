@@ -110,8 +110,7 @@ def overlay_path(out: Path, name: str) -> Path:
 
 
 def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
-    """Writes database, with corrected centres, models, faces and report beside the overlays; returns the run as it was
-    written."""
+    """Writes database, models, faces and report beside the overlays; returns the run as it was written."""
     observations = result.observations
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}

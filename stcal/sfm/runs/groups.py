@@ -100,8 +100,7 @@ class Mapped:
 
 
 def groups_of(task: Task, seen: DetectedImages) -> Groups:
-    """Returns the groups that can be solved. Without a board all images are one: nothing but the body is used, whatever
-    stands beside it. A board alone is chained, as there are no faces to adjust."""
+    """Returns the groups that can be solved; without a board all images are one, and a board alone is chained."""
     options, labelled = task.options, seen.labelled
     if not task.board.rows:
         labelled = tuple(replace(i, observations=replace(i.observations, group=TOP_GROUP)) for i in labelled)
@@ -125,8 +124,7 @@ def start_of(model: CameraModel, seen: DetectedImages, options: RunOptions) -> C
 
 
 def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Mapped:
-    """Maps and refines the groups, or some of them: by the mapper; or, if faces of known shape are in view, which place
-    the whole body, by these."""
+    """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
     camera, target, board, options = groups.camera, task.target, groups.board, groups.options
     known = () if groups.board_alone else faces_of_known_shape(board)
     with groups.explained():
@@ -397,8 +395,7 @@ def _stored(stored, meta) -> GroupSolution:
 
 
 def _solve_body(task: Task, groups: Groups, body: PlacedBody) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines the groups of a body that its faces have placed; returns the solutions, and why groups have
-    none. If there is no solution, the error of the first group is raised."""
+    """Maps and refines the groups of a body that its faces have placed; returns solutions, and notes on others."""
     camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
     images = by_group(groups.usable())
     step = counted(task.progress, "map", len(images))
@@ -455,8 +452,7 @@ def _odd_one_out(model: WorldModel, *arguments) -> str | None:
 
 
 def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:
-    """Returns a failed check that names what of a camera file is wrong by the dots of the board alone, whose places are
-    known: another camera explains what it leaves as residuals."""
+    """Returns a failed check that names what of a camera file is wrong by the dots of the board alone."""
     if not board.rows:
         return None
     try:

@@ -107,10 +107,7 @@ class RunOptions:
         return settled
 
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
-        """Returns the faces that the photographs were to show, in the order of the design.
-
-        ``groups`` : names of all groups, those included that could not be solved.
-        """
+        """Returns the faces that the photographs of all ``groups``, also of lost ones, were to show."""
         if self.board_only:
             return []
         ids = [face.id for face in target.faces]

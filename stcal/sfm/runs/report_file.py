@@ -201,8 +201,7 @@ class ReportRead(Part):
     summary: SummaryRead
 
     def names(self) -> list[tuple[str, str, int]]:
-        """Returns (name, group, circles) of the images in the database's order; KeyError or ValueError if they are
-        damaged."""
+        """Returns (name, group, circles) of the images in the database's order."""
         pairs = {entry.name: entry.pairs[0] for entry in self.groups}
         group_of = {entry.name: entry.group for entry in self.images}
         for name, group in group_of.items():

@@ -91,8 +91,7 @@ def require_dots(board: BoardDesign | None, option: str) -> None:
 
 
 def detect(task: Task) -> DetectedImages:
-    """Detects and labels the images with the camera that was given, or with one that the printed faces of the target,
-    or else the dots of the board, determine."""
+    """Detects and labels with the camera given, or with the one that printed faces, or the board's dots, determine."""
     if task.camera is None and (printed := task.target.with_faces(printed=True)).faces:
         return _detect_by_faces(task, printed)
     camera = task.camera
@@ -137,8 +136,7 @@ def _detect_by_faces(task: Task, printed: TargetDesign) -> DetectedImages:
 
 
 def camera_by_dots(task: Task, rough: CameraModel | None) -> CameraModel:
-    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens: the adjustment
-    of all groups estimates it again from the same dots."""
+    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens."""
     files = task.files[0]
     start = guessed_cameras(files)[0] if rough is None else rough.calibrated(*require_common_size(files)[0])
     seen = detect_with(task.named("{} for the camera"), model_of(start, PHOTOGRAPHS))
@@ -146,8 +144,7 @@ def camera_by_dots(task: Task, rough: CameraModel | None) -> CameraModel:
 
 
 def camera_for_a_look(task: Task) -> tuple[CameraModel, bool]:
-    """Returns the camera with which images are detected where none is given, and whether the dots of the board told it.
-    Else it is one of medium focal length: in a wide image faces far from the middle may lose their names."""
+    """Returns the camera for a detection without one, and whether dots told it; else it has a medium focal length."""
     if task.board.rows:
         with suppress(DetectionError, DegenerateError):
             return camera_by_dots(task, None), True
