@@ -37,7 +37,7 @@ from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.sfm import MeasureOptions, Tracker, measure, read_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.support.arms import LEFT, MARKERS, RIGHT, elastic, two_arms

@@ -25,7 +25,7 @@ from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.published import AS_PUBLISHED, STEPS, Answer, answer_of, in_steps
+from stcal.sfm.runs.paper import AS_PUBLISHED, STEPS, Answer, in_steps
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 
@@ -94,7 +94,8 @@ def trial(seed: int, width: int, folder: Path) -> dict[str, Errors]:
     published = run(*given, folder / "paper", *designs, RunOptions(solve="paper"))
     ours = run(*given, folder / "run", *designs)
     sigma = {f: 1e3 * float(np.sqrt(np.trace(c[3:, 3:]))) for f, c in ours.target.face_covariance.items()}
-    found = {PAPER: answer_of(published), **in_steps(ours), OURS: answer_of(ours)}
+    paper, own = (Answer.of(each.solutions, each.calibration) for each in (published, ours))
+    found = {PAPER: paper, **in_steps(ours), OURS: own}
     failed = {name: str(each) for name, each in found.items() if isinstance(each, StcalError)}
     if failed:
         raise SystemExit(f"trial {seed}: {failed}")

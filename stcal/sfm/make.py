@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from math import comb
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.board_file import load_dots, save_board
@@ -48,15 +49,6 @@ class Side:
     height: float
     box_from_plate: Rigid  # origin lower left as seen from outside, Y upwards, Z outwards
 
-    @property
-    def edge(self) -> float:
-        """Width of the margin without circles, mm."""
-        return EDGE_SHARE * min(self.width, self.height)
-
-    def outline(self) -> np.ndarray:
-        """Returns the corners of the plate, (4, 2), mm."""
-        return np.array([[0, 0], [self.width, 0], [self.width, self.height], [0, self.height]])
-
 
 NAMES = ("front", "right", "back", "left", "top")
 """Names of the sides that may have circles."""
@@ -73,22 +65,20 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
         ("left", d, h, (-y, z), (-w, d, -h)),
         ("top", w, d, (x, y), (-w, -d, h)),
     )
-    side_of = {
-        name: Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
-        for name, width, height, (x, y), corner in rows
-    }
-    return [side_of[name] for name in names]
+    box = {row[0]: row for row in rows}
+    return [
+        Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
+        for name, width, height, (x, y), corner in map(box.__getitem__, names)
+    ]
 
 
 def faces_of(text: str) -> tuple[str, ...]:
     """Parses ``front,right,top`` into the names of sides; all of them if the text is empty."""
-    names = tuple(name.strip().lower() for name in text.split(",")) if text else NAMES
-    require_sides(names, text)
-    return names
+    return require_sides(tuple(name.strip().lower() for name in text.split(",")) if text else NAMES, text)
 
 
-def require_sides(names: Sequence[str], text: str) -> None:
-    """Refuses names of sides that are unknown, occur twice, or have no neighbour."""
+def require_sides(names: tuple[str, ...], text: str) -> tuple[str, ...]:
+    """Returns names of sides; refuses those that are unknown, occur twice, or have no neighbour."""
     for name in names:
         if name not in NAMES:
             raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}")
@@ -100,6 +90,7 @@ def require_sides(names: Sequence[str], text: str) -> None:
             f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; "
             "use such as front,right,top",
         )
+    return names
 
 
 def size_of(text: str) -> tuple[float, float, float]:
@@ -157,13 +148,12 @@ def make_pattern(
     for side in sides:
         least, best = circles + 1, None
         for _ in range(TRIES):
-            face = _strewn(side, circles, radius_mm, rng)
-            if face is None:
-                continue
-            # With itself turned or mirrored, or another one or its mirror image.
-            pairs = [(other, mirrored) for other in (face, *faces) for mirrored in (False, True)]
-            if (alike := max(in_common(face, *pair) for pair in pairs)) < least:
-                least, best = alike, face
+            if (face := _strewn(side, circles, radius_mm, rng)) is not None:
+                # With itself turned or mirrored, or another one or its mirror image.
+                pairs = [(other, mirrored) for other in (face, *faces) for mirrored in (False, True)]
+                least, best = min(
+                    (least, best), (max(in_common(face, *pair) for pair in pairs), face), key=itemgetter(0)
+                )
             if least == 0:
                 break
         if best is None:
@@ -185,38 +175,33 @@ def make_pattern(
 
 def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) -> FaceDesign | None:
     """Returns one random pattern, or None if the last circles had no room."""
-    size = np.array([side.width, side.height])
-    large = LARGE * radius_mm
-    low, high = np.full(2, side.edge + large), size - side.edge - large
+    size, large = np.array([side.width, side.height]), LARGE * radius_mm
+    margin = EDGE_SHARE * size.min()
+    low, high = np.full(2, margin + large), size - margin - large
     if (high <= low).any():
         return None
     corner = CORNER_SHARE * (high - low)
     first = low + rng.random(2) * corner
     second = np.array([high[0] - rng.random() * corner[0], first[1]])  # X runs along the plate's edge
     third = np.array([low[0], high[1]]) + rng.random(2) * corner * [1, -1]
-    xy = [_on_grid(place) for place in (first, second, third)]
+    xy = list(np.rint(np.array([first, second, third]) / GRID_MM) * GRID_MM)
     radii = [large, large, large]
     for place in range(3, count):
         radius = large if place % 2 == 0 else radius_mm
-        edge = side.edge + radius
-        places = _on_grid(edge + rng.random((PLACES, 2)) * (size - 2 * edge))
-        gap = np.linalg.norm(places[:, None] - np.array(xy), axis=2) - np.array(radii) - radius
-        gap = gap.min(1)
+        edge = margin + radius
+        places = np.rint((edge + rng.random((PLACES, 2)) * (size - 2 * edge)) / GRID_MM) * GRID_MM
+        gap = (cdist(places, xy) - radii - radius).min(1)
         if gap.max() < GAP * radius_mm:
             return None
         xy.append(places[int(gap.argmax())])
         radii.append(radius)
-    distances = np.linalg.norm(np.array(xy[:3])[:, None] - np.array(xy[:3]), axis=2) + np.diag([np.inf] * 3)
-    if distances.min() < 2 * large + GAP * radius_mm:
+    if pdist(xy[:3]).min() < 2 * large + GAP * radius_mm:
         return None
     rows = [(str(i), *place.tolist(), radius) for i, (place, radius) in enumerate(zip(xy, radii, strict=True), 1)]
     face, plate_from_face = face_of_drawing(side.name, rows, "1", "2", "3")
-    outline = plate_from_face.inverse() @ np.pad(side.outline(), ((0, 0), (0, 1)))
+    corners = [[0, 0, 0], [side.width, 0, 0], [side.width, side.height, 0], [0, side.height, 0]]
+    outline = plate_from_face.inverse() @ np.array(corners, float)
     return replace(face, rough_target_from_face=side.box_from_plate @ plate_from_face, outline_mm=outline[:, :2])
-
-
-def _on_grid(place: np.ndarray) -> np.ndarray:
-    return np.rint(place / GRID_MM) * GRID_MM
 
 
 TILT_RAD = np.radians(40.0)
@@ -229,21 +214,18 @@ def unnamed_cases(
 ) -> tuple[list[tuple[str, tuple[str, ...]]], int]:
     """Cases (face, hidden circles) whose visible circles the finder does not read, and the number of all."""
     finder = FaceFinder(target)
-    failed, done = [], 0
-    total = sum(comb(len(face.ids), hidden) for face in target.faces)
-    for face in target.faces:
-        ellipses = _seen(face, target, camera, distance_mm)
-        for hidden_rows in combinations(range(len(face.ids)), hidden):
-            visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
-            readings = finder.find(Candidates.of(ellipses.select(visible), camera)).faces
-            right = [reading for reading in readings if reading.face is face and len(readings) == 1]
-            named = {(i, int(row)) for r in right for i, row in enumerate(r.index) if row >= 0}
-            if named != {(int(circle), row) for row, circle in enumerate(visible)}:
-                failed.append((face.id, tuple(face.ids[i] for i in hidden_rows)))
-            done += 1
-            if progress is not None and (done % 20 == 0 or done == total):
-                progress(done, total)
-    return failed, total
+    failed, cases = [], [(face, rows) for face in target.faces for rows in combinations(range(len(face.ids)), hidden)]
+    ellipses = {face.id: _seen(face, target, camera, distance_mm) for face in target.faces}
+    for done, (face, hidden_rows) in enumerate(cases, 1):
+        visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
+        readings = finder.find(Candidates.of(ellipses[face.id].select(visible), camera)).faces
+        right = [reading for reading in readings if reading.face is face and len(readings) == 1]
+        named = {(i, int(row)) for r in right for i, row in enumerate(r.index) if row >= 0}
+        if named != {(int(circle), row) for row, circle in enumerate(visible)}:
+            failed.append((face.id, tuple(face.ids[i] for i in hidden_rows)))
+        if progress is not None and (done % 20 == 0 or done == len(cases)):
+            progress(done, len(cases))
+    return failed, len(cases)
 
 
 def _seen(face: FaceDesign, target: TargetDesign, camera: Camera, distance_mm: float) -> Ellipses:
@@ -325,20 +307,15 @@ class DesignOptions(Brief):
         require_sides(self.faces, ",".join(self.faces))
 
     def ideal_camera(self) -> Camera:
-        """Returns the camera without its distortion, or a default camera if none is given.
-
-        Raises InputError if the camera file states no image size.
-        """
-        width, height = self.width, round(self.width * 2 / 3)
-        focal = np.full(2, FOCAL_PER_WIDTH * width)
-        model = None if self.camera is None else camera_model(self.camera)
-        if model is not None:
+        """Returns the camera without its distortion, or a default camera if none is given."""
+        width, height, focal = self.width, round(self.width * 2 / 3), np.full(2, FOCAL_PER_WIDTH * self.width)
+        if self.camera is not None:
+            model = camera_model(self.camera)
             width, height, focal = model.width, model.height, model.focal
-        if not (width and height):
-            raise InputError(
-                "E-CAMERA-SIZE",
-                f"camera file {model and model.source} states no image size; add it to the file",
-            )
+            if not (width and height):
+                raise InputError(
+                    "E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file"
+                )
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
     def least_radius_mm(self) -> float:
@@ -364,11 +341,9 @@ class Made:
 def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
     """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` is called with (done,
     total) cases of hidden circles."""
-    least = options.least_radius_mm()
-    radius = options.radius_mm
+    least, radius = options.least_radius_mm(), options.radius_mm
     if radius is None:
-        suitable = max(least, RADIUS_SHARE * min(options.size_mm))
-        radius = float(np.ceil(suitable / RADIUS_STEP_MM - 1e-9) * RADIUS_STEP_MM)
+        radius = _up_to(RADIUS_STEP_MM, max(least, RADIUS_SHARE * min(options.size_mm)))
     if radius < least:
         raise InputError(
             "E-MAKE-RADIUS",
@@ -400,9 +375,13 @@ def make_target(options: DesignOptions, progress: Callable[[int, int], None] | N
     )
 
 
+def _up_to(step: float, value: float) -> float:
+    """Returns the next multiple of ``step``."""
+    return float(np.ceil(value / step - 1e-9) * step)
+
+
 def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
-    pitch = max(PITCH_SHARE * max(options.size_mm), 4 * least_mm)
-    pitch = float(np.ceil(pitch / PITCH_STEP_MM - 1e-9) * PITCH_STEP_MM)
+    pitch = _up_to(PITCH_STEP_MM, max(PITCH_SHARE * max(options.size_mm), 4 * least_mm))
     camera, (width, _, depth) = options.ideal_camera(), options.size_mm
     beside = FIELD_SHARE * options.distance_mm * camera.width / camera.focal[0] - np.hypot(width, depth)
     while pitch * COLUMNS > beside and pitch - PITCH_STEP_MM >= 4 * least_mm:
@@ -413,17 +392,14 @@ def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
 
 def made_text(made: Made) -> str:
     """Returns a text that describes the target and how well its faces are told apart."""
-    options, target = made.options, made.pattern.target
-    large, alike = LARGE * made.radius_mm, made.pattern.likeness
-    common = f"at most {alike} of its circles" if alike else "never four circles"
-    return "\n".join(
-        [
-            f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
-            f"{large:g} mm, {target.polarity}",
-            f"smallest radius that is seen well at {options.distance_mm:g} mm: {made.least_mm:.2f} mm",
-            f"a face has {common} in common with another face, a mirror image or itself turned",
-            f"named with any {HIDDEN} circles hidden: {made.cases} of {made.cases} cases",
-        ]
+    options, target, alike = made.options, made.pattern.target, made.pattern.likeness
+    return (
+        f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
+        f"{LARGE * made.radius_mm:g} mm, {target.polarity}\n"
+        f"smallest radius that is seen well at {options.distance_mm:g} mm: {made.least_mm:.2f} mm\n"
+        f"a face has {f'at most {alike} of its circles' if alike else 'never four circles'} in common with another "
+        "face, a mirror image or itself turned\n"
+        f"named with any {HIDDEN} circles hidden: {made.cases} of {made.cases} cases"
     )
 
 
@@ -474,27 +450,21 @@ def design_target(
         Circles are too small or too large for the camera, too few or without room, a face is not told apart, or
         ``target.toml`` exists.
     """
-    target_file, board_file = _free(out)
-    board = load_dots(board_file) if board_file is not None and os.path.lexists(board_file) else None
+    folder = _free(out)
+    kept = folder / "board.toml" if folder and os.path.lexists(folder / "board.toml") else None
+    board = load_dots(kept) if kept else None
     made = make_target(options, progress and partial(progress, "patterns"))
     target, noise, source = made.pattern.target, *expected_noise()
-    session = PlanOptions(
-        images=images,
-        distance_mm=options.distance_mm,
-        width=options.width,
-        camera=options.camera,
-        noise=noise,
-        seed=options.seed,
-    )
+    same = {name: getattr(options, name) for name in ("distance_mm", "width", "camera", "seed")}
+    session = PlanOptions(images=images, noise=noise, **same)
     forecast = plan(session, target, board or made.board, target.rough_poses())
-    files: tuple[Path, ...] = ()
-    if target_file is not None and board_file is not None:
-        save_target(target_file, target)
-        files = (target_file,)
-        if board is None:
-            save_board(board_file, made.board)
-            files = target_file, board_file
-    return DesignedTarget(target, board or made.board, forecast, "", source, made, files)
+    files: list[Path] = []
+    if folder is not None:
+        files = [folder / "target.toml", *([] if kept else [folder / "board.toml"])]
+        save_target(files[0], target)
+        for path in files[1:]:
+            save_board(path, made.board)
+    return DesignedTarget(target, board or made.board, forecast, "", source, made, tuple(files))
 
 
 @require_arguments
@@ -539,7 +509,7 @@ def design_tag_body(
         not fit into the image.
     """
     require_size([size_mm], f"{size_mm:g}")
-    path, _ = _free(out)
+    folder = _free(out)
     target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id, faces), expected_noise(of_corners=True)
     forecast, reason = None, ""
     try:
@@ -548,16 +518,16 @@ def design_tag_body(
         if error.code != "E-PLAN-UNLINKED":
             raise
         reason = str(error)
-    if path is not None:
+    files = [] if folder is None else [folder / "target.toml"]
+    for path in files:
         save_target(path, target)
-    return DesignedTarget(target, None, forecast, reason, source, None, () if path is None else (path,))
+    return DesignedTarget(target, None, forecast, reason, source, None, tuple(files))
 
 
-def _free(out: str | Path | None) -> tuple[Path | None, Path | None]:
-    """Returns the places of the two files in a folder, in which there must be no target yet."""
-    if out is None:
-        return None, None
-    target_file = Path(out) / "target.toml"
-    if os.path.lexists(target_file):
-        raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
-    return target_file, Path(out) / "board.toml"
+def _free(out: str | Path | None) -> Path | None:
+    """Returns the folder for the files, in which there must be no target yet."""
+    if out is not None and os.path.lexists(Path(out) / "target.toml"):
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"{Path(out) / 'target.toml'}: exists; move it away, or give another folder"
+        )
+    return None if out is None else Path(out)

@@ -59,7 +59,7 @@ def test_faces_beside_circles_in_shifted_rows_are_right(tmp_path, circles):
     data = tmp_path / "data"
     write_dataset(data, scene)
     result = run(data / "images", data / "cameras.txt", tmp_path / "run", data / "target.toml", data / "board.toml")
-    for image in result.observations():
+    for image in result.observations:
         seen = image_circles(scene, image.group, int(image.name.split("_")[-1].split(".")[0]) - 1000)
         truth = dict(zip(seen.labels, seen.centre_px, strict=True))
         labels = [label for label in image.labels if not isinstance(label, DotLabel)]

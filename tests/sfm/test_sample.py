@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.text import run_text
+from stcal.sfm.runs.run_text import run_text
 from tests.sfm.truth import true_poses
 from tests.support.image_poses import pose_error
 
@@ -148,6 +148,12 @@ def test_the_report_says_what_the_files_say(calibrated):
         for value in np.array(faces[face_id])[:3, 3]:
             assert f"{value:.4f}" in text
             assert f"{value:.4f}" in html.replace("−", "-")
+
+
+def test_the_verdict_is_the_first_line_and_the_answer_is_short(calibrated):
+    lines = calibrated.text.splitlines()
+    assert lines[0].startswith("May I use it? ")
+    assert len(lines) <= 20 or calibrated.out.parent.name.startswith("small")
 
 
 def test_detections_are_where_the_truth_has_them(calibrated):

@@ -37,7 +37,7 @@ def test_every_label_is_right(calibrated):
     from stcal.synthetic.scene import image_circles
 
     scene, _, _, result = calibrated
-    for image in result.observations():
+    for image in result.observations:
         number = int(image.name.split("_")[-1].split(".")[0]) - 1000
         seen = image_circles(scene, image.group, number)
         truth = dict(zip(seen.labels, seen.centre_px, strict=True))

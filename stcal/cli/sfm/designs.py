@@ -248,7 +248,7 @@ def demo(
     from stcal.sfm.pipeline import run
     from stcal.sfm.report.compare import compare, comparison_table
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.text import run_text
+    from stcal.sfm.runs.run_text import run_text
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.scene import SceneOptions, make_scene
 

@@ -1,5 +1,7 @@
 """Commands ``stcal-sfm run``, ``detect``, ``report`` and ``budget``: calibration of a target."""
 
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -82,7 +84,7 @@ def run(
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.text import found_lines, run_text
+    from stcal.sfm.runs.run_text import found_lines, run_text
     from stcal.sfm.runs.transaction import is_finished
 
     options = RunOptions(
@@ -100,22 +102,27 @@ def run(
         exclude=tuple(exclude or ()),
         expect_faces=() if expect_faces is None else tuple(face.strip() for face in expect_faces.split(",")),
     )
+    lines, notes = "", StringIO()  # of what was assumed and noted: the verdict is the first line
     try:
-        with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as told:
+        assumed, elsewhere = shared.designs_told(target, board), shared.handed_over(scheduler, send_images)
+        with redirect_stdout(notes), assumed, elsewhere, StageProgress() as told:
             result = pipeline.run(images, camera, out, target, board, options, told, every=every)
+        lines = run_text(result)
     except StcalError as error:
         if (page := out / "report.html").exists() and not is_finished(out):
             error.append(f"; {page} shows the images")
         raise
+    finally:
+        for text in filter(None, (lines, notes.getvalue().rstrip())):
+            say(text)
     if verbose():
         say("\n".join(found_lines(result.labelled)))
-    say(run_text(result))
+    judgement, faces = result.judgement, {face.id for face in result.target_design.faces}
     has_faces = bool(result.target.target_from_face)  # a run of the board alone has none, and was asked for none
-    if has_faces and result.judgement is not None and result.judgement.verdict != "yes":
-        verdict = f"may I use it? {result.judgement.use.removesuffix('.')}"
-        unmet = {face.id for face in result.target_design.faces}.intersection(result.judgement.missing)
-        reasons = [verdict] if result.judgement.verdict == "no" or unmet else []
-        but = "do not use them" if result.judgement.verdict == "no" else "without faces that were expected"
+    if has_faces and judgement is not None and judgement.verdict != "yes":
+        is_no, verdict = judgement.verdict == "no", f"may I use it? {judgement.use.removesuffix('.')}"
+        reasons = [verdict] if is_no or faces.intersection(judgement.missing) else []
+        but = "do not use them" if is_no else "without faces that were expected"
         shared.require_usable(strict, reasons, out / "report.html", verdict, but)
 
 
@@ -138,8 +145,7 @@ def detect(
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.solve import require_no_calibration
-    from stcal.sfm.runs.text import detection_text, found_in_all
+    from stcal.sfm.runs.run_text import detection_text, found_in_all
 
     options = RunOptions(
         solve=solve,
@@ -147,7 +153,6 @@ def detect(
         workers=workers,
         exclude=tuple(exclude or ()),
     )
-    require_no_calibration(out)
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         found = detect_images(images, camera, out, target, board, options, progress)
     print_each("note", found.notes)

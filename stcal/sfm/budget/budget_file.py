@@ -219,7 +219,7 @@ class BudgetFile(ResultFile):
             version=stcal.__version__,
             run=RunOfBudget(
                 folder=str(run.folder),
-                images=str(run.images),
+                images=str(run.photographs),
                 target=run.target_design.name,
                 version=verified.version,
                 sha256=run.sha256.get(RUN_MARKER, ""),

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid
@@ -30,14 +31,9 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
     rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
     if len(rough) < 2:
         return []
-    notes = []
-    found = {face: target_from_face[face] for face in rough}
-    apart = [
-        [float(np.linalg.norm(of[a].translation - of[b].translation)) for of in (rough, found)]
-        for a, b in combinations(rough, 2)
-    ]
-    ratios = [seen / drawn for drawn, seen in apart if drawn > 0]
-    ratio = float(np.median(ratios)) if ratios else 1.0
+    notes, found = [], {face: target_from_face[face] for face in rough}
+    drawn, seen = (pdist([pose.translation for pose in of.values()]) for of in (rough, found))
+    ratio = float(np.median(seen[drawn > 0] / drawn[drawn > 0])) if drawn.any() else 1.0
     if not 1 / LIKE_DRAWN < ratio < LIKE_DRAWN:
         what = f"faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has them"
         sizes = "check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
@@ -52,9 +48,7 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
         if not {a, b} & turned_faces(found, exchanged).keys():
             what += f", as if the names of faces {a} and {b} were exchanged"
             break
-    folders = (
-        "put the photographs of each setting of target and board into a folder of its own; or " if one_folder else ""
-    )
+    folders = "put the photographs of each setting of target and board into a folder of its own; or " * one_folder
     return [*notes, Note(what, NOT_AS_DRAWN, remedy=f"{folders}correct names, ids or rough_pose", then=": ")]
 
 

@@ -89,8 +89,8 @@ class ImageObservations(Measured):
 
     def select(self, keep) -> "ImageObservations":
         """Returns the circles of the indices ``keep``."""
-        arrays = [getattr(self, f.name)[keep] for f in fields(self)[3:]]
-        return ImageObservations(self.name, self.group, tuple(self.labels[i] for i in keep), *arrays)
+        arrays = {f.name: getattr(self, f.name)[keep] for f in fields(self)[3:]}
+        return replace(self, labels=tuple(self.labels[i] for i in keep), **arrays)
 
 
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
@@ -212,10 +212,9 @@ class GroupModel(Measured):
 
     def xyz_camera(self) -> np.ndarray:
         """Returns the observed points in the frames of the cameras that observe them, (n, 3)."""
-        rotation = np.stack([pose.rotation for pose in self.camera_from_model])
-        translation = np.stack([pose.translation for pose in self.camera_from_model])
-        xyz = self.xyz_model[self.point_index]
-        return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
+        rotation = np.stack([pose.rotation for pose in self.camera_from_model])[self.image_index]
+        translation = np.stack([pose.translation for pose in self.camera_from_model])[self.image_index]
+        return np.einsum("nij,nj->ni", rotation, self.xyz_model[self.point_index]) + translation
 
     def by_parameters(self, camera: Camera) -> np.ndarray:
         """Returns the derivatives of the projections (px) by the camera's parameters, (n, 2, 16)."""
@@ -228,14 +227,9 @@ class GroupModel(Measured):
 
     def _placed(self, kind: type["M"], a_from_model: Similarity) -> "M":
         """Returns the model transformed to another frame and unit, as a model of the given kind."""
-        rotation, scale = a_from_model.rigid.rotation, a_from_model.scale
-        poses = tuple(
-            Rigid(
-                pose.rotation @ rotation.T,
-                scale * pose.translation - pose.rotation @ rotation.T @ a_from_model.rigid.translation,
-            )
-            for pose in self.camera_from_model
-        )
+        (rotation, shift), scale = (a_from_model.rigid.rotation, a_from_model.rigid.translation), a_from_model.scale
+        turned = [(pose.rotation @ rotation.T, scale * pose.translation) for pose in self.camera_from_model]
+        poses = tuple(Rigid(turn, translation - turn @ shift) for turn, translation in turned)
         same = {f.name: getattr(self, f.name) for f in fields(self)}
         return kind(**same | {"camera_from_model": poses, "xyz_model": a_from_model @ self.xyz_model})
 
@@ -245,14 +239,10 @@ class GroupModel(Measured):
 
     def plus(self: "M", other: "M") -> "M":
         """Returns the model with the images of another one of the same points."""
-        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _PER_OBSERVATION[1:]}
-        return replace(
-            self,
-            images=self.images + other.images,
-            camera_from_model=self.camera_from_model + other.camera_from_model,
-            image_index=np.concatenate([self.image_index, other.image_index + len(self.images)]),
-            **both,
-        )
+        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _PER_OBSERVATION}
+        both["image_index"][len(self.image_index) :] += len(self.images)
+        poses = self.camera_from_model + other.camera_from_model
+        return replace(self, images=self.images + other.images, camera_from_model=poses, **both)
 
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Returns the indices of the points by face; the points of the board have the key ``board``."""

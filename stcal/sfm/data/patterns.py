@@ -1,6 +1,7 @@
 """Patterns of the faces and the board, their projection into an image, and the pitch of a board's dots."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -94,11 +95,9 @@ def images_px(
 @lru_cache(maxsize=8)
 def ideal_border(camera: Camera) -> np.ndarray:
     """Returns the smallest and largest ideal coordinates along the image's border, (2, 2)."""
-    t = np.linspace(0, 1, BORDER_POINTS)
-    x, y = t * (camera.width - 1), t * (camera.height - 1)
-    zero = np.zeros(BORDER_POINTS)
-    sides = [(x, zero), (x, zero + camera.height - 1), (zero, y), (zero + camera.width - 1, y)]
-    ideal = camera.normalised_from_pixel(np.concatenate([np.column_stack(side) for side in sides]))
+    t, last = np.linspace(0, 1, BORDER_POINTS), np.array([camera.width - 1, camera.height - 1])
+    sides = [np.column_stack(side) for end in (0 * t, 0 * t + 1) for side in ((t, end), (end, t))]
+    ideal = camera.normalised_from_pixel(np.concatenate(sides) * last)
     return frozen(np.stack([ideal.min(0), ideal.max(0)]))
 
 
@@ -161,23 +160,19 @@ MOST_OFF = 0.05
 
 
 def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -> float | None:
-    """Returns the distance of neighbouring dots, mm, by their radius in the board file: the median over all dots of the
-    step by the image's homography, in units of the ellipse. None if too few dots, or corners, are seen."""
+    """Returns the median pitch of the dots, mm, by their radius in the board file; None if too few are seen."""
     if board.radius_mm <= POINT_RADIUS_MM:
         return None
     radius, pitches = board.radius_of(), []
     for image in images:
-        dots = [i for i, label in enumerate(image.labels) if isinstance(label, DotLabel)]
+        dots = {i: label for i, label in enumerate(image.labels) if isinstance(label, DotLabel)}
         if len(dots) < MIN_DOTS:
             continue
-        labels = [label for label in image.labels if isinstance(label, DotLabel)]
-        cells = dot_cells(labels)[:, ::-1].astype(float)
-        try:
-            local = homography_jacobian(fit_homography(cells, image.centre[dots]), cells)
-        except DegenerateError:
-            continue
-        steps = np.sqrt(np.abs(np.linalg.det(local) / np.linalg.det(image.shape[dots])))
-        pitches.append(steps * [radius[label] for label in labels])
+        cells, rows = dot_cells(dots.values())[:, ::-1].astype(float), list(dots)
+        with suppress(DegenerateError):
+            local = homography_jacobian(fit_homography(cells, image.centre[rows]), cells)
+            steps = np.sqrt(np.abs(np.linalg.det(local) / np.linalg.det(image.shape[rows])))
+            pitches.append(steps * [radius[label] for label in dots.values()])
     return float(np.median(np.concatenate(pitches))) if pitches else None
 
 

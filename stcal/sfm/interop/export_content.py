@@ -14,7 +14,7 @@ from stcal.io.json import Part
 from stcal.io.poses.programs import Static
 from stcal.labels import CircleLabel, parse_label
 from stcal.report.text import number
-from stcal.sfm.runs.report import ReportCamera, Space
+from stcal.sfm.runs.report_file import ReportCamera, Space
 from stcal.sfm.runs.saved import SavedRun
 
 FACES_RGB = (

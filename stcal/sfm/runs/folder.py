@@ -1,19 +1,17 @@
 """Files that a run writes into its folder: overlays, results, report."""
 
 import contextlib
-import csv
 import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from stcal.boards.board_file import save_board
 from stcal.boards.target_file import save_target
-from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
@@ -39,8 +37,7 @@ from stcal.parallel import Progress
 from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, plots, require_pdf
 from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.model import GroupModel, ImageObservations
-from stcal.sfm.detect.files import DetectedImage, DetectionResult
+from stcal.sfm.data.model import GroupModel, ImageObservations, detections_csv
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
@@ -48,11 +45,12 @@ from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, shown_overlays
 from stcal.sfm.report.run_page import report_html
-from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
-from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, as_written, folder_of, require_run, verify
-from stcal.sfm.runs.text import found_in_all
-from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
+from stcal.sfm.runs.report_file import ReportFile, report_of, residuals_px
+from stcal.sfm.runs.run_result import AnyRun, RunResult, SavedRun, folder_of
+from stcal.sfm.runs.run_text import found_in_all
+from stcal.sfm.runs.saved import require_run, verify
+from stcal.sfm.runs.start import DetectedImages, Task
+from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -61,40 +59,44 @@ HASH_DIGITS = 12
 
 
 @contextlib.contextmanager
-def overlays_beside(
-    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, run: RunFolder, progress: Progress
-) -> Iterator[dict[str, frozenset[Label]]]:
-    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block, which
-    adds to the yielded labels, by image, those that are to be crossed out."""
-    face_ids, focal_px = [face.id for face in target.faces], detection.camera.focal
+def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iterator[dict[str, frozenset[Label]]]:
+    """Writes ``detections.csv``, and draws the detections into every image while other work goes on.
 
+    All overlays exist at the end of the block, which adds to the yielded labels, by image, those that are to be crossed
+    out. Where the block fails, a page on why and what was found is written, and the error gets what most images have in
+    common; not without ``page``.
+    """
+    stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
+    save(stage / "detections.csv", detections_csv(seen.observations()))
+    pictures = {image.file.name: image for image in seen.detection.images}
     left_out: dict[str, frozenset[Label]] = {}
 
-    def draw(image: DetectedImage, each: LabelledImage, crossed: frozenset[Label] = frozenset()) -> None:
-        small = image.thumbnail, image.thumbnail_scale
-        seen, notes = each.observations, len(each.notes)
-        picture = kept_overlay(run.cache, image.digest, *small, seen, face_ids, focal_px, notes, crossed)
-        save(overlay_path(run.stage, image.file.name), picture)
+    def draw(image: LabelledImage) -> None:
+        name, picture = image.observations.name, pictures[image.observations.name]
+        small, crossed = (picture.thumbnail, picture.thumbnail_scale), left_out.get(name, frozenset())
+        drawn = image.observations, face_ids, focal_px, len(image.notes), crossed
+        save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
 
-    with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
-        drawn = pool.map(draw, _in_order(detection, labelled), labelled)
-        try:
-            yield left_out
-        except Exception:
-            raise
-        except BaseException:  # interrupted or exiting
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        for i, _ in enumerate(drawn):
-            progress("overlays", i + 1, len(labelled))
-        again = [each for each in labelled if left_out.get(each.observations.name)]
-        crosses = [left_out[each.observations.name] for each in again]
-        list(pool.map(draw, _in_order(detection, again), again, crosses))
-
-
-def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
-    by_name = {image.file.name: image for image in detection.images}
-    return [by_name[labelled_image.observations.name] for labelled_image in labelled]
+    try:
+        with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
+            drawn = [pool.submit(draw, image) for image in seen.labelled]
+            try:
+                yield left_out
+            except Exception:
+                raise
+            except BaseException:  # interrupted or exiting
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            for i, each in enumerate(drawn, 1):
+                each.result()
+                task.progress("overlays", i, len(drawn))
+            list(pool.map(draw, [image for image in seen.labelled if left_out.get(image.observations.name)]))
+    except StcalError as error:
+        if page:
+            found = found_in_all(seen.labelled)
+            save(stage / "report.html", _page_on_failure(task.target.name, str(error), found, seen))
+            error.append(f"; {found}")
+        raise
 
 
 def overlay_path(out: Path, name: str) -> Path:
@@ -107,9 +109,9 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{group}{slash}{file_name}{suffix}"
 
 
-def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
-    """Writes database, with corrected centres, models, faces and report beside the overlays; returns the judgement."""
-    observations = result.observations()
+def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
+    """Writes database, models, faces and report beside the overlays; returns the run as it was written."""
+    observations = result.observations
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
@@ -129,6 +131,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
         save_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
+    faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
@@ -138,12 +141,13 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
     progress("report", 1, 1)
-    return judgement
+    written = read_json(out / "report.json", "run", AGAIN)
+    return replace(result, corrected_px=tuple(corrected), faces_file=faces, report=written, judgement=judgement)
 
 
 def write_report(out: Path, report: dict, run: Path) -> None:
     """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
-    page = _report_page(run, report)
+    page, _ = _report_page(run, report)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
 
@@ -206,15 +210,10 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
 
 def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
     """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
-    path = run / "report.json"
-    report = read_json(path, "run", AGAIN)
-    with as_written(path):
+    report = read_json(run / "report.json", "run", AGAIN)
+    with as_written(run / "report.json"):
         checked(report, ReportFile)
-        shown = shown_overlays(report)
-        overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
-    gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
-    with as_written(path):
-        page = report_html(report, overlays, residuals, gone=gone)
+        page, gone = _report_page(run, report)
     contents: dict[Path, str | bytes] = {out: page}
     if pdf:
         contents[out.with_suffix(".pdf")] = pdf_of(page)
@@ -223,29 +222,32 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     return tuple(contents), gone
 
 
-def _report_page(run: Path, report: dict) -> str:
-    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays)))
+def _report_page(run: Path, report: dict) -> tuple[str, int]:
+    """Returns the page with the overlays that are in the folder, and the number of those that are not."""
+    shown = shown_overlays(report)
+    overlays = {name: path.read_bytes() for name in shown if (path := overlay_path(run, name)).is_file()}
+    gone = len(shown) - len(overlays)
+    return report_html(report, overlays, _residuals(run, list(overlays)), gone), gone
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     """Returns centres and residuals of these images from ``labels.csv``."""
-    path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
-    try:
-        for row in csv_rows(read_bytes(path, MODEL_BYTES).decode()):
+    with as_written(run / "labels.csv"):
+        for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(values)
-    except (LookupError, TypeError, ValueError, csv.Error) as error:
-        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
 
 
 def require_report(saved: SavedRun) -> None:
     """Refuses a run whose report cannot be extended: of another version, without its overlays, or read-only."""
     with as_written(saved.folder / "report.json"):
-        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+        report = {key: value for key, value in saved.report.items() if key != "crosscheck"}
+        for name in shown_overlays(report):
+            overlay_path(saved.folder, name).stat()
+        _report_page(saved.folder, report)
     if not os.access(saved.folder, os.W_OK):
         raise InputError(
             "E-OUTPUT-UNWRITABLE",
@@ -253,50 +255,31 @@ def require_report(saved: SavedRun) -> None:
         )
 
 
-def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+def _corrected_px(models: Mapping[str, GroupModel], observations: Sequence[ImageObservations]) -> list[np.ndarray]:
     """Returns all keypoints of every image as the models of the groups correct them, as measured without a model."""
-    rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
-    none = np.zeros(0, int)
-    return [
-        models[image.group].keypoints_px(image, rows.get(image.name, none))
-        if image.group in models
-        else image.centre_px
-        for image in observations
-    ]
+    corrected = {image.name: image.centre_px.copy() for image in observations}
+    for model in models.values():
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            corrected[name][model.keypoint[rows]] = model.corrected_px()[rows]
+    return list(corrected.values())
 
 
-@contextlib.contextmanager
-def shown_if_failed(
-    name: str, detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder
-) -> Iterator[None]:
-    """Where the block fails, writes a page on why and what was found, and adds what most images have in common."""
-    try:
-        yield
-    except StcalError as error:
-        seen = found_in_all(labelled)
-        save(folder.stage / "report.html", _page_on_failure(name, str(error), seen, detection, labelled))
-        error.append(f"; {seen}")
-        raise
-
-
-def _page_on_failure(
-    name: str, error: str, seen: str, detection: DetectionResult, labelled: Sequence[LabelledImage]
-) -> str:
+def _page_on_failure(name: str, error: str, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows = []
-    for each in labelled:
+    for each in seen.labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
-    left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
+    left_out = [f"{each.observations.name}: {note}" for each in seen.labelled for note in each.notes]
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
     shown = [macro("plot", place, image, image) for place, image in overlays[:FIRST_IMAGES]]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
-        Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
+        Section("What was found", [found, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
-        Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
+        Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in seen.detection.skipped])]),
         Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
-    return Document(name, f"{len(labelled)} images, no calibrated target", sections, [answer]).page()
+    return Document(name, f"{len(rows)} images, no calibrated target", sections, [answer]).page()

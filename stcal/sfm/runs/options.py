@@ -82,13 +82,7 @@ class RunOptions:
         require_fields(self, "options", workers=1, flatness_mm=LEAST)
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
-        """Returns the options of the adjustment, with every default decided.
-
-        Raises
-        ------
-        InputError
-            A choice that does not exist.
-        """
+        """Returns the options of the adjustment, with every default decided. Raises InputError: no such choice."""
         eccentricity = self.eccentricity and self.solve != "paper"
         return AdjustOptions(
             target.face(self.reference_face or target.faces[0].id).id,
@@ -100,13 +94,7 @@ class RunOptions:
         )
 
     def settled(self, target: TargetDesign) -> "RunOptions":
-        """Returns the same options with every default decided.
-
-        Raises
-        ------
-        InputError
-            A choice that does not exist.
-        """
+        """Returns the same options with every default decided. Raises InputError: no such choice."""
         for face in self.expect_faces:
             target.face(face)
         settled = replace(self, **asdict(self.adjustment(target)))
@@ -119,10 +107,7 @@ class RunOptions:
         return settled
 
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
-        """Returns the faces that the photographs were to show, in the order of the design.
-
-        ``groups`` : names of all groups, those included that could not be solved.
-        """
+        """Returns the faces that the photographs of all ``groups``, also of lost ones, were to show."""
         if self.board_only:
             return []
         ids = [face.id for face in target.faces]
@@ -141,7 +126,7 @@ def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]
     for group in groups if any(faces_in_name(name, ids) for name in groups) else ():
         words = re.split("[-_+ ]", group)
         parts = words if len(words) > 1 else list(group)
-        others = [part for part in parts if part not in ids]
-        if len(parts) == 2 and len(others) == 1 and not faces_in_name(others[0], ids):
-            found.setdefault(others[0], group)
+        match [part for part in parts if part not in ids]:
+            case [other] if len(parts) == 2 and not faces_in_name(other, ids):
+                found.setdefault(other, group)
     return found

@@ -1,20 +1,18 @@
 """A finished run read back from its folder, for every command that continues from it; and the comparison of its files
 with the hashes stored at its end."""
 
-import csv
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
 from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
-from stcal.design import BoardDesign, TargetDesign, scale_reference
-from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.design import scale_reference
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
@@ -33,128 +31,33 @@ from stcal.io.files import (
     read_bytes,
     require_unchanged,
 )
-from stcal.io.json import Part, checked, read_json
+from stcal.io.json import checked, read_json
 from stcal.io.table import csv_rows
-from stcal.labels import CircleLabel, circle_labels
-from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
+from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.adjust.uncertainty import with_differences
-from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
-from stcal.sfm.mapping.models import ReadModel, read_model
+from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.report import ReportCamera, ReportRead
-from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.transaction import RESULTS, MarkerFile, complete_interrupted, files_below
+from stcal.sfm.runs.report_file import ReportRead
+from stcal.sfm.runs.run_result import AnyRun, SavedRun, by_circle, folder_of, no_faces
+from stcal.sfm.runs.transaction import AGAIN, RESULTS, MarkerFile, as_written, complete_interrupted, files_below
 
-AGAIN = "run it again"
-ReportPart = TypeVar("ReportPart", bound=Part)
-Value = TypeVar("Value")
-COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SavedRun(Brief):
-    """Content of a run's folder.
-
-    ``images`` : the folder of photographs as given to the run; ``observations`` : of all images, in the database's
-    order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), centres in the database;
-    ``faces`` : ``faces.json``; ``report`` : content of ``report.json``; ``sha256`` : hashes of the folder's files at
-    the end of the run, by path below the folder.
-    """
-
-    folder: Path
-    images: Path
-    options: RunOptions
-    camera: Camera
-    target_design: TargetDesign
-    board_design: BoardDesign
-    observations: tuple[ImageObservations, ...]
-    corrected_px: tuple[np.ndarray, ...]
-    faces: FacesFile
-    report: dict
-    sha256: dict[str, str]
-
-    @property
-    def database(self) -> Path:
-        """Path of COLMAP's database."""
-        return self.folder / DATABASE
-
-    @property
-    def target(self) -> CalibratedTarget:
-        """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
-        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
-        return CalibratedTarget(
-            faces.reference_face,
-            faces.poses(),
-            _by_circle(faces.circles),
-            {},
-            dict(faces.target_from_face_covariance),
-            _by_circle(faces.circle_covariance_mm2),
-            {},
-            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
-            None if joint is None else joint.matrix(),
-        )
-
-    def groups(self) -> dict[str, list[ImageObservations]]:
-        """Returns the observations by group, in order."""
-        return by_group(self.observations)
-
-    def sigma_factors(self) -> SigmaFactors:
-        """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
-        summary = self.report["summary"]
-        overall = summary["sigma_factor"]
-        circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
-        printed = summary.get("printed_sigma_factor") or circles
-        return SigmaFactors(overall, circles, dots, printed, self.target_design.printed_ids())
-
-    def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
-        """Heights of the rims behind which the faces lie, by circle, and σ of all, mm, 0 if they are stated."""
-        return _by_circle(self.faces.rim_mm), self.report["summary"].get("rim_sigma_mm") or 0.0
-
-    def failed_checks(self) -> list[dict]:
-        """Returns the checks that failed, as ``report.json`` has them."""
-        return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
-
-    def report_as(self, part: type[ReportPart]) -> ReportPart:
-        """Returns the part of ``report.json`` that a command needs."""
-        with as_written(self.folder / "report.json"):
-            return checked(self.report, part)
-
-    def adjusted_camera(self, own: ReportCamera) -> Camera:
-        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
-        if not self.options.refine_camera:
-            return self.camera
-        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
-        return Camera.of(camera, self.camera.colmap_model)
-
-
-def _by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
-    """Returns values of ``faces.json`` by the labels of the circles."""
-    return dict(zip(circle_labels(values), values.values(), strict=True))
-
-
-AnyRun = SavedRun | RunResult | str | Path
-"""A finished run: its folder, or what :func:`load_run` or ``run`` returned."""
-
-
-def folder_of(run: AnyRun) -> Path:
-    """Returns the folder of a run; an error if no file of it was kept."""
-    if isinstance(run, RunResult):
-        if run.out is None:
-            raise InputError("E-RUN-FOLDER", "run: in memory, no file of it was kept; run it with out=")
-        return run.out
-    return run.folder if isinstance(run, SavedRun) else Path(run)
+COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
 def saved_run(run: AnyRun) -> SavedRun:
-    """Returns the run as read back from its folder; errors as of :func:`load_run`."""
-    return run if isinstance(run, SavedRun) else load_run(folder_of(run))
+    """Returns a run that has a folder, read back if the folder is given; errors as of :func:`load_run`."""
+    if not isinstance(run, SavedRun):
+        return load_run(run)
+    require_run(run.folder)
+    return run
 
 
 def require_run(folder: Path) -> None:
@@ -194,11 +97,7 @@ def load_run(folder: str | Path) -> SavedRun:
     needed = (*inputs, "labels.csv", DATABASE, "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing == ["faces.json"]:
-        raise InputError(
-            "E-RUN-NO-FACES",
-            f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
-            "that show them",
-        )
+        raise no_faces(folder)
     if missing:
         raise InputError(
             "E-RUN-UNFINISHED",
@@ -210,7 +109,7 @@ def load_run(folder: str | Path) -> SavedRun:
     board = scale_reference(None if without_board else load_board(folder / BOARD), target)
     with as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
-        options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
+        options, photographs = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
     with as_written(folder / "report.json"):
         names = checked(report, ReportRead).names()
     with as_written(folder / "faces.json"):
@@ -222,48 +121,13 @@ def load_run(folder: str | Path) -> SavedRun:
     for name in (RUN_MARKER, *needed):
         if name != DATABASE:  # SQLite writes to it when it is read
             require_unchanged(folder / name)
-    return SavedRun(
-        folder=folder,
-        images=images,
-        options=options,
-        camera=camera,
-        target_design=target,
-        board_design=board,
-        observations=observations,
-        corrected_px=corrected,
-        faces=result,
-        report=report,
-        sha256=marker_file.sha256 or {},
-    )
+    return SavedRun(folder, photographs, options, camera, target, board, observations, corrected, result, report)
 
 
 def _options(stored: dict) -> RunOptions:
-    for part in (stored, stored["pairs"], stored["ellipses"]):
-        for name, value in part.items():
-            if isinstance(value, list | dict) and name not in ("pairs", "ellipses", "exclude", "expect_faces"):
-                raise ValueError(f"options: {name} {value}: a single value needed")
-    lists = {key: stored.get(key, []) for key in ("exclude", "expect_faces")}
-    for key, names in lists.items():
-        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-            raise ValueError(f"options: {key} {names}: a list of names needed")
+    read: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
     pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
-    return RunOptions(
-        **(stored | {"pairs": pairs, "ellipses": ellipses, **{key: tuple(names) for key, names in lists.items()}})
-    )
-
-
-@contextmanager
-def as_written(file: Path | str) -> Iterator[None]:
-    """Raises InputError that names the file if it is not as a run of this version writes it."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
-        ) from error
-    except (LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
+    return RunOptions(**read | {"pairs": pairs, "ellipses": ellipses})
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
@@ -282,24 +146,14 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         unknown = [label for label in labels if label not in known]
         if unknown or len(set(labels)) < len(labels):
             raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
-        columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
-        texts = [[row[column] for column in columns] for row in image_rows]
-        values = frozen(np.array(texts or np.zeros((0, 7)), float), (None, 7), name)
-        covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
+        texts = [[row[column] for column in COLUMNS] for row in image_rows]
+        values = frozen(np.array(texts, float).reshape(-1, len(COLUMNS)), (None, len(COLUMNS)), name)
+        centre_px, covariance = values[:, :2], values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
         fault = first_fault(covariance, OF_PIXEL, definite=True)
         if fault is not None:
             raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
-        observations.append(
-            ImageObservations(
-                name=name,
-                group=group,
-                labels=labels,
-                centre_px=values[:, :2],
-                centre=camera.normalised_from_pixel(values[:, :2]),
-                shape=np.zeros((len(image_rows), 2, 2)),
-                covariance_px2=covariance,
-            )
-        )
+        centre, shape = camera.normalised_from_pixel(centre_px), np.zeros_like(covariance)
+        observations.append(ImageObservations(name, group, labels, centre_px, centre, shape, covariance))
         corrected.append(values[:, 2:4])
     return tuple(observations), tuple(corrected)
 
@@ -313,22 +167,13 @@ class AdjustedRun:
     prior: CameraPrior | None  # of the intrinsics if they were adjusted
 
 
-def read_target_model(run: SavedRun) -> ReadModel:
-    """Reads the adjusted model of a run, mm, target frame."""
-    ids = image_ids(run.observations)
-    return read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
-
-
 def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """Repeats the final adjustment of a run, which moves nothing."""
-    read = read_target_model(run)
+    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame."""
+    ids = image_ids(run.observations)
+    read = read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
-    start = CalibratedTarget(
-        run.faces.reference_face,
-        run.faces.poses(),
-        _by_circle(run.faces.circles),
-        {model.group: Rigid() for model in models},
-    )
+    placed = {model.group: Rigid() for model in models}
+    start = CalibratedTarget(run.faces.reference_face, run.faces.poses(), by_circle(run.faces.circles), placed)
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     state = with_differences(state, start, run.target_design, run.faces.frame)
@@ -371,11 +216,10 @@ def verify(run: AnyRun) -> Verified:
             "run it again",
         )
     present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
-    changed = [
-        name
-        for name, known in marker.sha256.items()
-        if name in present and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
-    ]
-    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - marker.sha256.keys())
-    missing = marker.sha256.keys() - present
-    return Verified(marker.version, tuple(sorted(missing)), tuple(sorted(changed)), tuple(sorted(added)))
+    known = marker.sha256
+    now = {
+        name: own_digest(content) if name == RUN_MARKER else digest_of(run / name) for name in known.keys() & present
+    }
+    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - known.keys())
+    changed = (name for name, digest in now.items() if digest != known.get(name))
+    return Verified(marker.version, *(tuple(sorted(names)) for names in (known.keys() - present, changed, added)))

@@ -2,6 +2,7 @@
 take the places of the earlier ones. Whoever opens the folder next finishes that if the process was killed. A marker
 holds the input of the run, and the hashes of its files."""
 
+import csv
 import os
 import shutil
 import socket
@@ -32,6 +33,7 @@ from stcal.io.json import ResultFile, read_result
 from stcal.sfm.runs.options import RunOptions
 
 ByFile = Annotated[str, "file"]
+AGAIN = "run it again"
 
 
 class MarkerFile(ResultFile):
@@ -131,7 +133,7 @@ def added_results(out: Path) -> Iterator[Path]:
     writes. The PDF of a report that is replaced is removed."""
     with _staged(out) as stage:
         yield stage
-        marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+        marker = read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN)
         gone = [REPORT_PDF] if (stage / "report.html").exists() and not (stage / REPORT_PDF).exists() else []
         if marker.sha256 is not None:
             kept = {name: digest for name, digest in marker.sha256.items() if name not in gone}
@@ -170,17 +172,30 @@ def _staged(out: Path) -> Iterator[Path]:
         lock.release()
 
 
+@contextmanager
+def as_written(file: Path | str) -> Iterator[None]:
+    """Raises InputError that names the file if it is not as a run of this version writes it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
+        ) from error
+    except (LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
+
+
 def is_finished(out: Path) -> bool:
     """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
     with suppress(InputError):
-        if read_result(out / RUN_MARKER, MarkerFile, "run", "run it again").sha256 is not None:
+        if read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN).sha256 is not None:
             return True
     return (out / "faces.json").exists()
 
 
 def _digests(stage: Path) -> dict[str, str]:
-    names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
-    return {name: digest_of(stage / name) for name in names}
+    return {name: digest_of(stage / name) for name in sorted(files_below(stage)) if name.split("/")[0] in RESULTS}
 
 
 def _exchange(out: Path, marker: MarkerFile, gone: Sequence[str]) -> None:

@@ -151,7 +151,7 @@ def test_rims_that_were_estimated_are_a_row(saved, plain):
     of both normals."""
     faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
     summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
-    found = budget_of_run(replace(saved, faces=faces, report=saved.report | {"summary": summary}))
+    found = budget_of_run(replace(saved, faces_file=faces, report=saved.report | {"summary": summary}))
     assert [each.origin for each in found.sources if each.key == "rims"] == ["estimated"]
     assert all(each.key != "rims" for each in plain.sources)
     normal = {face: np.array(m)[:3, 2] for face, m in saved.faces.target_from_face.items()}

@@ -320,7 +320,7 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
     saved = load_run(small_run)
     faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
     summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
-    known = known_of(replace(saved, faces=faces, report=saved.report | {"summary": summary}))
+    known = known_of(replace(saved, faces_file=faces, report=saved.report | {"summary": summary}))
     now = forecast(known.models, known.setup)
     seen = forecast(known.models, replace(known.setup, rims_mm2=None), now.derivatives)
     shares = variance_shares(now, known.models, known.setup)

@@ -9,7 +9,7 @@ from stcal.sfm.data.note import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
 from stcal.sfm.report.judgement import judged, judgement_of
 from stcal.sfm.report.run_page import report_html
-from stcal.sfm.runs.report import Remark
+from stcal.sfm.runs.report_file import Remark
 from tests.sfm.report.test_report import make
 
 

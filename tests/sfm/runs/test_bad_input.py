@@ -251,40 +251,36 @@ def test_an_impossible_or_missing_design(small_set, stcal_sfm, kind):
     assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
 
 
-@pytest.mark.parametrize(("content", "error"), [(None, "No such file"), ("prose", "E-CAMERA-UNREADABLE")])
-def test_a_camera_file_that_is_none(small_set, stcal_sfm, content, error):
-    """Others are in tests/io/test_camera.py."""
-    small = small_set("12")
-    small.camera.unlink()
-    if content is not None:
-        small.camera.write_text(content, encoding="utf-8")
-    assert_error(stcal_sfm(*small.arguments()), INPUT, error, f"camera file {small.camera}")
-
-
 def opencv_yaml(focal: float, x: float, y: float, distortion: list[float]) -> str:
     """A camera file that does not state the image size."""
     matrix = [float(v) for v in (focal, 0, x, 0, focal, y, 0, 0, 1)]
     return f"%YAML:1.0\n---\ncamera_matrix: {matrix}\ndistortion_coefficients: {distortion}\n"
 
 
-def test_a_camera_of_opencv_for_larger_images(small_set, stcal_sfm):
-    small = small_set("12")
-    path = small.folder / "camera.yml"
-    path.write_text(opencv_yaml(5580, 2592, 1728, []), encoding="utf-8")
-    outcome = stcal_sfm(*small.arguments("--camera", path))
-    parts = ("(2592, 1728) px is outside of 12/IMG_1000.jpg (1296×864 px)", "use the camera file that belongs")
-    assert_error(outcome, INPUT, "E-CAMERA-CENTRE", f"{path}", *parts)
+OUTSIDE = ("(2592, 1728) px is outside of 12/IMG_1000.jpg (1296×864 px)", "use the camera file that belongs")
+WRONG_CAMERAS = [
+    (None, INPUT, ("No such file", "camera file ")),
+    ("prose", INPUT, ("E-CAMERA-UNREADABLE", "camera file ")),
+    (opencv_yaml(5580, 2592, 1728, []), INPUT, ("E-CAMERA-CENTRE", "camera.yml", *OUTSIDE)),  # for larger images
+    pytest.param(
+        opencv_yaml(3000, 648, 432, []),  # another one than took the images
+        COMPUTATION,
+        ("group 12: ", "check that the camera file belongs to the images"),
+        marks=pytest.mark.slow,
+    ),
+]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
-def test_another_camera_than_took_the_images(small_set, stcal_sfm):
+@pytest.mark.parametrize(("content", "code", "parts"), WRONG_CAMERAS)
+def test_a_camera_file_that_is_none_or_not_of_the_images(small_set, stcal_sfm, content, code, parts):
+    """Others are in tests/io/test_camera.py."""
     small = small_set("12")
     small.image(3).unlink()
     path = small.folder / "camera.yml"
-    path.write_text(opencv_yaml(3000, 648, 432, []), encoding="utf-8")
-    outcome = stcal_sfm(*small.arguments("--camera", path))
-    assert_error(outcome, COMPUTATION, "group 12: ", "check that the camera file belongs to the images")
+    if content is not None:
+        path.write_text(content, encoding="utf-8")
+    assert_error(stcal_sfm(*small.arguments("--camera", path)), code, *parts)
 
 
 def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):

@@ -66,7 +66,7 @@ def test_measure_calibrate_camera_and_plan_name_what_they_assumed(stcal_sfm, sma
 
 
 def test_images_tell_the_pitch(small_result):
-    images = small_result.observations()
+    images = small_result.observations
     board = reference_board()
     # Blur of 0.7 px on dots of some 10 px makes them larger by a few per cent at most, and the pitch as much smaller.
     assert measured_pitch_mm(images, board) == pytest.approx(30, rel=0.03)

@@ -22,8 +22,8 @@ from stcal.sfm.mapping.pairs import (
     incidence,
     track_parts,
 )
+from stcal.sfm.runs.groups import solve_groups
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.solve import solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 

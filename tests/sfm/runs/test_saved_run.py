@@ -13,7 +13,7 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
-from stcal.sfm import run
+from stcal.sfm import run, uncertainty_budget
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.known_target import read_target
@@ -68,8 +68,8 @@ def grey(path) -> None:
 @pytest.mark.slow
 def test_labels_and_centres_are_the_same_numbers(written):
     result, saved = written
-    assert [image.name for image in saved.observations] == [image.name for image in result.observations()]
-    for found, known in zip(saved.observations, result.observations(), strict=True):
+    assert [image.name for image in saved.observations] == [image.name for image in result.observations]
+    for found, known in zip(saved.observations, result.observations, strict=True):
         assert (found.group, found.labels) == (known.group, known.labels)
         assert np.array_equal(found.centre_px, known.centre_px)  # all 64 bits
         # Undistorted again from the same pixels, by the same iteration to 1e-12.
@@ -88,6 +88,12 @@ def test_corrected_centres_are_those_of_the_models(written):
         found = np.array([by_name[name][k] for name, k in zip(names, model.keypoint, strict=True)])
         assert np.array_equal(found, model.corrected_px())
         assert np.abs(model.shift_px).max() > 0.01  # they differ from the measured ones
+
+
+def test_a_run_just_made_gives_what_its_folder_gives(small_result, small_run):
+    made, read = (uncertainty_budget(each).file.content() for each in (small_result, small_run))
+    assert made == read
+    assert set(made["faces"]) == {"2", "4", "5"}
 
 
 def test_an_image_without_a_label_keeps_its_place(written):
@@ -119,7 +125,7 @@ def test_options_answers_and_places_are_the_same(written):
     result, saved = written
     assert saved.options == result.options
     assert saved.options.reference_face == saved.faces.reference_face == "2"
-    assert saved.images == result.out.parent / "data" / "images"
+    assert saved.photographs == result.photographs == result.out.parent / "data" / "images"
     assert saved.database == result.out / "colmap/database.db"
     found = {face: np.array(matrix) for face, matrix in saved.faces.target_from_face.items()}
     assert found.keys() == result.target.target_from_face.keys()
@@ -138,7 +144,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     shutil.copy(tmp_path / "new" / ".stcal/run.json", own / ".stcal")
     saved = load_run(own)
     assert saved.options == OTHER
-    assert saved.images == tmp_path / "some images"
+    assert saved.photographs == tmp_path / "some images"
 
 
 @pytest.mark.parametrize(
@@ -237,12 +243,12 @@ WRONG = {
     "a list for an option": (
         ".stcal/run.json",
         lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
-        "max_angle_rad [1]: a single value needed",
+        "options: max_angle_rad <1>: a finite number or None needed",
     ),
     "names that are none": (
         ".stcal/run.json",
         lambda c: c["options"].update(exclude=[7]),
-        "options: exclude [7]: a list of names needed",
+        "options: exclude <1>: a tuple, each a text, needed",
     ),
 }
 

@@ -17,8 +17,8 @@ from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.report import unadjusted
-from stcal.sfm.runs.solve import Task, labelled_images
+from stcal.sfm.runs.report_file import unadjusted
+from stcal.sfm.runs.start import Task, detect_with
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -47,7 +47,7 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
 def test_a_dot_that_one_image_alone_shows_is_crossed_in_its_overlay(small_set, small_result):
     """Painted over in the three others; the overlay of the image of a dot that is used has no white there."""
     small, out = small_set("12"), DotLabel(3, 4)
-    seen = {image.name: image for image in small_result.observations() if image.group == "12"}
+    seen = {image.name: image for image in small_result.observations if image.group == "12"}
     assert all(out in image.labels for image in seen.values())
     for name in list(seen)[1:]:
         picture = cv2.imread(str(small.images / name))
@@ -82,8 +82,8 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     own = RunFolder(small.out, small.out / ".stcal/unfinished", small.out / ".stcal/cache")
     task = Task(find_images(folder / "images"), own, target, board, coarse, lambda *_: None)
-    detection, _ = labelled_images(task, read_camera(folder / "cameras.txt"))
-    assert not any(image.reused for image in detection.images)
+    seen = detect_with(task, read_camera(folder / "cameras.txt"))
+    assert not any(image.reused for image in seen.detection.images)
 
 
 def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):

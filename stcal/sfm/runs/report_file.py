@@ -1,5 +1,6 @@
 """``report.json``: everything that tells how far to trust a run; its keys, and how they are filled."""
 
+from dataclasses import fields
 from itertools import combinations
 from typing import Any, Literal
 
@@ -20,8 +21,9 @@ from stcal.sfm.data.note import Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.judgement import Judgement
-from stcal.sfm.runs.crosscheck import Crosscheck
-from stcal.sfm.runs.result import Comparison, RunResult
+from stcal.sfm.runs.groups import GroupSolution
+from stcal.sfm.runs.run_result import Comparison, RunResult
+from stcal.sfm.runs.tolerances import Crosscheck
 
 MICRO = 1e3
 Row = dict[str, Any]
@@ -41,25 +43,6 @@ class Remark(Part):
     place: str = ""
     words: str = ""
     remedy: str = ""
-
-
-class PairRow(Part):
-    first: str
-    second: str
-    shared: int
-    median_angle_rad: float
-    in_front: float
-    forward: float
-    verdict: str
-
-
-class ImageResiduals(Part):
-    image: str
-    group: str
-    observations: int
-    rms_px: float
-    max_px: float
-    worst: str
 
 
 class LeftOut(Part):
@@ -158,7 +141,7 @@ class ReportFile(ResultFile):
         "`[x, y, z]`; `source` of λ: `board`, `faces` of known shape, whose corners then stand for the dots, known "
         "`distances`, or the `drawing`"
     )
-    residuals_by_image: list[ImageResiduals] = Field(
+    residuals_by_image: list[Row] = Field(
         description="`image`, `group`, `observations`, `rms_px` per coordinate, `max_px` length, `worst` label"
     )
     residuals_by_label: list[Row] = Field(
@@ -218,35 +201,29 @@ class ReportRead(Part):
     summary: SummaryRead
 
     def names(self) -> list[tuple[str, str, int]]:
-        """Returns (name, group, circles) of the images in the database's order; KeyError or ValueError if they are
-        damaged."""
+        """Returns (name, group, circles) of the images in the database's order."""
         pairs = {entry.name: entry.pairs[0] for entry in self.groups}
-        names = [(entry.name, entry.group, entry.circles) for entry in self.images]
-        for name, _, _ in names:
+        group_of = {entry.name: entry.group for entry in self.images}
+        for name, group in group_of.items():
             if fault := name_fault(name):
                 raise ValueError(f"image {name!r}: its name {fault}")
-        for group in {group for _, group, _ in names}:
-            images_of_group = {name for name, group_of_image, _ in names if group_of_image == group}
-            if not {pairs[group].first, pairs[group].second} <= images_of_group:
+            if not all(group_of.get(each) == group for each in (pairs[group].first, pairs[group].second)):
                 raise ValueError(f"group {group}: its initial pair is not of its images")
-        return names
+        return [(entry.name, entry.group, entry.circles) for entry in self.images]
 
 
 def report_of(result: RunResult) -> ReportFile:
     """Returns the report of a run."""
-    models, calibration = _final_models(result), result.calibration
-    residual = {name: model.residuals_px(calibration.camera) for name, model in models.items()}
-    options, camera = result.options, calibration.camera
+    models, options, camera = _final_models(result), result.options, result.calibration.camera
+    residual = {name: model.residuals_px(camera) for name, model in models.items()}
+    shown = ("solve", "frame", "eccentricity", "refine_camera")
     content = {
         "format": "stcal report 1",
         "version": stcal.__version__,
         "target": result.target_design.name,
         "reference_face": result.target.reference_face,
         "options": {
-            "solve": options.solve,
-            "frame": options.frame,
-            "eccentricity": options.eccentricity,
-            "refine_camera": options.refine_camera,
+            **{key: getattr(options, key) for key in shown},
             "expect_faces": list(options.expect_faces),
             "max_pair_angle_deg": round(float(np.degrees(options.pairs.limit_rad())), 9),
         },
@@ -269,7 +246,7 @@ def report_of(result: RunResult) -> ReportFile:
         "notes": [note if isinstance(note, Note) else Note(note) for note in result.notes],
         "images": [
             {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
-            for i, image in enumerate(result.observations(), start=1)
+            for i, image in enumerate(result.observations, start=1)
         ],
         "focus": [image.focus for image in result.labelled if image.focus is not None],
         "scene": _scene(result),
@@ -301,11 +278,9 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
         "dot_sigma_factor": factors.dots,
         "printed_sigma_factor": factors.printed if design.has_printed else None,
         "scale_sigma_ppm": None if target.scale_sigma is None or design.up_to_scale else 1e6 * target.scale_sigma,
-        "sigma0": joint.sigma0 if joint else None,
-        "redundancy": joint.redundancy if joint else None,
-        "last_move_px": joint.last_move_px if joint else None,
-        "photographs_differ": joint.differ if joint else None,
-        "sigma_enlarged": joint.enlarged if joint else None,
+        **{key: getattr(joint, key, None) for key in ("sigma0", "redundancy", "last_move_px")},
+        "photographs_differ": getattr(joint, "differ", None),
+        "sigma_enlarged": getattr(joint, "enlarged", None),
         "rim_mm": float(np.mean(rims)) if rims else None,
         "rim_sigma_mm": calibration.rim_sigma_mm if rims else None,
         "dot_rim_mm": result.board_design.rim_mm or None,
@@ -323,7 +298,7 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
 def residuals_px(result: RunResult) -> list[np.ndarray]:
     """Returns corrected minus projected keypoints of every image, (k, 2); NaN for keypoints not in the result."""
     models = _final_models(result)
-    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations()}
+    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations}
     for model in models.values():
         residual = model.residuals_px(result.calibration.camera)
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
@@ -335,7 +310,7 @@ def unadjusted(result: RunResult) -> dict[str, frozenset[Label]]:
     """Returns the labels of the keypoints that are not in the result, by image."""
     return {
         image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residual).any(axis=1)))
-        for image, residual in zip(result.observations(), residuals_px(result), strict=True)
+        for image, residual in zip(result.observations, residuals_px(result), strict=True)
     }
 
 
@@ -352,16 +327,14 @@ def face_row(result: RunResult, face_id: str) -> Row:
     members = [member for member in result.calibration.faces if member.face == face_id]
     covariance = result.target.face_covariance.get(face_id)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sources = result.target.position_sources_mm.get(face_id, {})
     return {
         "target_from_face": pose.matrix().tolist(),
         "translation_mm": pose.translation.tolist(),
         "angle_to_reference_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1, 1)))),
         "translation_sigma_um": None if sigma is None else (MICRO * sigma[3:]).tolist(),
         "rotation_sigma_mdeg": None if sigma is None else (MICRO * np.degrees(sigma[:3])).tolist(),
-        "translation_sources_um": {
-            kind: (MICRO * sigma_mm).tolist()
-            for kind, sigma_mm in result.target.position_sources_mm.get(face_id, {}).items()
-        },
+        "translation_sources_um": {kind: (MICRO * sigma_mm).tolist() for kind, sigma_mm in sources.items()},
         "circles": len(labels),
         "circles_of_design": len(result.target_design.face(face_id).ids),
         "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,
@@ -371,24 +344,21 @@ def face_row(result: RunResult, face_id: str) -> Row:
 
 
 def _between(result: RunResult) -> list[Row]:
-    rows = []
-    poses, sigma = result.target.target_from_face, result.target.distance_sigma_mm
-    for a, b in combinations(poses, 2):
-        cosine = poses[a].rotation[:, 2] @ poses[b].rotation[:, 2]
-        rows.append(
-            {
-                "a": a,
-                "b": b,
-                "distance_mm": float(np.linalg.norm(poses[a].translation - poses[b].translation)),
-                "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
-                "angle_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-            }
-        )
-    return rows
+    sigma = result.target.distance_sigma_mm
+    return [
+        {
+            "a": a,
+            "b": b,
+            "distance_mm": float(np.linalg.norm(pose.translation - other.translation)),
+            "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
+            "angle_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[:, 2] @ other.rotation[:, 2], -1, 1)))),
+        }
+        for (a, pose), (b, other) in combinations(result.target.target_from_face.items(), 2)
+    ]
 
 
-def _group(result: RunResult, solution) -> Row:
-    name = solution.model.group
+def _group(result: RunResult, solution: GroupSolution) -> Row:
+    name, ranked = solution.model.group, solution.pairs
     scale = result.calibration.scales[name]
     return {
         "name": name,
@@ -397,7 +367,7 @@ def _group(result: RunResult, solution) -> Row:
         "points": len(solution.model.labels),
         "seeded": solution.seeded,
         "rounds": solution.rounds,
-        "pairs": [PairRow.model_validate(pair).model_dump() for pair in solution.pairs],
+        "pairs": [{f.name: getattr(p, f.name) for f in fields(p) if f.name != "second_from_first"} for p in ranked],
         "scale": {
             "mm_per_unit": scale.mm_per_unit,
             "mm_per_unit_rows": scale.rows_mm_per_unit,
@@ -408,10 +378,7 @@ def _group(result: RunResult, solution) -> Row:
             "board_mean_um": MICRO * scale.mean_mm(),
             "board_spread_um": MICRO * scale.spread_mm(),
             "board_rms_um": MICRO * scale.rms_mm(),
-            "board_residuals_um": {
-                str(label): (MICRO * residual).tolist()
-                for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
-            },
+            "board_residuals_um": dict(zip(map(str, scale.labels), (MICRO * scale.residuals_mm).tolist(), strict=True)),
             "source": scale.source,
         },
     }
@@ -421,19 +388,11 @@ def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
     rows = []
     for name, model in models.items():
         length = np.linalg.norm(residual[name], axis=1)
-        for i, image in enumerate(model.images):
-            indices = np.flatnonzero(model.image_index == i)
+        for image, indices in zip(model.images, model.rows_by_image(), strict=True):
             worst = indices[np.argmax(length[indices])]
-            rows.append(
-                {
-                    "image": image,
-                    "group": name,
-                    "observations": len(indices),
-                    "rms_px": rms(residual[name][indices]),
-                    "max_px": float(length[worst]),
-                    "worst": model.labels[model.point_index[worst]],
-                }
-            )
+            largest = {"max_px": float(length[worst]), "worst": str(model.labels[model.point_index[worst]])}
+            row = {"image": image, "group": name, "observations": len(indices)}
+            rows.append(row | {"rms_px": rms(residual[name][indices])} | largest)
     return rows
 
 
@@ -463,16 +422,8 @@ def _left_out(result: RunResult) -> Row:
         mapped = set(solution.model.labels)
         for name, reason in solution.left_out.items():
             known = len(mapped & set(observed[name].observations.labels))
-            few = known < MIN_POINTS
-            images.append(
-                {
-                    "name": name,
-                    "reason": reason,
-                    "gate": "known_circles" if few else "fitting_circles",
-                    "value": known if few else None,
-                    "limit": MIN_POINTS,
-                }
-            )
+            gate, value = ("known_circles", known) if known < MIN_POINTS else ("fitting_circles", None)
+            images.append({"name": name, "reason": reason, "gate": gate, "value": value, "limit": MIN_POINTS})
         circles += [
             {
                 "image": o.image,

@@ -1,41 +1,48 @@
 """Result of a run, and its comparison with the published method."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, ByValue, rms
+from stcal.geometry.arrays import Brief, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
-from stcal.io.json import ByFace, Part
-from stcal.labels import Label
+from stcal.io.files import DATABASE, RUN_MARKER
+from stcal.io.json import ByFace, Part, checked, read_result
+from stcal.labels import CircleLabel, Label, circle_labels
 from stcal.report.document import html
-from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.calibration import Calibration, SigmaFactors
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.scale import ScaleSource
-from stcal.sfm.checks.significance import Check
 from stcal.sfm.checks.suite import Evidence
-from stcal.sfm.data.model import ImageObservations, MetricModel
+from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
 from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs.groups import GroupSolution
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.solve import GroupSolution
+from stcal.sfm.runs.transaction import AGAIN, MarkerFile, as_written
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from stcal.sfm.runs.report_file import ReportCamera
+
+ReportPart = TypeVar("ReportPart", bound=Part)
+Value = TypeVar("Value")
 Cells = Mapping[str, str | float]
 """A row of a table."""
 Rows = Literal["faces", "circles", "images", "observations"]
@@ -113,43 +120,166 @@ def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResul
     by_pose = model.whiten(projection_jacobians(model, camera)[0])
     alone = np.linalg.inv(blocks_of(by_pose, by_pose[..., 0], model.image_index, len(model.images))[0])
     corrected, residuals = model.corrected_px(), model.residuals_px(camera)
+    images = zip(model.images, model.camera_from_model, scale**2 * alone, model.rows_by_image(), strict=True)
     return [
-        ImageResult(
-            name,
-            model.group,
-            pose,
-            scale**2 * covariance,
-            tuple(model.labels[k] for k in model.point_index[rows]),
-            corrected[rows],
-            residuals[rows],
-        )
-        for name, pose, covariance, rows in zip(
-            model.images, model.camera_from_model, alone, model.rows_by_image(), strict=True
-        )
+        ImageResult(name, model.group, pose, covariance, labels, corrected[rows], residuals[rows])
+        for name, pose, covariance, rows in images
+        for labels in [tuple(model.labels[k] for k in model.point_index[rows])]
     ]
 
 
-def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, float]:
-    """Returns the cells of a pose with σ (6,) of rotation and translation."""
-    names = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
-    values = {name: float(value) for name, value in zip(names, pose.log(), strict=True)}
-    return values | {f"sigma_{name}": float(value) for name, value in zip(names, sigma, strict=True)}
+OF_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RunResult(ByValue):
-    """All results of a run; :attr:`target` is the calibrated target.
+def _cells(names: Sequence[str], values: np.ndarray, covariance: np.ndarray | None) -> dict[str, float]:
+    """Returns the cells of values and their σ, NaN without a covariance."""
+    sigma = np.full(len(names), np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sigmas = zip([f"sigma_{name}" for name in names], sigma.tolist(), strict=True)
+    return dict(zip(names, values.tolist(), strict=True)) | dict(sigmas)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SavedRun(Brief):
+    """A run: what it was given, and what it found. One that was just made is a :class:`RunResult`.
 
     Parameters
     ----------
     out : Path or None
         The run's folder; None if no file stays.
+    photographs : Path or str
+        The folder of photographs as given.
+    options : RunOptions
+        Options with every default decided.
     camera : Camera
         The camera as its file states it; refined intrinsics are ``calibration.camera``.
     target_design, board_design : TargetDesign, BoardDesign
         The designs as given.
-    options : RunOptions
-        Options with every default decided.
+    observations : tuple of ImageObservations
+        Labelled centres of all images, px, in the database's order; without the shapes of the ellipses if read back.
+    corrected_px : tuple of (n, 2) array
+        By image, the centres in the database, corrected for the eccentricity.
+    faces_file : FacesFile or None
+        Content of ``faces.json``; None of the board alone.
+    report : dict
+        Content of ``report.json``.
+    """
+
+    out: Path | None
+    photographs: Path | str
+    options: RunOptions
+    camera: Camera
+    target_design: TargetDesign
+    board_design: BoardDesign
+    observations: tuple[ImageObservations, ...]
+    corrected_px: tuple[np.ndarray, ...] = ()
+    faces_file: FacesFile | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def database(self) -> Path:
+        """Path of COLMAP's database."""
+        return self.folder / DATABASE
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder; an error if no file of it was kept."""
+        if self.out is None:
+            raise InputError("E-RUN-FOLDER", "run: in memory, no file of it was kept; run it with out=")
+        return self.out
+
+    @property
+    def faces(self) -> FacesFile:
+        """Content of ``faces.json``; an error if the run is of the board alone."""
+        if self.faces_file is None:
+            raise no_faces(self.folder)
+        return self.faces_file
+
+    @property
+    def sha256(self) -> dict[str, str]:
+        """Hashes of the folder's files at the end of the run, by path below the folder."""
+        return read_result(self.folder / RUN_MARKER, MarkerFile, "run", AGAIN).sha256 or {}
+
+    @property
+    def target(self) -> CalibratedTarget:
+        """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
+        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
+        return CalibratedTarget(
+            faces.reference_face,
+            faces.poses(),
+            by_circle(faces.circles),
+            {},
+            dict(faces.target_from_face_covariance),
+            by_circle(faces.circle_covariance_mm2),
+            {},
+            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
+            None if joint is None else joint.matrix(),
+        )
+
+    def groups(self) -> dict[str, list[ImageObservations]]:
+        """Returns the observations by group, in order."""
+        return by_group(self.observations)
+
+    def sigma_factors(self) -> SigmaFactors:
+        """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
+        summary = self.report["summary"]
+        overall = summary["sigma_factor"]
+        circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
+        printed = summary.get("printed_sigma_factor") or circles
+        return SigmaFactors(overall, circles, dots, printed, self.target_design.printed_ids())
+
+    def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
+        """Heights of the rims behind which the faces lie, by circle, and σ of all, mm, 0 if they are stated."""
+        return by_circle(self.faces.rim_mm), self.report["summary"].get("rim_sigma_mm") or 0.0
+
+    def failed_checks(self) -> list[dict]:
+        """Returns the checks that failed, as ``report.json`` has them."""
+        return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
+
+    def report_as(self, part: type[ReportPart]) -> ReportPart:
+        """Returns the part of ``report.json`` that a command needs."""
+        with as_written(self.folder / "report.json"):
+            return checked(self.report, part)
+
+    def adjusted_camera(self, own: "ReportCamera") -> Camera:
+        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
+        if not self.options.refine_camera:
+            return self.camera
+        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
+        return Camera.of(camera, self.camera.colmap_model)
+
+
+def no_faces(folder: Path) -> InputError:
+    """Returns the error of a run without a result for faces."""
+    return InputError(
+        "E-RUN-NO-FACES",
+        f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
+        "that show them",
+    )
+
+
+def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
+    """Returns values of ``faces.json`` by the labels of the circles."""
+    return dict(zip(circle_labels(values), values.values(), strict=True))
+
+
+AnyRun = SavedRun | str | Path
+"""A finished run: its folder, or what ``load_run`` or ``run`` returned."""
+
+
+def folder_of(run: AnyRun) -> Path:
+    """Returns the folder of a run; an error if no file of it was kept."""
+    return run.folder if isinstance(run, SavedRun) else Path(run)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
+class RunResult(SavedRun):
+    """A run with the results of its stages; :attr:`target` is the calibrated target. Further fields are those of every
+    run: ``out``, ``photographs``, ``options``, ``camera`` (as its file states it; refined intrinsics are
+    ``calibration.camera``), ``target_design``, ``board_design``, ``observations``, ``corrected_px``, ``faces_file``,
+    ``report``.
+
+    Parameters
+    ----------
     detection : DetectionResult
         Detections of each image, and the images skipped.
     labelled : tuple of LabelledImage
@@ -174,11 +304,6 @@ class RunResult(ByValue):
         False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
-    out: Path | None
-    camera: Camera
-    target_design: TargetDesign
-    board_design: BoardDesign
-    options: RunOptions
     detection: DetectionResult
     labelled: tuple[LabelledImage, ...]
     graph: ImageGraph
@@ -193,11 +318,13 @@ class RunResult(ByValue):
 
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
-        board = self.board_design
-        drawn = self.target_design.up_to_scale
-        distances = known_distances(board)
-        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": distances and not drawn}
-        known["drawing"] = drawn
+        board, drawn = self.board_design, self.target_design.up_to_scale
+        known = {
+            "board": board.rows,
+            "faces": faces_of_known_shape(board),
+            "distances": known_distances(board) and not drawn,
+            "drawing": drawn,
+        }
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
@@ -211,7 +338,7 @@ class RunResult(ByValue):
 
     def _repr_html_(self) -> str:
         """Returns verdict, faces and checks as HTML, which notebooks show."""
-        from stcal.sfm.runs.text import document_of
+        from stcal.sfm.runs.run_text import document_of
 
         document = document_of(self)
         return html(document.about, *document.banner, *document.sections[0].blocks)
@@ -220,7 +347,7 @@ class RunResult(ByValue):
         """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
         return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.of_target)
 
-    def images(self) -> tuple["ImageResult", ...]:
+    def images(self) -> tuple[ImageResult, ...]:
         """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""
         calibration = self.calibration
         scale = 1.0 if calibration.joint is None else calibration.joint.sigma_scale
@@ -252,39 +379,31 @@ class RunResult(ByValue):
         return DataFrame(tables[rows]())
 
     def _faces(self) -> list[Cells]:
-        table = []
-        for face, pose in self.target.target_from_face.items():
-            covariance = self.target.face_covariance.get(face)
-            sigma = np.full(6, np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
-            table.append({"face": face} | _pose_cells(pose, sigma))
-        return table
+        covariance = self.target.face_covariance
+        poses = self.target.target_from_face.items()
+        return [{"face": face} | _cells(OF_POSE, pose.log(), covariance.get(face)) for face, pose in poses]
 
     def _circles(self) -> list[Cells]:
-        table = []
-        for label, xyz in self.target.circles.items():
-            covariance = self.target.circle_covariance.get(label)
-            sigma = np.full(3, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
-            cells = {f"{axis}_mm": float(value) for axis, value in zip("xyz", xyz, strict=True)}
-            cells |= {f"sigma_{axis}_mm": float(value) for axis, value in zip("xyz", sigma, strict=True)}
-            table.append({"label": str(label), "face": label.face} | cells)
-        return table
+        covariance, circles = self.target.circle_covariance, self.target.circles.items()
+        return [
+            {"label": str(label), "face": label.face} | _cells(OF_POSE[3:], xyz, covariance.get(label))
+            for label, xyz in circles
+        ]
 
     def _images(self) -> list[Cells]:
         return [
             {"image": image.name, "group": image.group}
-            | _pose_cells(image.camera_from_target, np.sqrt(np.diag(image.covariance)))
+            | _cells(OF_POSE, image.camera_from_target.log(), image.covariance)
             | {"circles": len(image.labels), "rms_px": image.rms_px}
             for image in self.images()
         ]
 
     def _seen(self) -> list[Cells]:
+        columns = ("x_px", "y_px", "residual_x_px", "residual_y_px")
         return [
-            {"image": image.name, "group": image.group, "label": str(label)}
-            | {"x_px": x, "y_px": y, "residual_x_px": dx, "residual_y_px": dy}
+            {"image": image.name, "group": image.group, "label": str(label)} | dict(zip(columns, row, strict=True))
             for image in self.images()
-            for label, (x, y), (dx, dy) in zip(
-                image.labels, image.xy_px.tolist(), image.residuals_px.tolist(), strict=True
-            )
+            for label, row in zip(image.labels, np.hstack([image.xy_px, image.residuals_px]).tolist(), strict=True)
         ]
 
     @property
@@ -295,17 +414,13 @@ class RunResult(ByValue):
             return None
         return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
-    def observations(self) -> list[ImageObservations]:
-        """Returns labelled centres of all images, in the database's order."""
-        return [image.observations for image in self.labelled]
-
     def evidence(self, prior: CameraPrior) -> Evidence:
         """Returns the input of the checks; ``prior`` : of the intrinsics, used if they were refined."""
         blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
         return Evidence(
             models=tuple(s.model for s in self.solutions),
             outliers=tuple(o for s in self.solutions for o in s.outliers),
-            images=tuple(self.observations()),
+            images=self.observations,
             camera=self.camera,
             target=self.target_design,
             board=self.board_design,

@@ -9,14 +9,15 @@ import numpy as np
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera
-from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
-from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult
+from stcal.sfm.runs.groups import GroupSolution
+from stcal.sfm.runs.run_result import ComparedRow, Comparison, FaceOff, RunResult
 
 MICRO = 1e3
 AS_PUBLISHED = "as published"
@@ -32,6 +33,11 @@ class Answer:
     models: tuple[WorldModel, ...]  # without unit, one per group
     scales: dict[str, Scale]  # by group
 
+    @classmethod
+    def of(cls, solutions: Sequence[GroupSolution], calibration: Calibration) -> "Answer":
+        """Returns the answer of a run, group by group."""
+        return cls(calibration.target, tuple(s.model for s in solutions), calibration.scales)
+
 
 def require_comparable(options: AdjustOptions) -> None:
     """Refuses to compare a run that is itself a part of the published method."""
@@ -43,22 +49,19 @@ def require_comparable(options: AdjustOptions) -> None:
         )
 
 
-def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
+def compare_with_paper(result: RunResult, published: Answer | StcalError) -> Comparison:
     """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
     three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
     joint = result.calibration.joint
     if joint is None:
         raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
     whole = calibrated_target(joint, result.target, result.target_design, "three-point")
-    steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
+    steps = {AS_PUBLISHED: published, **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
     sigma = {
-        face: FaceOff(
-            translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
-            rotation_mdeg=MICRO * float(np.degrees(np.sqrt(np.trace(c[:3, :3])))),
-        )
+        face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5)
         for face, c in whole.face_covariance.items()
         if face != whole.reference_face
     }
@@ -77,11 +80,6 @@ def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
         except StcalError as error:
             answers[f"+ {step}"] = error
     return answers
-
-
-def answer_of(run: RunResult) -> Answer:
-    """Returns the answer of a run, group by group."""
-    return Answer(run.target, tuple(solution.model for solution in run.solutions), run.calibration.scales)
 
 
 def _alike(model: WorldModel) -> WorldModel:
@@ -111,16 +109,21 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
         return ComparedRow(method=name, missing=others, reason=str(found))
-    faces = {}
-    for face, pose in found.target.target_from_face.items():
-        if face in others:
-            known = whole.target_from_face[face]
-            faces[face] = FaceOff(
-                translation_um=MICRO * float(np.linalg.norm(pose.translation - known.translation)),
-                rotation_mdeg=MICRO * float(np.degrees((pose @ known.inverse()).angle_rad())),
-            )
+    pairs = (
+        (face, pose, whole.target_from_face[face])
+        for face, pose in found.target.target_from_face.items()
+        if face in others
+    )
+    faces = {
+        face: _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
+        for face, pose, known in pairs
+    }
     missing = [face for face in others if face not in faces]
     return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
+
+
+def _off(translation_mm: float | np.floating, rotation_rad: float) -> FaceOff:
+    return FaceOff(translation_um=MICRO * float(translation_mm), rotation_mdeg=MICRO * float(np.degrees(rotation_rad)))
 
 
 def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, Scale]) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from stcal.sfm.report.check import BY_CHANCE, Check, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, without_sigma_of
 from stcal.sfm.report.run_page import CONTROL, PUBLISHED, faces_table
-from stcal.sfm.runs.report import face_row
-from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.report_file import face_row
+from stcal.sfm.runs.run_result import RunResult
 
 WEAK_FOCAL = 0.01
 """Relative σ of a focal length beyond which the views lack what determines it."""
@@ -35,13 +35,13 @@ def document_of(result: RunResult) -> Document:
     """Returns the result of a run in short: the verdict, faces with σ, checks that did not pass, and remarks."""
     verdict, *others = [] if result.judgement is None else result.judgement.answers()
     blocks: list[Block] = []
-    if result.target.target_from_face:
-        rows = {face: face_row(result, face) for face in result.target.target_from_face}
+    faces = {face: face_row(result, face) for face in result.target.target_from_face}
+    if faces:
         failed = result.judgement is not None and result.judgement.verdict == "no"
-        blocks.append(faces_table(without_sigma_of(rows) if failed else rows, result.target.reference_face))
+        blocks.append(faces_table(without_sigma_of(faces) if failed else faces, result.target.reference_face))
     else:
         blocks += _boards(result)
-    blocks += _checks(result.checks, frozenset(image.name for image in result.observations()))
+    blocks += _checks(result.checks, frozenset(image.name for image in result.observations))
     if result.comparison is not None:
         heads, compared = comparison_cells(result.comparison.model_dump())
         blocks += [
@@ -50,10 +50,10 @@ def document_of(result: RunResult) -> Document:
             *(f"{row.method}: {row.reason}" for row in result.comparison.rows if row.reason),
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
-    if result.out is not None:
-        camera = [f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
-        faces = [f"faces:  {result.out / 'faces.json'}"] if result.target.target_from_face else []
-        blocks.append(Printed([*faces, *camera, f"report: {result.out / 'report.html'}"]))
+    if (out := result.out) is not None:
+        files = [f"faces:  {out / 'faces.json'}"] if faces else []
+        files += [f"camera: {out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
+        blocks.append(Printed([*files, f"report: {out / 'report.html'}"]))
     first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
     return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
@@ -61,11 +61,10 @@ def document_of(result: RunResult) -> Document:
 
 def _remarks(result: RunResult) -> Iterator[str]:
     """Yields what was left out, on what the size and the camera rest, and what was corrected."""
-    skipped = [f"skipped {file.name}: {file.reason}" for file in result.detection.skipped]
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
     noted = [image.observations.name for image in result.labelled if image.notes]
     outliers = sum(len(solution.outliers) for solution in result.solutions)
-    for lines in (skipped, unmapped):
+    for lines in (_skipped(result.detection), unmapped):
         yield from lines[:FIRST]
         if len(lines) > FIRST:
             yield f"and {len(lines) - FIRST} more, which the report names"
@@ -149,8 +148,11 @@ def _rims(result: RunResult) -> Iterator[str]:
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
     """Returns faces and dots of each image, and what was left out."""
-    skipped = [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
-    return "\n".join([*found_lines(labelled), *skipped, found_in_all(labelled)])
+    return "\n".join([*found_lines(labelled), *_skipped(detection), found_in_all(labelled)])
+
+
+def _skipped(detection: DetectionResult) -> list[str]:
+    return [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
 
 
 def found_in_all(labelled: Sequence[LabelledImage]) -> str:
@@ -160,8 +162,8 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
     dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
     alike: dict[str, list[str]] = {}
     for each in labelled:
-        for note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
-            alike.setdefault(note[0], []).append(note[1])
+        for kind, note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
+            alike.setdefault(kind, []).append(note)
     most = max(alike.values(), key=len, default=[])
     reason = f"; in {len(most)} of {count}: {most[0]}" if most else ""
     return f"a face in {faces} of {count} images, the board in {dots}{reason}"
@@ -169,25 +171,25 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
 
 def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
     """Yields faces and dots of each image, and what was left out in it and helps."""
-    board_seen = any(isinstance(label, DotLabel) for each in labelled for label in each.observations.labels)
-    for labelled_image in labelled:
-        image = labelled_image.observations
-        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+    counts = [sum(isinstance(label, DotLabel) for label in each.observations.labels) for each in labelled]
+    for each, dots in zip(labelled, counts, strict=True):
+        image = each.observations
         faces = ", ".join(sorted(image.face_ids())) or "none"
         yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
-        yield from (f"  {note}" for note in labelled_image.notes)
+        yield from (f"  {note}" for note in each.notes)
         if not image.face_ids():
             yield f"  no face is read: {REMEDIES['face']}"
-        if board_seen and not dots:
+        if any(counts) and not dots:
             yield f"  the board is not read: {REMEDIES['board']}"
 
 
 def _boards(result: RunResult) -> list[Block]:
     """Returns λ and residuals of the board alone."""
     rows = [
-        [name, len(scale.labels), f"{scale.mm_per_unit:.6g}", f"{scale.rows_mm_per_unit:.6g}"]
-        + [f"{1e3 * value:.2f}" for value in (scale.mean_mm(), scale.spread_mm())]
-        for name, scale in result.calibration.scales.items()
+        [name, len(s.labels)]
+        + [f"{each:.6g}" for each in (s.mm_per_unit, s.rows_mm_per_unit)]
+        + [f"{1e3 * each:.2f}" for each in (s.mean_mm(), s.spread_mm())]
+        for name, s in result.calibration.scales.items()
     ]
     return [
         f"the board alone: no face of the target in {len(result.labelled)} images, so that there is no faces.json; "
@@ -198,8 +200,8 @@ def _boards(result: RunResult) -> list[Block]:
 
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
     """Yields the checks that did not pass, the worst first."""
-    if any(check.verdict in ("failed", "suspicious") for check in checks):
+    doubtful = [check for check in ranked(checks, images) if check.verdict in ("failed", "suspicious")]
+    if doubtful:
         yield f"checks: {count_verdicts(checks)} ({BY_CHANCE})"
-    for check in ranked(checks, images):
-        if check.verdict in ("failed", "suspicious"):
-            yield f"{check.verdict}: {check.title}: {check.reason}{'; ' * bool(check.remedy)}{check.remedy}"
+    for check in doubtful:
+        yield f"{check.verdict}: {check.title}: {check.reason}{'; ' * bool(check.remedy)}{check.remedy}"

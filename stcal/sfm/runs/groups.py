@@ -1,0 +1,481 @@
+"""The stage of a run that maps: which groups can be solved, and the solution of each, which is cached by its inputs."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape
+from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cache import keep, kept, made_by
+from stcal.io.cameras.model import CameraModel, refinable
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
+from stcal.labels import DotLabel, parse_labels, unseen_lines
+from stcal.parallel import Progress, counted, run_in_order
+from stcal.report.text import significant
+from stcal.sfm.adjust.refine import Refined, refine
+from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
+from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
+from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
+from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
+from stcal.sfm.data.patterns import pitch_hint
+from stcal.sfm.detect.labelling import LabelledImage, is_board_alone
+from stcal.sfm.mapping.body import MIN_CORNERS
+from stcal.sfm.mapping.database import image_ids, write_database
+from stcal.sfm.mapping.incremental import left_out, map_group
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
+from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model, place_with_camera
+from stcal.sfm.report.check import Check
+from stcal.sfm.runs.options import RunOptions, unknown_faces
+from stcal.sfm.runs.start import DetectedImages, Task
+
+CACHE_VERSION = 8
+LEAST_WITHOUT, MOST_WITHOUT = 3, 40
+"""Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
+FEW_NAMED = 6
+SHOW_MORE = "show two faces of it at once, or one by more corners"
+UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)
+"""Errors by which one group has no solution, while others may."""
+LIKELY = "; the likely cause: "
+"""How the part of an error begins that says what the photographs that cannot be solved have in common."""
+_ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+S = TypeVar("S")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupSolution:
+    """Solution of one group in a world without unit."""
+
+    pairs: tuple[PairScore, ...]  # the ranking, the chosen pair first; without poses
+    model: WorldModel
+    seeded: str  # how the pair was registered
+    rounds: int  # of refinement
+    left_out: dict[str, str]  # reason by image
+    outliers: tuple[Outlier, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Groups:
+    """The images by the groups in which they are solved."""
+
+    labelled: tuple[LabelledImage, ...]
+    names: tuple[str, ...]  # of the groups that can be solved
+    graph: ImageGraph  # of all images
+    camera: Camera  # with which their solution begins
+    board: BoardDesign  # with the σ of its printed edges
+    options: RunOptions
+    board_alone: bool
+    notes: tuple[str, ...]  # on groups that cannot be solved
+
+    def observations(self) -> list[ImageObservations]:
+        """Returns the labelled centres of all images."""
+        return [image.observations for image in self.labelled]
+
+    def usable(self) -> list[ImageObservations]:
+        """Returns the labelled centres of the images whose groups can be solved."""
+        return [image for image in self.observations() if image.group in self.names]
+
+    def explained(self) -> AbstractContextManager[None]:
+        """Lets errors name what of the camera file is wrong, unless the file is a start alone."""
+        return nullcontext() if self.options.refine_camera else explained(self.usable(), self.camera, self.board)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """The solutions of groups, and notes on those that have none."""
+
+    groups: Groups
+    solutions: tuple[GroupSolution, ...]
+    notes: tuple[str, ...]
+
+
+def groups_of(task: Task, seen: DetectedImages) -> Groups:
+    """Returns the groups that can be solved; without a board all images are one, and a board alone is chained."""
+    options, labelled = task.options, seen.labelled
+    if not task.board.rows:
+        labelled = tuple(replace(i, observations=replace(i.observations, group=TOP_GROUP)) for i in labelled)
+    observations = [image.observations for image in labelled]
+    camera = start_of(seen.camera, seen, options)
+    board_alone = options.board_only or is_board_alone(seen.detection)
+    if board_alone and options.solve == "joint":
+        options = replace(options, solve="chain", refine_camera=False)
+    board = with_edge_sigma(task.board, observations)
+    skipped, needs_board = seen.detection.skipped, not task.target.has_scale
+    usable, notes = usable_groups(by_group(observations), skipped, board_alone, needs_board)
+    task.progress("map", 0, len(usable))
+    graph = image_graph(observations, board)
+    return Groups(labelled, tuple(usable), graph, camera, board, options, board_alone, tuple(notes))
+
+
+def start_of(model: CameraModel, seen: DetectedImages, options: RunOptions) -> Camera:
+    """Returns the camera with which a solution of the images begins."""
+    camera = model.calibrated(seen.detection.camera.width, seen.detection.camera.height)
+    return refinable(camera) if options.refine_camera else camera
+
+
+def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Mapped:
+    """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
+    camera, target, board, options = groups.camera, task.target, groups.board, groups.options
+    known = () if groups.board_alone else faces_of_known_shape(board)
+    with groups.explained():
+        if known:
+            circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+            body = place_with_camera(groups.usable(), (*known, *circles), camera)
+            solutions, notes = _solve_body(task, groups, body)
+            notes += body.unlinked_notes()
+        else:
+            folders = task.folder.stage / "scratch", task.folder.cache
+            arguments = camera, target, board, options, task.progress, names or groups.names
+            solutions, notes = solve_groups(groups.observations(), groups.graph, *folders, *arguments)
+    return Mapped(groups, tuple(solutions), tuple(notes))
+
+
+def _each_group(names: Iterable[str], solve: Callable[[str], S]) -> tuple[dict[str, S], list[str]]:
+    """Returns the solutions by group, and notes on the others; raises the first error if no group has one."""
+    solutions: dict[str, S] = {}
+    errors: list[tuple[str, StcalError]] = []
+    for name in names:
+        try:
+            solutions[name] = solve(name)
+        except UNSOLVED as error:
+            errors.append((name, error))
+    if not solutions:
+        raise errors[0][1]
+    return solutions, [Note.of_group(name, error) for name, error in errors]
+
+
+def usable_groups(
+    groups: dict[str, list[ImageObservations]],
+    skipped: Sequence[Skipped],
+    board_alone: bool = False,
+    needs_board: bool = True,
+) -> tuple[dict[str, list[ImageObservations]], list[str]]:
+    """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped."""
+    lost: dict[str, Skipped] = {}  # the first file of each group; a folder that holds only copies is not a group
+    for file in skipped:
+        group = file.name.rpartition("/")[0] or TOP_GROUP
+        if file.name.lower().endswith(SUFFIXES) and (group in groups or file.gate != "copy"):
+            lost.setdefault(group, file)
+
+    def usable(name: str) -> list[ImageObservations]:
+        group = groups.get(name, [])
+        if len(group) < 2:
+            count = f"1 usable image ({group[0].name})" if group else "0 usable images"
+            why = f", not {lost[name].name}: {lost[name].reason}" if name in lost else ""
+            remedy = "add photographs from other places"
+            if name == TOP_GROUP and group and len(groups) > 1:
+                others = _listed([g for g in groups if g != TOP_GROUP])
+                remedy = (
+                    f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
+                    f"leave it out with --exclude {group[0].name}"
+                )
+            raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
+        require_usable(group, board_alone, needs_board)
+        return group
+
+    try:
+        return _each_group(sorted(groups.keys() | lost.keys()), usable)
+    except MappingError as error:
+        error.append("".join([f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason][:1]))
+        raise
+
+
+def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
+    """Refuses a group that cannot be solved: without a needed board, or without a face."""
+    where = f"group {group[0].group}"
+    if not board_alone and not any(image.face_ids() for image in group):
+        raise MappingError(
+            "E-GROUP-NO-FACE",
+            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
+            "check target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
+        )
+    if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
+        raise MappingError(
+            "E-GROUP-NO-BOARD",
+            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
+            "check board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
+        )
+
+
+def _listed(names: Sequence[str], most: int = 4, more: str = ", …") -> str:
+    return ", ".join(names[:most]) + more * (len(names) > most)
+
+
+def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
+    """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
+    images = [image for image in labelled if image.observations.group == TOP_GROUP]
+    dropped = [
+        image.observations.name
+        for image in images
+        if any(isinstance(note, Note) and note.code == BOARD_LEFT_OUT for note in image.notes)
+    ]
+    remark = (
+        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
+        "more than one group"
+    )
+    note = (
+        f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
+        f"moved{remark if dropped else ''}; put the images of each setting of target and board into a folder of its "
+        "own, IMAGES/<group>/"
+    )
+    return [note] if images else []
+
+
+def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]:
+    """Returns notes on faces that groups are named after and the target does not have."""
+    known = ", ".join(face.id for face in target.faces)
+    return [
+        f"group {group} seems to be named after face {face}, which the target does not have (faces {known}): add it to "
+        "target.toml, or rename the folder"
+        for face, group in unknown_faces(groups, target).items()
+    ]
+
+
+def unseen_board(solutions: Sequence[GroupSolution], board: BoardDesign) -> list[str]:
+    """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
+    dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
+    return unseen_lines(dots, board.rows, board.columns)
+
+
+def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> list[str]:
+    """Returns a note on circles or corners of the faces in the result that no image shows as the design has them."""
+    mapped = {label for s in solutions for label in s.model.labels}
+    faces = {label.plane for label in mapped}
+    every = (label for face in target.faces if face.id in faces for label in face.labels())
+    missing = [str(label) for label in every if label not in mapped]
+    note = (
+        f"{_listed(missing, FEW_NAMED, ' …')}: not in the result, as too few images show "
+        f"{'it' if len(missing) == 1 else 'them'} as drawn; check radius and place in target.toml, unless something "
+        "hides it"
+    )
+    return [note] if missing else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """A group and all that its solution depends on."""
+
+    images: list[ImageObservations]
+    skeleton: list[str]  # names of the images that are mapped first, among which the initial pair is chosen
+    matched: np.ndarray  # (n, 2) indices of images to match, in the group
+    camera: Camera
+    target: TargetDesign
+    board: BoardDesign
+    pair_options: PairOptions
+    eccentricity: bool
+
+    def key(self) -> str:
+        """Returns a hash of all inputs of the solution. It does not depend on other groups."""
+        hasher = hashlib.sha256()
+        for image in self.images:
+            hasher.update(f"{image.name}\0{image.labels}\0".encode())
+            hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
+        hasher.update(self.matched.astype("<i8").tobytes())
+        plain = [
+            CACHE_VERSION,
+            made_by(),
+            self.skeleton,
+            [self.camera.width, self.camera.height, self.camera.parameters()],
+            *map(asdict, (self.target.patterns_alone(), self.board, self.pair_options)),
+            self.eccentricity,
+        ]
+        hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
+        return hasher.hexdigest()[:40]
+
+
+def solve_groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    scratch: Path,  # a folder that is made and removed again
+    cache: Path,  # folder for what later runs take up
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+    names: Collection[str] | None = None,  # groups to solve, all if None
+) -> tuple[list[GroupSolution], list[str]]:
+    """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
+    solution, the error of the first group is raised."""
+    common = camera, target, board, options.pairs, options.eccentricity
+    groups = {
+        name: _Group(
+            images,
+            [observations[i].name for i in graph.skeleton[name]],
+            _pairs_within(name, observations, graph),
+            *common,
+        )
+        for name, images in by_group(observations).items()
+        if names is None or name in names
+    }
+    paths = {name: cache / f"group-{group.key()}.npz" for name, group in groups.items()}
+    found: dict[str, GroupSolution | StcalError | None] = {name: kept(path, _stored) for name, path in paths.items()}
+    pending = [name for name, solution in found.items() if solution is None]
+    step = counted(progress, "map", len(groups))
+    for _ in range(len(groups) - len(pending)):
+        step(None)
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        jobs = [(groups[name], scratch / str(k)) for k, name in enumerate(pending)]
+        for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
+            found[name] = solution
+            if isinstance(solution, GroupSolution):
+                _save(paths[name], solution)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+    def scaled(name: str) -> GroupSolution:
+        solution = found[name]
+        try:
+            if not isinstance(solution, GroupSolution):
+                raise solution or KeyError(name)
+            find_scale(solution.model, board)
+        except UNSOLVED as error:
+            error.append(pitch_hint(groups[name].images, board))
+            raise
+        return solution
+
+    solutions, notes = _each_group(groups, scaled)
+    return list(solutions.values()), notes
+
+
+def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
+    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
+    within = np.array([image.group == group for image in observations])
+    pairs = graph.pairs[within[graph.pairs].all(1)]
+    return (np.cumsum(within) - 1)[pairs]
+
+
+def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
+    """Solves one group with a database of its own in a folder that is made; returns why it has no solution."""
+    images, camera, board = group.images, group.camera, group.board
+    scratch.mkdir()
+    ids, database = image_ids(images), scratch / "mapping.db"
+    try:
+        first = [image for image in images if image.name in group.skeleton]
+        pairs = rank_pairs(first, camera, group.pair_options, board)
+        write_database(database, camera, images, group.matched)
+        mapping = map_group(database, scratch / "models", images, group.skeleton, ids, pairs, camera)
+        refined = refine_or_explain(mapping.model, camera, group.target, board, group.eccentricity)
+    except UNSOLVED as error:
+        return error
+    missing = mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model)
+    outliers, ranked = (*mapping.outliers, *refined.outliers), [replace(p, second_from_first=None) for p in pairs]
+    return GroupSolution(tuple(ranked), refined.model, mapping.seeded, refined.rounds, missing, outliers)
+
+
+def _save(path: Path, solution: GroupSolution) -> None:
+    model = solution.model
+    poses = np.stack([pose.matrix() for pose in model.camera_from_model])
+    plain = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name != "model"}
+    plain |= {"pairs": [asdict(pair) for pair in solution.pairs], "outliers": [asdict(o) for o in solution.outliers]}
+    names = [model.group, model.images, model.labels]
+    keep(path, {"poses": poses} | {name: getattr(model, name) for name in _ARRAYS}, {"solution": plain, "names": names})
+
+
+def _stored(stored, meta) -> GroupSolution:
+    """Returns the solution that is kept in arrays and metadata."""
+    (group, images, labels), plain = meta["names"], meta["solution"]
+    poses = tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"])
+    arrays = {name: stored[name] for name in _ARRAYS}
+    plain["pairs"] = tuple(PairScore(**pair) for pair in plain["pairs"])
+    plain["outliers"] = tuple(Outlier(**outlier) for outlier in plain["outliers"])
+    return GroupSolution(model=WorldModel(group, tuple(images), poses, parse_labels(labels), **arrays), **plain)
+
+
+def _solve_body(task: Task, groups: Groups, body: PlacedBody) -> tuple[list[GroupSolution], list[str]]:
+    """Maps and refines the groups of a body that its faces have placed; returns solutions, and notes on others."""
+    camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
+    images = by_group(groups.usable())
+    step = counted(task.progress, "map", len(images))
+
+    def solved(name: str) -> GroupSolution:
+        try:
+            model = model_of_body(body, images[name], camera)
+            gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+            seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
+            is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+            refined = refine_or_explain(model.without(is_gross), camera, task.target, board, eccentricity)
+            find_scale(refined.model, board)
+        finally:
+            step(None)
+        missing = left_out(images[name], refined.model, SHOW_MORE) | left_out(images[name], model, SHOW_MORE)
+        pair, outliers = pair_of_model(refined.model), (*gross.values(), *refined.outliers)
+        return GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers)
+
+    solutions, notes = _each_group(images, solved)
+    return list(solutions.values()), notes
+
+
+def refine_or_explain(
+    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool = True
+) -> Refined:
+    """Refines a group, as :func:`stcal.sfm.adjust.refine.refine`; its errors say if target and board moved apart."""
+    try:
+        return refine(model, camera, target, board, eccentricity)
+    except (MappingError, ConvergenceError) as error:
+        if (image := _odd_one_out(model, camera, target, board, eccentricity)) is not None:
+            raise MappingError(
+                error.code,
+                f"group {model.group}: {image} contradicts the others, which agree without it; leave it out, with "
+                f"--exclude {image}, or take it again",
+            ) from error
+        if moved_apart(model, camera, target, board):
+            agree = "the circles of the faces agree with one another, and the dots of the board do"
+            error.append(f"{LIKELY}{MOVED}, as {agree}: {MOVED_REMEDY}")
+        raise
+
+
+def _odd_one_out(model: WorldModel, *arguments) -> str | None:
+    """Returns the one image without which a group can be refined; None if there is none, or more than one."""
+    cures: list[str] = []
+    if not LEAST_WITHOUT < len(model.images) <= MOST_WITHOUT:
+        return None
+    for k, image in enumerate(model.images):
+        with suppress(MappingError, ConvergenceError, DegenerateError):
+            refine(model.without(model.image_index == k), *arguments)
+            cures.append(image)
+        if len(cures) > 1:
+            return None
+    return cures[0] if cures else None
+
+
+def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:
+    """Returns a failed check that names what of a camera file is wrong by the dots of the board alone."""
+    if not board.rows:
+        return None
+    try:
+        found, stated = camera_of_labelled(images, board, camera)
+    except StcalError:
+        return None
+    square, square_of_file = (weighted_rms_px(each) ** 2 for each in (found, stated))
+    if square > (1 - EXPLAINS) * square_of_file:
+        return None
+    cause = cause_of_file(camera, found.camera, found.covariance, found.colmap_model)
+    if cause is None:
+        return None
+    rms = f"{significant(square**0.5)} px RMS from where the board has them, {significant(square_of_file**0.5)} px"
+    return replace(cause, reason=f"{cause.reason}; by the dots of the board alone, which are {rms} with the file")
+
+
+@contextmanager
+def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Iterator[None]:
+    """Lets errors of a run that cannot be solved name what of the camera file is wrong, if the board tells it."""
+    try:
+        yield
+    except UNSOLVED as error:
+        if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
+            name = cause.cause
+            error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
+        raise
