@@ -86,14 +86,14 @@ def timed_handeye(scratch: Path) -> dict[str, dict]:
 
     from stcal.handeye import HandEyeOptions
     from stcal.workflows.handeye_inputs import read_handeye
-    from stcal.workflows.handeye_run import Splits, calibrate
+    from stcal.workflows.handeye_run import calibrate_handeye
 
     rows = {}
     folder = photographed_chessboards(scratch / "chessboards", VIEWS, 1.0)
     files = (folder / name for name in ("images", "poses.csv", "cameras.txt", "board.toml"))
     start = time.perf_counter()
     given = read_handeye(*files)
-    calibrate(given, "eye-in-hand", None, HandEyeOptions(intrinsics=given.prior), Splits())
+    calibrate_handeye(given, options=HandEyeOptions(intrinsics=given.prior))
     rows[HANDEYE] = {"seconds": time.perf_counter() - start}
     for title, name in (("ChArUco, 16 of 1.9 Mpx", "charuco"), ("dot boards, 15 of 0.3 Mpx", "dots")):
         if (SHARED / f"{name.replace('dots', 'dotgrid')}_handeye").is_dir():

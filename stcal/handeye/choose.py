@@ -10,17 +10,14 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import HandEyePoses, Setup
-from stcal.handeye.data.views import Views
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
 from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions, solved
+from stcal.handeye.solve import Problem
 from stcal.handeye.validate import (
     HeldOutPoses,
     deciding_error,
-    predicted,
-    repaired,
-    require_solvable_without,
+    errors_of,
+    naming_held_out,
     with_common_errors,
     with_jackknife,
 )
@@ -65,9 +62,10 @@ class Candidate:
         unknowns = [*["the intrinsics"] * self.camera, *["the board's size"] * self.scale]
         return f"{self.method} with {' and '.join(unknowns)} solved for" if unknowns else f"{self.method} as filed"
 
-    def options(self, options: HandEyeOptions, prior: CameraPrior | None) -> HandEyeOptions:
-        """Returns the options of this candidate. ``prior`` holds the intrinsics where they are solved for."""
-        return replace(options, intrinsics=prior if self.camera else None, with_scale=self.scale)
+    def of(self, problem: Problem, prior: CameraPrior | None) -> Problem:
+        """Returns the problem with the unknowns of this candidate. ``prior`` : of the intrinsics."""
+        options = replace(problem.options, intrinsics=prior if self.camera else None, with_scale=self.scale)
+        return replace(problem, options=options)
 
 
 CLOSED_FORMS = tuple(Candidate(method) for method in (*AX_ZB, *AX_XB))
@@ -139,46 +137,39 @@ class _Outcome:
     shown_without: np.ndarray
 
 
-def _solved(
-    pairs: HandEyePoses, setup: Setup, method: str, views: Views | None, options: HandEyeOptions, rows: np.ndarray
-) -> _Outcome | StcalError:
+def _solved(problem: Problem, method: str, rows: np.ndarray) -> _Outcome | StcalError:
     """Returns the results of a candidate from all poses and without those of each split, or the error if it fails."""
     try:
-        solution = solved(pairs, setup, method, views, options)
+        solution = problem.solved(method)
         partial = tuple(solution.without(out) for out in rows)
-        result = solution.result
     except StcalError as error:
         return error
-    errors = [
-        deciding_error(part, pairs[out], None if views is None else views[out])
-        for part, out in zip(partial, rows, strict=True)
-    ]
-    share = 1 - rows.shape[1] / len(pairs)
-    shown_without = np.array([_shown(part, options, views, share) for part in partial])
-    return _Outcome(result, partial, np.array(errors), _shown(result, options, views), shown_without)
+    result, unseen = solution.result, (problem[out] for out in rows)
+    errors = [deciding_error(part, own.pairs, own.views) for part, own in zip(partial, unseen, strict=True)]
+    share = 1 - rows.shape[1] / len(problem)
+    shown_without = np.array([_shown(part, problem, share) for part in partial])
+    return _Outcome(result, partial, np.array(errors), _shown(result, problem), shown_without)
 
 
-def _with_sigma(
-    result: HandEye, pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
-) -> HandEye:
+def _with_sigma(result: HandEye, problem: Problem) -> HandEye:
     """Returns the result of a closed form with covariances by the jackknife, or any other as it is."""
     if result.covariance is not None:
         return result
-    solution = solved(pairs, setup, result.method, views, options)
-    result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
-    return with_common_errors(result, pairs, setup, options)
+    solution = problem.solved(result.method)
+    return with_common_errors(
+        with_jackknife(result, [solution.without(np.array([i])) for i in range(len(problem))]), problem
+    )
 
 
-def _shown(result: HandEye, options: HandEyeOptions, views: Views | None, share: float = 1.0) -> bool:
+def _shown(result: HandEye, problem: Problem, share: float = 1.0) -> bool:
     """True if board and intrinsics, where solved for from this ``share`` of the poses, differ from their files beyond
     chance."""
-    tests = []
-    if options.with_scale and result.sigma_scale:
+    tests, found, intrinsics = [], result.reprojection, problem.options.intrinsics
+    if problem.options.with_scale and result.sigma_scale:
         tests.append((((result.scale - 1) / result.sigma_scale) ** 2, 1))
-    found = result.reprojection
-    if options.intrinsics is not None and views is not None and found is not None:
-        basis = intrinsic_basis(options.intrinsics.colmap_model)
-        off = basis.T @ (found.camera.parameters() - views.camera.parameters()) / basis.sum(0)
+    if intrinsics is not None and problem.views is not None and found is not None:
+        basis = intrinsic_basis(intrinsics.colmap_model)
+        off = basis.T @ (found.camera.parameters() - problem.views.camera.parameters()) / basis.sum(0)
         if found.camera_covariance is not None:
             tests.append((float(off @ generalised_inverse(found.camera_covariance) @ off), len(off)))
     return all(share * squared > chi2.ppf(1 - SHOWN, dof) for squared, dof in tests)
@@ -234,10 +225,7 @@ def _difference(off: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
 
 @one_thread()
 def choose(
-    pairs: HandEyePoses,
-    setup: Setup,
-    views: Views | None,
-    options: HandEyeOptions,
+    problem: Problem,
     prior: CameraPrior | None,
     rows: np.ndarray,
     workers: int | None = 1,
@@ -249,25 +237,24 @@ def choose(
     :func:`~stcal.handeye.validate.deciding_error` on held-out poses decides. Solutions without some poses are one step
     from the solution of all.
 
-    ``options`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
+    ``problem`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
     None; ``rows`` : (s, k) poses to hold out in each split; ``progress`` : called with the number of solutions done,
     and of all.
 
     Raises StcalError: the first candidate, which trusts all files, fails.
     """
-    pairs, views, options = repaired(pairs, setup, views, options)
+    problem = problem.mended()
     for out in rows:
-        require_solvable_without(pairs, setup, options, out)
+        with naming_held_out(problem, out):
+            problem.without(out).require_observable()
     candidates = [
         candidate
-        for candidate in (BY_POSES if views is None else BY_VIEWS)
-        if (prior is not None or not candidate.camera) and not (options.four_dof and candidate in CLOSED_FORMS)
+        for candidate in (BY_POSES if problem.views is None else BY_VIEWS)
+        if (prior is not None or not candidate.camera) and not (problem.options.four_dof and candidate in CLOSED_FORMS)
     ]
-    jobs = [
-        (pairs, setup, candidate.method, views, candidate.options(options, prior), rows) for candidate in candidates
-    ]
+    jobs = [(candidate.of(problem, prior), candidate.method, rows) for candidate in candidates]
     finished: dict[int, _Outcome | StcalError] = {}
-    for i, outcome in run_parallel(_solved, jobs, 1 if views is None else workers):
+    for i, outcome in run_parallel(_solved, jobs, 1 if problem.views is None else workers):
         if i == 0 and isinstance(outcome, StcalError):  # what the first one cannot use, the others should not
             raise outcome
         finished[i] = outcome
@@ -276,18 +263,14 @@ def choose(
     trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
     chosen = trial.best()
     try:  # of a closed form the σ cost a solution for each pose: they are made for the chosen one alone
-        result = _with_sigma(trial.outcomes[chosen].result, pairs, setup, views, chosen.options(options, prior))
+        result = _with_sigma(trial.outcomes[chosen].result, chosen.of(problem, prior))
     except StcalError as error:
         outcomes[chosen] = error
         trial = _Trial({each: own for each, own in trial.outcomes.items() if each not in CLOSED_FORMS}, rows)
         chosen = trial.best()
         result = trial.outcomes[chosen].result
-    best_of_splits = [trial.outcomes[trial.best(k)].partial[k] for k in range(len(rows))]
-    errors = [
-        predicted(part, pairs[out], None if views is None else views[out])
-        | {"mount_from_camera": part.mount_from_camera.matrix()}
-        for part, out in zip(best_of_splits, rows, strict=True)
-    ]
+    best_of_splits = (trial.outcomes[trial.best(k)].partial[k] for k in range(len(rows)))
+    errors = [errors_of(part, problem[out]) for part, out in zip(best_of_splits, rows, strict=True)]
     held_out = HeldOutPoses.of_splits(rows, errors)
     tried = tuple(
         Tried(candidate, NO_ERRORS, str(each)) if isinstance(each, StcalError) else Tried(candidate, each.error_mm)
@@ -302,7 +285,7 @@ def choose(
     of_splits = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
     result = replace(held_out, mount_from_camera=of_splits).widened(result)
     result, notes = _widened(result, chosen, rivals)
-    where = "of the board's origin" if views is None else "at the board"
+    where = "of the board's origin" if problem.views is None else "at the board"
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, where), notes)
 
 

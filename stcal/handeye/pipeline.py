@@ -1,67 +1,52 @@
 """Hand-eye calibration as a whole: a way of solving, and σ that hold for poses that it has not seen."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.handeye import solve
-from stcal.handeye.choose import Choice, choose
+from stcal.handeye.choose import choose
 from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions
-from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits
+from stcal.handeye.solve import HandEyeOptions, Problem
+from stcal.handeye.validate import LEAST_LEFT, refitted, splits
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Validated:
-    """A result with its errors on held-out poses. ``held_out`` : None if too few would be left; ``options`` : as used;
-    ``choice`` : the ways that were tried, if none was named; ``notes`` : why errors are missing."""
-
-    result: HandEye
-    held_out: HeldOutPoses | None
-    options: HandEyeOptions
-    choice: Choice | None = None
-    notes: tuple[str, ...] = ()
-
-
 def validated(
-    pairs: HandEyePoses,
-    setup: Setup,
+    problem: Problem,
     method: str | None,
-    views: Views | None,
-    options: HandEyeOptions,
-    prior: CameraPrior | None,
     rows: np.ndarray,
+    prior: CameraPrior | None = None,
+    choosing: bool = False,
     workers: int | None = 1,
     progress: Callable[[int, int], None] = lambda *_: None,
-    choosing: bool = False,
-) -> Validated:
+) -> Outcome:
     """Returns the result of a method, or of the way that predicts best, with σ that hold for poses held out.
 
-    ``prior`` : of intrinsics that may be solved for; ``rows`` : (s, k) poses to hold out; ``choosing`` : among all
+    ``rows`` : (s, k) poses to hold out; ``prior`` : of intrinsics that may be solved for; ``choosing`` : among all
     ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
     """
+    known, notes = {"options": problem.options, "pairs": problem.pairs, "views": problem.views}, ()
     try:
         if choosing and len(rows):
-            choice = choose(pairs, setup, views, options, prior, rows, workers, progress)
-            return Validated(choice.result, choice.held_out, choice.chosen.options(options, prior), choice)
-        result = solve.handeye(pairs, setup, method, views, options)
-        if not len(rows):
-            return Validated(result, None, options)
-        held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
-        return Validated(held_out.widened(result), held_out, options)
+            choice = choose(problem, prior, rows, workers, progress)
+            known["options"] = choice.chosen.of(problem, prior).options
+            return Outcome("", choice.result, choice.held_out, choice=choice, **known)
+        result = problem.solved(method).result
+        if len(rows):
+            held_out = refitted(problem.mended(), method, rows, workers, progress)
+            return Outcome("", held_out.widened(result), held_out, **known)
     except DegenerateError as error:  # if not of all poses, then of those besides some
-        result = solve.handeye(pairs, setup, method, views, options)
-        return Validated(result, None, options, notes=(f"no errors on poses held out: {error}",))
+        result, notes = problem.solved(method).result, (f"no errors on poses held out: {error}",)
+    return Outcome("", result, notes=notes, **known)
 
 
 @require_arguments
@@ -135,12 +120,11 @@ def handeye(
         raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
     else:
         pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)
-    options = options or HandEyeOptions()
+    problem = Problem(pairs, asked, views, options or HandEyeOptions())
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
-    prior = None if views is None else options.camera
-    choosing = method is None and not options.names_unknowns
-    found = validated(pairs, asked, method, views, options, prior, rows, choosing=choosing)
+    prior = None if views is None else problem.options.camera
+    choosing = method is None and not problem.options.names_unknowns
+    found = validated(problem, method, rows, prior, choosing)
     x, z = found.result.mount_from_camera, found.result.stand_from_board
-    notes = (*found.notes, *of_setup(x, z, asked, setup is not None))
-    outcome = Outcome("", found.result, found.held_out, notes=notes, choice=found.choice, pairs=pairs)
-    return replace(found.result, judgement=judged(outcome), notes=outcome.all_notes())
+    outcome = replace(found, notes=(*found.notes, *of_setup(x, z, asked, setup is not None)))
+    return replace(outcome.result, judgement=judged(outcome), notes=outcome.all_notes())

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: one function for every method."""
+"""Hand-eye calibration: one problem, and one function for every method."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,17 +22,15 @@ from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed_form
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.methods.joint import Adjusted, adjust_views, in_common, of_poses
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places, places
-from stcal.handeye.methods.reprojection import CAMERA_GAIN, resected
+from stcal.handeye.methods.reprojection import CAMERA_GAIN, Adjusted, adjust_views, in_common, of_poses, resected
 from stcal.handeye.result import HandEye
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
 S = TypeVar("S", PoseSolution, Adjusted)
-OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
-METHODS = (*AX_XB, *AX_ZB, *OTHERS)
+METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", "pose", "reprojection")
 """Names of all methods."""
 UNIT_MM = 1000.0
 """Length that weighs like one radian if no σ are stated, in mm: an error of 1 mm weighs like one of 1 mrad."""
@@ -52,8 +50,8 @@ ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
 chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
-AT_ONE_PLACE = "the robot stood several times at one place: its errors there count once in σ"
-IN_COMMON = "σ contain the errors that the board's poses have in common (columns common…)"
+AT_ONE_PLACE = Aside("the robot stood several times at one place: its errors there count once in σ")
+IN_COMMON = Aside("σ contain the errors that the board's poses have in common (columns common…)")
 HELD_MM = 1e-6
 """σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
 
@@ -105,24 +103,90 @@ class HandEyeOptions(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Task:
-    """Input of one call. ``pairs``, ``views`` : after repair of the numbering; ``guess`` : returns first X, Z and scale
-    of a loop and ``with_scale``; ``seen`` : observability; ``notes`` : notes so far; ``part`` : of :func:`handeye`."""
+class Problem:
+    """What is solved: ``pairs`` of poses in a ``setup``, the ``views`` from which they were computed, and ``options``;
+    ``notes`` : on repairs; ``part`` : whether the poses are a part of others, of which conventions were judged."""
 
     pairs: HandEyePoses
-    loop: Loop
-    setup: Setup
-    views: Views | None
-    options: HandEyeOptions
-    guess: Guess
-    seen: Observability
-    notes: tuple[str, ...]
-    part: bool
+    setup: Setup = "eye-in-hand"
+    views: Views | None = None
+    options: HandEyeOptions = field(default_factory=HandEyeOptions)
+    notes: tuple[str, ...] = ()
+    part: bool = False
 
-    def only(self, rows: np.ndarray) -> "_Task":
-        """Returns the task with these poses alone."""
-        views = None if self.views is None else self.views[rows]
-        return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, rows: np.ndarray) -> "Problem":
+        """Returns the problem of these poses alone."""
+        views, arm = (None if each is None else each[rows] for each in (self.views, self.options.arm))
+        return replace(self, pairs=self.pairs[rows], views=views, options=replace(self.options, arm=arm))
+
+    def without(self, out: np.ndarray) -> "Problem":
+        """Returns the problem without the poses ``out``, (k,)."""
+        return replace(self[np.setdiff1d(np.arange(len(self)), out)], part=True)
+
+    @property
+    def loop(self) -> Loop:
+        """The poses in the terms of the equation."""
+        return Loop.of(self.pairs, self.setup)
+
+    def mended(self) -> "Problem":
+        """Returns the problem with the numberings of a symmetric board corrected, and a note on that."""
+        if not self.options.symmetries:
+            return self
+        mended = repair(self.pairs, self.setup, self.options.symmetries, self.views)
+        options, notes = replace(self.options, symmetries=()), (*self.notes, *mended.notes())
+        return replace(self, pairs=mended.pairs, views=mended.views, options=options, notes=notes)
+
+    def require_observable(self) -> Observability:
+        """Returns what the poses determine; raises DegenerateError if that is not enough."""
+        return check(self.loop, self.setup, self.pairs.where, self.options.four_dof)
+
+    def solved(self, method: str | None = None) -> "Solved":
+        """Returns the result of one method, ``reprojection`` with views, else ``pose``, if None, with the state from
+        which solutions without some poses start. Raises StcalError: as :func:`stcal.handeye.handeye`."""
+        method = method or ("pose" if self.views is None else "reprojection")
+        options, pairs = self.options, self.pairs
+        if method not in METHODS:
+            choices = ", ".join(METHODS)
+            raise InputError("E-OPTION-METHOD", f"hand-eye: method {method!r} is unknown; one of {choices} needed")
+        if method == "reprojection" and (self.views is None or len(self.views) != len(pairs)):
+            raise InputError(
+                "E-HANDEYE-NEEDS-VIEWS",
+                "hand-eye: reprojection needs the corners of every pose; give views, or use method pose",
+            )
+        if options.arm is not None and method != "reprojection":
+            raise InputError(
+                "E-HANDEYE-NEEDS-VIEWS",
+                f"hand-eye: {method} does not solve for the arm; give views, and method reprojection",
+            )
+        seen = self.require_observable()
+        if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
+            raise DegenerateError(
+                "E-HANDEYE-FEW-POSES",
+                f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more",
+            )
+        problem = self.mended()
+        if options.arm is None:
+            problem.pairs.require_moving_flange()
+
+        @cache
+        def guess(loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+            if options.four_dof:
+                return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
+            return closed_form.robust(loop, with_scale)
+
+        loop, by_images = problem.loop, problem.views is not None
+        if not self.part:
+            doubts = check_conventions(problem.pairs, loop, self.setup, guess, options.with_scale, by_images)
+            problem = replace(problem, notes=(*problem.notes, *doubts))
+        task = _Task(problem, loop, guess, seen)
+        if method == "pose":
+            return _by_poses(task)
+        if method == "reprojection" and problem.views is not None:
+            return _by_views(task, problem.views)
+        return Solved(task, _by_equations(task, method))
 
 
 @one_thread()
@@ -132,45 +196,21 @@ def handeye(
     method: str | None = None,
     views: Views | None = None,
     options: HandEyeOptions | None = None,
-    part: bool = False,
 ) -> HandEye:
-    """Returns the result of one method, with σ estimated from its own residuals; ``reprojection`` with views, else
-    ``pose``, if None. Parameters and errors as for :func:`stcal.handeye.handeye`, which chooses a method and widens
-    σ. ``part`` : the poses are a part of others, of which conventions were judged."""
-    return solved(pairs, setup, method, views, options, part).result
+    """Returns the result of one method, with σ estimated from its own residuals. Parameters and errors as for
+    :func:`stcal.handeye.handeye`, which chooses a method and widens σ."""
+    return Problem(pairs, setup, views, options or HandEyeOptions()).solved(method).result
 
 
-def solved(
-    pairs: HandEyePoses,
-    setup: Setup,
-    method: str | None,
-    views: Views | None,
-    options: HandEyeOptions | None,
-    part: bool = False,
-) -> "Solved":
-    """Returns the result of :func:`handeye` with the state from which solutions without some poses start."""
-    method = method or ("pose" if views is None else "reprojection")
-    if method not in METHODS:
-        raise InputError(
-            "E-OPTION-METHOD", f"hand-eye: method {method!r} is unknown; one of {', '.join(METHODS)} needed"
-        )
-    if method == "reprojection" and (views is None or len(views) != len(pairs)):
-        raise InputError(
-            "E-HANDEYE-NEEDS-VIEWS",
-            "hand-eye: reprojection needs the corners of every pose; give views, or use method pose",
-        )
-    options = options or HandEyeOptions()
-    if options.arm is not None and method != "reprojection":
-        raise InputError(
-            "E-HANDEYE-NEEDS-VIEWS",
-            f"hand-eye: {method} does not solve for the arm; give views, and method reprojection",
-        )
-    task = _task(pairs, setup, views, options, part)
-    if method == "pose":
-        return _by_poses(task)
-    if method == "reprojection" and task.views is not None:
-        return _by_views(task, task.views)
-    return Solved(task, _by_equations(task, method))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """A ``problem`` after repair, with its ``loop``; ``guess`` : returns first X, Z and scale of a loop and
+    ``with_scale``; ``seen`` : observability."""
+
+    problem: Problem
+    loop: Loop
+    guess: Guess
+    seen: Observability
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,88 +224,58 @@ class Solved:
     def without(self, out: np.ndarray) -> HandEye:
         """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
         all poses. Adjustments take one step; other methods are solved again. Raises StcalError: they fail."""
-        task, solution = self.task, self.solution
+        task, solution, board = self.task, self.solution, None
         if solution is None:
-            again = _by_equations(task.only(np.setdiff1d(np.arange(len(task.loop)), out)), self.result.method)
-            return replace(
-                self.result, mount_from_camera=again.mount_from_camera, stand_from_board=again.stand_from_board
-            )
-        board = None
+            problem = task.problem.without(out)
+            again = _by_equations(replace(task, problem=problem, loop=problem.loop), self.result.method)
+            x, z = again.mount_from_camera, again.stand_from_board
+            return replace(self.result, mount_from_camera=x, stand_from_board=z)
         if isinstance(solution, Adjusted):
             state = solution.without(out)
-            found, corners = solution.found, state.scale * state.corners
-            board = replace(found, camera=state.camera, corners=corners)
+            board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
         else:
             state = solution.without(task.loop, out)
         x, z = state.mount_from_camera, state.stand_from_board
-        if task.options.four_dof:
+        if task.problem.options.four_dof:
             x, z = closed_form.slid(x, z, task.seen.mount_axis, task.loop)
         return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
 
 
-def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions, part: bool) -> _Task:
-    """Runs the checks that all methods share."""
-    observability = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
-    if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
-        raise DegenerateError(
-            "E-HANDEYE-FEW-POSES",
-            f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more",
-        )
-    notes: tuple[str, ...] = ()
-    if options.symmetries:
-        repaired = repair(pairs, setup, options.symmetries, views)
-        pairs, views, notes = repaired.pairs, repaired.views, repaired.notes()
-    if options.arm is None:
-        pairs.require_moving_flange()
-    loop = Loop.of(pairs, setup)
-
-    @cache
-    def guess(loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
-        if options.four_dof:
-            return closed_form.about_one_axis(loop, observability.mount_axis, with_scale)
-        return closed_form.robust(loop, with_scale)
-
-    if not part:
-        notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
-    return _Task(pairs, loop, setup, views, options, guess, observability, notes, part)
-
-
 def _by_equations(task: _Task, method: str) -> HandEye:
     """Solves AX = XB or AX = ZB by the named method."""
-    if task.options.four_dof:
+    options, pairs, loop, notes = task.problem.options, task.problem.pairs, task.loop, task.problem.notes
+    if options.four_dof:
         raise DegenerateError(
             "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with --four-dof use method pose"
         )
-    loop, notes, noise = task.loop, task.notes, task.options.noise
+    noise, evolution = options.noise, options.evolution
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
     if method in AX_XB and not (used := poses_with_log(loop)).all():
-        left_out = ", ".join(name for name, u in zip(task.pairs.names, used, strict=True) if not u)
+        left_out = ", ".join(name for name, u in zip(pairs.names, used, strict=True) if not u)
         notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
         loop = loop[used]
         if len(loop) < 3 or Observability.of(loop).useless:
             raise DegenerateError(
                 "E-HANDEYE-LARGE-TURNS",
                 f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
-                "left for "
-                f"{method}; use method pose or shah",
+                f"left for {method}; use method pose or shah",
             )
     if method in (*AX_XB, *AX_ZB):
         x, z = solve_closed_form(loop, method, unit_mm)
     else:
-        motions, options = Motions.consecutive(loop), task.options.evolution
+        motions = Motions.consecutive(loop)
         if method == "zhao":
             x = convex(motions, unit_mm)
         else:
-            objective = Objective(motions.with_log(method), unit_mm, options.weight)
-            known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
-            places = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
-            x = evolve(objective, options, float(np.linalg.norm(places, axis=1).max()), known_x)
+            objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
+            known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if evolution.needs_closed_form() else None
+            farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
+            x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
             x = polish(objective, x) if method == "de-polished" else x
         if method == "de":
-            notes = (*notes, Aside(options.in_words(unit_mm)))
-        z = closed_form.mean_pose(task.loop.chain(x))
-    none = np.zeros(len(task.loop), bool)
-    return _result(task, method, x, z, task.loop.residuals(x, z), none, notes)
+            notes = (*notes, Aside(evolution.in_words(unit_mm)))
+        z = closed_form.mean_pose(loop.chain(x))
+    return _result(task, method, x, z, task.loop.residuals(x, z), np.zeros(len(pairs), bool), notes)
 
 
 def _result(
@@ -282,29 +292,28 @@ def _result(
     """Returns the result; ``covariance`` : (12, 12) or more, of X and Z first; ``more`` : further fields."""
     if covariance is not None:
         more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
-    names, seen = task.pairs.names, task.seen
-    return HandEye(method, task.setup, x, z, residuals, names, outliers, observability=seen, notes=notes, **more)
+    names, seen = task.problem.pairs.names, task.seen
+    return HandEye(
+        method, task.problem.setup, x, z, residuals, names, outliers, observability=seen, notes=notes, **more
+    )
 
 
 def _by_poses(task: _Task) -> Solved:
-    options = task.options
-    first = LoopState(*task.guess(task.loop, options.with_scale))
-    solution, contradicted = _by_true_robot(
+    problem, options, loop = task.problem, task.problem.options, task.loop
+    first = LoopState(*task.guess(loop, options.with_scale))
+    solution, noise, contradicted = _by_true_robot(
         task, lambda loop, noise: adjust_poses(loop, first, noise, options.with_scale)
     )
-    noise = options.noise if not contradicted else replace(options.noise, robot_rad=None, robot_mm=None)
-    state, normal = solution.state, solution.normal
-    x, z = state.mount_from_camera, state.stand_from_board
-    notes, covariance = task.notes + contradicted, generalised_inverse(normal)
-    if not options.four_dof and (clusters := by_places(task.loop, solution)):
-        covariance = clusters.covariance
-        notes += (Aside(AT_ONE_PLACE),)
-    sigma_scale = float(np.sqrt(covariance[12, 12])) if options.with_scale else None
+    state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
+    notes, inverse = problem.notes + contradicted, generalised_inverse(solution.normal)
+    if not options.four_dof and (clusters := by_places(loop, solution)):
+        inverse, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
+    sigma_scale = float(np.sqrt(inverse[12, 12])) if options.with_scale else None
     if sigma_scale is not None:
-        require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
+        require_scale(state.scale, sigma_scale, loop, problem.pairs.where)
     if options.four_dof:
-        x, z, covariance, notes = _without_slide(task, x, z, normal)
-    inverse = covariance
+        x, z, inverse, notes = _without_slide(task, x, z, solution.normal)
+    covariance, common = inverse, None
     notes += _remarks(task, x, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
@@ -313,12 +322,11 @@ def _by_poses(task: _Task) -> Solved:
         notes += beyond
         if beyond and solution.variance_factor > 1:
             covariance = covariance * solution.variance_factor
-    common = None
-    if task.loop.camera_common is not None:
-        added = in_common(task.loop, solution, task.loop.camera_common).covariance(inverse) - inverse
-        common, notes, covariance = added[:6, :6], (*notes, Aside(IN_COMMON)), covariance + added
-    if task.views is not None and options.camera is not None:
-        error = of_poses(task.loop, solution, task.views, options.camera)
+    if loop.camera_common is not None:
+        added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
+        common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
+    if problem.views is not None and options.camera is not None:
+        error = of_poses(loop, solution, problem.views, options.camera)
         covariance = covariance + error.covariance(inverse) - inverse
     stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
     result = _result(
@@ -340,33 +348,31 @@ def _by_poses(task: _Task) -> Solved:
 
 
 def _by_views(task: _Task, views: Views) -> Solved:
-    options, names = task.options, task.pairs.names
-    first = task.guess(task.loop, options.with_scale)
+    problem, options, pairs = task.problem, task.problem.options, task.problem.pairs
+    first, scaled = task.guess(task.loop, options.with_scale), options.with_scale
 
     def adjusted_by(loop: Loop, noise: Noise) -> Adjusted:
-        flange = task.pairs.base_from_flange
-        intrinsics, camera = options.intrinsics, options.camera
-        return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
+        flange, intrinsics = pairs.base_from_flange, options.intrinsics
+        return adjust_views(loop, flange, views, first, noise, intrinsics, scaled, options.camera, options.arm)
 
-    solution, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, reprojection = solution.state, ~solution.used, solution.found
-    sigma_scale = solution.sigma_scale
+    solution, _, contradicted = _by_true_robot(task, adjusted_by)
+    state, outliers, sigma_scale = solution.state, ~solution.used, solution.sigma_scale
     if sigma_scale is not None:
-        require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
+        require_scale(state.scale, sigma_scale, task.loop, pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
-    notes, covariance = task.notes + contradicted, solution.covariance
+    notes, covariance = problem.notes + contradicted, solution.covariance
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loop, camera_from_board=resected(names, views, reprojection))
-    residuals = adjusted.residuals(x, z)
-    if not options.four_dof and places(adjusted[~outliers]) is not None:
+    adjusted = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
+    residuals, good = adjusted.residuals(x, z), adjusted[~outliers]
+    if not options.four_dof and places(good) is not None:
         # What the places add to the covariance of the board's poses, they add to that of the corners.
-        by_poses = adjust_poses(adjusted[~outliers], LoopState(x, z, state.scale), Noise(), options.with_scale, False)
-        if clusters := by_places(adjusted[~outliers], by_poses):
+        by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), scaled, False)
+        if clusters := by_places(good, by_poses):
             added = clusters.covariance - clusters.independent
-            covariance, notes = covariance + added[:12, :12], (*notes, Aside(AT_ONE_PLACE))
+            covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
             if sigma_scale is not None:
                 sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
@@ -391,72 +397,67 @@ def _by_views(task: _Task, views: Views) -> Solved:
         sigma_scale=sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
-        reprojection=reprojection,
+        reprojection=solution.found,
     )
     return Solved(task, result, solution)
 
 
-def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:
-    """Solves with the robot's stated σ, or estimated ones and a note if poses contradict them: errors of a robot held
-    too tightly appear in camera and board instead."""
-    noise, loop = task.options.noise, task.loop
+def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+    """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses contradict
+    the stated: errors of a robot held too tightly appear in camera and board instead."""
+    noise, loop = task.problem.options.noise, task.loop
     solution, stated = solved(loop, noise), loop.robot_covariance
     if stated is not None:
         rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
     elif noise.robot_rad is not None and noise.robot_mm is not None:
         rad, mm = noise.robot_rad, noise.robot_mm
     else:
-        return solution, ()
-    free = solved(replace(loop, robot_covariance=None), replace(noise, robot_rad=None, robot_mm=None))
+        return solution, noise, ()
+    unknown = replace(noise, robot_rad=None, robot_mm=None)
+    free = solved(replace(loop, robot_covariance=None), unknown)
     estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
-    if not _contradicted((rad, mm), estimated, solution.sigma, free.sigma, len(loop)):
-        return solution, ()
-    if isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
+    if rad and mm:
+        dof = max(3 * (len(loop) - LEAST_WITH_SCALE), 3)
+        limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
+        contradicted = estimated[0] > limit * rad or estimated[1] > limit * mm
+    else:  # an exact robot, with which corners or the board's poses fit worse
+        given, other = solution.sigma, free.sigma
+        shared = [name for name in ("corner_px", "camera_factor") if given.get(name) and other.get(name)]
+        contradicted = any(estimated) and max((given[name] / other[name] for name in shared), default=1.0) > REST_WORSE
+    if contradicted and isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
         # σ of a robot that is far better than the camera hardly show: what is estimated then is no evidence by itself.
         used = ~free.outliers
-        if solution.misfit(used) - free.misfit(used) < chi2.ppf(1 - BY_CHANCE, len(ROBOT)):
-            return solution, ()
-    return free, (
+        contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
+    if not contradicted:
+        return solution, noise, ()
+    note = (
         f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
-        f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses",
+        f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
     )
-
-
-def _contradicted(
-    stated: tuple[float, ...], found: tuple[float, ...], given: dict[str, float], free: dict[str, float], poses: int
-) -> bool:
-    """True if the robot's estimated σ exceed the stated, or corners or board poses fit worse with an exact robot."""
-    dof = max(3 * (poses - LEAST_WITH_SCALE), 3)
-    limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
-    if all(stated):
-        return any(own > limit * value for own, value in zip(found, stated, strict=True))
-    shared = [name for name in ("corner_px", "camera_factor") if given.get(name) and free.get(name)]
-    worse = max((given[name] / free[name] for name in shared), default=1.0)
-    return any(found) and worse > REST_WORSE
+    return free, unknown, (note,)
 
 
 def _remarks(
     task: _Task, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
 ) -> tuple[str, ...]:
     """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
-    if task.part:
+    problem, loop = task.problem, task.loop
+    if problem.part:
         return ()
-    names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
-    z = closed_form.mean_pose(task.loop[~outliers].chain(x))
-    tilted = flipped(task.loop, x, z, outliers)
-    notes = remarks.of_still(task.pairs) + remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
-    notes += flip_note(task.pairs.names, tilted)
-    apart = places(task.loop) is None
-    moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12], apart)
-    notes += moved or remarks.of_groups(names, residuals[~outliers])
-    if not (task.options.with_scale or task.options.four_dof):
-        notes += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
-    return notes + remarks.of_distance(task.loop)
+    pairs, options, good = problem.pairs, problem.options, ~outliers
+    tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
+    notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
+    notes += flip_note(pairs.names, tilted)
+    moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x)[:, :, :12], places(loop) is None)
+    notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
+    if not (options.with_scale or options.four_dof):
+        notes += remarks.of_size(loop[good], hint, options.noise)
+    return notes + remarks.of_distance(loop)
 
 
 def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
     """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
-    axis, frames = task.seen.mount_axis, FRAMES[task.setup]
+    axis, frames = task.seen.mount_axis, FRAMES[task.problem.setup]
     x, z = closed_form.slid(x, z, axis, task.loop)
     held = normal.copy()
     held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
@@ -464,4 +465,4 @@ def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
         f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which the "
         f"flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
     )
-    return x, z, generalised_inverse(held), (*task.notes, note)
+    return x, z, generalised_inverse(held), (*task.problem.notes, note)

@@ -14,12 +14,12 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
-from stcal.handeye.data.pairs import Loop, Setup
+from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.solve import handeye
+from stcal.handeye.solve import Problem
 from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -40,7 +40,6 @@ from stcal.workflows.robot_at_images import (
 
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
-OF_IMAGES = ("--poses", "--camera", "--board")
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | Told
 
@@ -69,30 +68,29 @@ class HandEyeInput:
     timed: Timed | None = None
     notes: tuple[str, ...] = ()
 
+    def problem(self, options: HandEyeOptions) -> Problem:
+        """Returns what is to be solved."""
+        return Problem(self.pairs, self.setup or "eye-in-hand", self.views, options)
+
 
 def one_source(
-    source: Path,
-    second: Path | None,
+    first: Path,
+    second: Path,
     key: str,
     statements: Said,
     quaternions: Order = "wxyz",
     timing: Timing | None = None,
 ) -> tuple[Source, tuple[str, ...]]:
-    """Returns the poses of two files, the robot's and the camera's, or of one, as one source; and notes on rows left
-    out.
-
-    Two tables of the package's own are joined as tables.
-    """
-    if second is None:
-        return source, ()
+    """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
+    tables of the package's own are joined as tables."""
     timing = timing or Timing()
-    told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
+    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
     if told is not None:
         return told, ()
-    for path in (source, second):
+    for path in (first, second):
         require_own(path, quaternions)
-    _require_unsaid(statements, f"{source}, {second}")
-    joined = join_tables(str(source), str(second), key, PREFIXES, quaternions)
+    _require_unsaid(statements, f"{first}, {second}")
+    joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
 
 
@@ -179,16 +177,14 @@ def read_handeye(
         A file is missing or not of the required form, one file too many was given, or no image shows the board.
     """
     statements = Said.of_options(rotation, length_unit, poses_are, setup)
-    timing = Timing(tolerance_s, _path(image_times), time_offset)
-    place, notes = Path(source) if isinstance(source, str) else source, ()
-    if isinstance(place, Path) and not place.is_dir():
-        place, notes = one_source(place, _path(second), key, statements, quaternions, timing)
-    files = Files(place, _path(poses), _path(camera), _path(board), statements, quaternions, timing, robot)
+    paths = (None if path is None else Path(path) for path in (poses, camera, board, second, image_times))
+    robot_file, camera_file, board_file, other, times = paths
+    timing, notes = Timing(tolerance_s, times, time_offset), ()
+    place = Path(source) if isinstance(source, str) else source
+    if isinstance(place, Path) and other is not None and not place.is_dir():
+        place, notes = one_source(place, other, key, statements, quaternions, timing)
+    files = Files(place, robot_file, camera_file, board_file, statements, quaternions, timing, robot)
     return replace(files.read(workers, progress), notes=notes)
-
-
-def _path(path: str | Path | None) -> Path | None:
-    return None if path is None else Path(path)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +210,8 @@ class Files:
         """Returns the pairs of poses, and the views of the board if there are images."""
         if isinstance(self.source, Path) and self.source.is_dir():
             return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
-        self._require_no_images()
         source, statements = self.source, self.statements
+        self._require_no_images()
         if isinstance(source, Table):
             return HandEyeInput(source.where, read_poses(source, self.quaternions), setup=statements.setup)
         if isinstance(source, Told):
@@ -232,33 +228,35 @@ class Files:
         known = {name: getattr(told, name) for name in ("left_out", "understood", "timed")}
         return HandEyeInput(where, told.pairs, setup=stated or told.setup, **known)
 
+    def _of_images(self) -> dict[str, Path | None]:
+        """Returns the options of images, by name."""
+        return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
+
     def _require_no_images(self) -> None:
         """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
-        source, of_images = self.source, zip(OF_IMAGES, (self.poses, self.camera, self.board), strict=True)
-        place = (
-            source.pairs.where if isinstance(source, Told) else source.where if isinstance(source, Table) else source
-        )
-        if self.robot is not None:
-            raise InputError(
-                "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
-            )
-        if isinstance(source, Path) and not source.exists():
-            raise InputError(
-                "E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed"
-            )
-        if extra := [name for name, path in of_images if path is not None]:
-            held = "is a file of poses" if isinstance(source, Path) else "are poses"
-            raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {place} {held}")
-        if self.timing.image_times is not None:
-            raise InputError(
-                "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
-            )
-        if self.timing.offset and not (isinstance(source, Told) and source.timed is not None):
-            raise InputError(
-                "E-OPTION-NEEDS",
+        source = self.source
+        of_file, of_pairs, of_table = (isinstance(source, kind) for kind in (Path, Told, Table))
+        place = source.pairs.where if of_pairs else source.where if of_table else source
+        extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
+        for refused, message in (
+            (self.robot is not None, "--with-kinematics: only with a folder of images, which show the arm's errors"),
+            (extra, f"{extra}: only with a folder of images; {place} {'is a file of poses' if of_file else 'are poses'}"),
+            (
+                self.timing.image_times is not None,
+                "--image-times: only with a folder of images; poses have their times beside them",
+            ),
+            (
+                self.timing.offset and not (of_pairs and source.timed is not None),
                 f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
                 "and --poses, each with times",
-            )
+            ),
+        ):
+            if of_file and not source.exists() and self.robot is None:
+                raise InputError(
+                    "E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed"
+                )
+            if refused:
+                raise InputError("E-OPTION-NEEDS", message)
 
     def dry_run(self) -> list[str]:
         """Returns lines on how the inputs are understood, without looking for the board in images."""
@@ -313,8 +311,8 @@ class _Photographs:
         """Returns the images of a folder, matched with the poses in their file."""
         poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
         if poses is None or camera is None or board is None:
-            missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
-            raise InputError("E-OPTION-MISSING", f"image folder {folder}: {', '.join(missing)} needed with images")
+            missing = ", ".join(name for name, path in files._of_images().items() if path is None)
+            raise InputError("E-OPTION-MISSING", f"image folder {folder}: {missing} needed with images")
         if files.robot is None:
             robot = read_robot_poses(poses, files.quaternions, files.statements)
         elif timing.offset or timing.image_times is not None:
@@ -418,21 +416,20 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
     InputError
         The input consists of images, which determine the poses by themselves.
     """
-    inputs, setup, options = given, given.setup or "eye-in-hand", options or HandEyeOptions()
-    if inputs.views is not None:
+    problem = given.problem(options or HandEyeOptions())
+    if given.views is not None:
         raise InputError(
             "E-OPTION-NEEDS", "--undo-flips: only with poses; with images, the corners decide the tilt; leave it out"
         )
-    pairs, undone = inputs.pairs, np.zeros(len(inputs.pairs), bool)
+    undone = np.zeros(len(problem), bool)
     for _ in range(MOST_ROUNDS):
-        result = handeye(pairs, setup, "pose", None, options)
-        x, z = result.mount_from_camera, result.stand_from_board
-        flips = flipped(Loop.of(pairs, setup), x, z, result.outliers) & ~undone
+        result, pairs = problem.solved("pose").result, problem.pairs
+        flips = flipped(problem.loop, result.mount_from_camera, result.stand_from_board, result.outliers) & ~undone
         if not flips.any():
             break
         seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
-        turned = np.where(flips[:, None, None], other.rotation, seen.rotation)
-        pairs, undone = replace(pairs, camera_from_board=Poses(turned, seen.translation)), undone | flips
-    shown = ", ".join(name for name, flip in zip(pairs.names, undone, strict=True) if flip)
-    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(pairs)} poses: {shown or 'none'}"
-    return replace(inputs, pairs=pairs), said
+        turned = Poses(np.where(flips[:, None, None], other.rotation, seen.rotation), seen.translation)
+        problem, undone = replace(problem, pairs=replace(pairs, camera_from_board=turned)), undone | flips
+    shown = ", ".join(name for name, flip in zip(given.pairs.names, undone, strict=True) if flip)
+    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(problem)} poses: {shown or 'none'}"
+    return replace(given, pairs=problem.pairs), said

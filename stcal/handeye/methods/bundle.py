@@ -14,10 +14,6 @@ from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
 
-SETTLED_MM = 1e-3
-"""Largest motion of a flange in a round of linear steps, in mm, after which only squares of the motion are
-neglected."""
-ARM_ROUNDS = 10
 PARTS = ("arm_rad", "arm_mm")
 """Groups of σ of the parameters about the arm's file: directions of axes, and places of axes."""
 

@@ -1,7 +1,7 @@
 """All results of a hand-eye command, and the verdict on them."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import f
@@ -15,6 +15,7 @@ from stcal.handeye.judge.mistakes import flipped
 from stcal.handeye.judge.observability import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, SizeDoubt, Verdict, Word, spoken
 from stcal.handeye.result import HandEye
+from stcal.handeye.solve import HandEyeOptions
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 
@@ -43,15 +44,13 @@ class Outcome:
     result : HandEye
     held_out : errors of the result's method on held-out poses
     compared : results of every method, if a comparison was asked for
+    options : by which the result was solved
     pitch_mm : pitch of dots or squares, as the board's file states it
-    colmap_model : model of the camera whose intrinsics were solved for
-    own_sigmas : whether corners came with covariances. The result's ``corner_px`` is then their factor.
     left_out : images and rows that did not take part, and why
     notes : notes in addition to those of the result
     motions : errors of the last motions, held out
     choice : the candidates that were tried, if no method was named
-    pairs : the pairs that were solved, after repair of the numbering of a symmetric board
-    views : the corners after the same repair, if there were images
+    pairs, views : the poses that were solved, and their corners if there were images; a symmetric board's as numbered
     understood : how files of other programs were interpreted
     arm : the arm's parameters, if they were solved for
     time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
@@ -61,9 +60,8 @@ class Outcome:
     result: HandEye
     held_out: HeldOutPoses | None = None
     compared: tuple[Compared, ...] = ()
+    options: HandEyeOptions = field(default_factory=HandEyeOptions)
     pitch_mm: float | None = None
-    colmap_model: str = ""
-    own_sigmas: bool = False
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
@@ -73,6 +71,16 @@ class Outcome:
     understood: tuple[str, ...] = ()
     arm: ArmFound | None = None
     time_offset: TimeOffset | None = None
+
+    @property
+    def colmap_model(self) -> str:
+        """Model of the camera whose intrinsics were solved for."""
+        return self.options.intrinsics.colmap_model if self.options.intrinsics else ""
+
+    @property
+    def own_sigmas(self) -> bool:
+        """Whether corners came with covariances. The result's ``corner_px`` is then their factor."""
+        return self.views is not None and all(view.covariance is not None for view in self.views.views)
 
     def sentence(self) -> str:
         """Returns what was solved for and what that gains; empty if the user chose what to solve for."""

@@ -72,8 +72,8 @@ def test_every_sigma_that_there_is_has_a_name():
     wrong = replace(camera, focal=1.02 * camera.focal)
     views = replace(truth.views, camera=wrong)
     prior = camera_prior(Camera.of(wrong, "PINHOLE"))
-    result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
-    outcome = Outcome("images", result, colmap_model="PINHOLE")
+    options = HandEyeOptions(intrinsics=prior)
+    outcome = Outcome("images", handeye(truth.pairs, truth.setup, None, views, options), options=options)
     assert "camera file, focal length" in outcome_report(outcome).text()
     assert "Camera, as adjusted" in outcome_report(outcome).page()
     assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5
