@@ -140,9 +140,7 @@ def handeye(
         Path | None, "Read the times of the images from this file: image, time_s (CSV); if not given, from their names."
     ] = None,
     time_tolerance: Annotated[
-        float,
-        "Take the robot's nearest pose within this time, s, if none can be interpolated.",
-        Opt(min=0, max=3600),
+        float, "Take the robot's nearest pose within this time, s, if none can be interpolated.", Opt(min=0, max=3600)
     ] = 0.02,
     motions_held_out: Annotated[
         int | None,

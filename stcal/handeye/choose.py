@@ -108,10 +108,8 @@ class Choice:
     ----------
     tried : all candidates, those that trust the files first
     chosen : the candidate that was chosen
-    result : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more
-        than the σ allow.
-    held_out : errors of the choice as a whole: in each split, of the candidate that the errors on all other poses
-        choose
+    result : than the σ allow
+    held_out : choose
     sentence : the choice, what it gains, and what it says about camera file, board and robot
     notes : notes on answers that contradict each other
     """

@@ -69,39 +69,29 @@ def handeye(
 
     Parameters
     ----------
-    base_from_flange : Poses or (m, 4, 4) array
-        At least three poses, rotated about two axes that are not parallel.
-    camera_from_board : Poses or (m, 4, 4) array
-        The pose of the board in the camera in each of them. After ``pairs``, the setup may stand here.
-    method : str, optional
-        One of :data:`METHODS`. If None, the way that predicts poses held out best, among all methods, with the board's
-        size as stated or solved for; ``reprojection`` with views, else ``pose``, where ``options`` name unknowns.
-    views : Views, optional
-        The corners from which the poses were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
+    base_from_flange : (m, 4, 4), at least three poses, rotated about two axes that are not parallel
+    camera_from_board : (m, 4, 4), the pose of the board in the camera in each of them. After ``pairs``, the setup may
+        stand here.
+    method : one of :data:`METHODS`. If None, the way that predicts poses held out best, among all methods, with the
+        board's size as stated or solved for; ``reprojection`` with views, else ``pose``, where ``options`` name
+        unknowns.
+    views : the corners from which the poses were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
         camera's errors into σ.
-    options : HandEyeOptions, optional
-        Known errors of robot and camera, and further unknowns; the defaults if None.
-    setup : {"eye-in-hand", "eye-to-hand"}
-        ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``: the board on the flange.
-    unit : {"mm", "m", "cm", "um", "in"}
-        Unit of translations.
-    pairs : HandEyePoses
-        Pairs of poses in place of the first two, also as the first argument; see :func:`~stcal.handeye.read_poses`,
-        :func:`~stcal.handeye.pairs_of_views`.
+    options : known errors of robot and camera, and further unknowns; the defaults if None
+    setup : {"eye-in-hand", "eye-to-hand"}, ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``:
+        the board on the flange
+    unit : {"mm", "m", "cm", "um", "in"}, unit of translations
+    pairs : pairs of poses in place of the first two, also as the first argument; see :func:`~stcal.handeye.read_poses`,
+        :func:`~stcal.handeye.pairs_of_views`
 
     Returns
     -------
     HandEye
         X and Z with covariances, residuals, outliers, notes on anything doubtful, and the verdict.
 
-    Raises
-    ------
-    InputError
-        The method or setup is unknown, ``reprojection`` has no views, or the poses follow another convention.
-    DegenerateError
-        The poses do not determine the answer; the message says which motion is missing.
-    ConvergenceError
-        The method fails on these poses.
+    Raises InputError: the method or setup is unknown, ``reprojection`` has no views, or the poses follow another
+    convention. Raises DegenerateError: the poses do not determine the answer; the message says which motion is missing.
+    Raises ConvergenceError: the method fails on these poses.
 
     Examples
     --------

@@ -39,14 +39,10 @@ class NextPoses(Brief):
 
     Parameters
     ----------
-    base_from_flange : Poses
-        Planned poses of the flange, mm.
-    camera_from_board : Poses
-        Poses of the board that the camera would see, mm.
-    sigma_mm : (k + 1,) array
-        Worst σ of a point at the board due to the transform: now, and after each planned pose.
-    turn_rad : (k,) array
-        Smallest rotation of the flange against any earlier pose, planned poses included.
+    base_from_flange : planned poses of the flange, mm
+    camera_from_board : poses of the board that the camera would see, mm
+    sigma_mm : (k + 1,), worst σ of a point at the board due to the transform: now, and after each planned pose
+    turn_rad : (k,), smallest rotation of the flange against any earlier pose, planned poses included
     """
 
     base_from_flange: Poses
@@ -80,31 +76,17 @@ def plan_poses(
 
     Parameters
     ----------
-    pairs : HandEyePoses
-        Poses taken so far.
-    result : HandEye
-        Result from these poses.
-    count : int
-        Number of poses to plan.
-    outline : (n, 3) array, optional
-        Points of the board that must be in the image, mm; the board's origin if None.
-    camera : Camera, optional
-        Camera whose image must hold the outline. If None, the board is placed along lines of sight on which its origin
-        was seen.
-    reachable : callable, optional
-        Returns for n poses base_from_flange whether the robot reaches them, (n,) bool; all are reachable if None. It is
-        called with :data:`ASKED` poses at a time, the best first.
-    seed : int
-        Seed of the random candidates.
+    pairs : poses taken so far
+    result : result from these poses
+    count : number of poses to plan
+    outline : (n, 3), points of the board that must be in the image, mm; the board's origin if None
+    camera : camera whose image must hold the outline. If None, the board is placed along lines of sight on which its
+        origin was seen.
+    reachable : returns for n poses base_from_flange whether the robot reaches them, (n,) bool; all are reachable if
+        None. It is called with :data:`ASKED` poses at a time, the best first.
+    seed : seed of the random candidates
 
-    Returns
-    -------
-    NextPoses
-
-    Raises
-    ------
-    InputError
-        The result has no covariance, or no candidate is reachable with the board in view.
+    Raises InputError: the result has no covariance, or no candidate is reachable with the board in view.
     """
     if result.covariance is None:
         raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
@@ -296,10 +278,8 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
 
     Parameters
     ----------
-    planned : NextPoses
-        Of :func:`~stcal.handeye.plan_poses`, k poses.
-    joints : dict of (k,) array, optional
-        Joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm.
+    planned : of :func:`~stcal.handeye.plan_poses`, k poses
+    joints : (k,), joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm
 
     Returns
     -------

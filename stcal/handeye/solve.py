@@ -62,25 +62,17 @@ class HandEyeOptions(ByValue):
 
     Parameters
     ----------
-    noise : Noise
-        Known σ of the errors; unknown σ are estimated.
-    intrinsics : CameraPrior, optional
-        Prior of the camera's parameters; if given, they are solved for. ``reprojection`` only.
-    with_scale : bool
-        Solve for the board's true size too; ``pose`` and ``reprojection`` only.
-    symmetries : tuple of Rigid
-        All board_from_board except the identity that map the board onto itself. Views whose corners were numbered from
-        another end are renumbered.
-    four_dof : bool
-        The flange turns about one axis only: solve for everything except X along this axis. ``pose`` and
+    noise : known σ of the errors; unknown σ are estimated
+    intrinsics : prior of the camera's parameters; if given, they are solved for. ``reprojection`` only.
+    with_scale : solve for the board's true size too; ``pose`` and ``reprojection`` only
+    symmetries : all board_from_board except the identity that map the board onto itself. Views whose corners were
+        numbered from another end are renumbered.
+    four_dof : the flange turns about one axis only: solve for everything except X along this axis. ``pose`` and
         ``reprojection`` only.
-    evolution : EvolutionOptions
-        Options of ``de`` and ``de-polished``.
-    camera : CameraPrior, optional
-        Uncertainty of the camera's parameters if they are not solved for. With views, it is propagated into σ. The
+    evolution : options of ``de`` and ``de-polished``
+    camera : uncertainty of the camera's parameters if they are not solved for. With views, it is propagated into σ. The
         parameters are exact if None.
-    arm : ArmModel, optional
-        Model of the arm, with the joint vectors of the same poses. Its parameters are solved for too, held by σ that
+    arm : model of the arm, with the joint vectors of the same poses. Its parameters are solved for too, held by σ that
         are estimated. Its poses replace those of the pairs. ``reprojection`` only.
     """
 

@@ -97,8 +97,7 @@ def estimate_offset(
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
         raise InputError(
-            "E-TIME-OFFSET-FEW",
-            f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more",
+            "E-TIME-OFFSET-FEW", f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more"
         )
     if _inside(stream, seconds).any():
         _require_motion(stream, seconds)

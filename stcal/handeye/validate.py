@@ -39,18 +39,14 @@ class HeldOutPoses(Brief):
 
     Parameters
     ----------
-    rows : (s, k) int array
-        Rows of the poses that were held out.
-    rotation_rad, translation_mm : (s, k) arrays
-        Deviation of the chain through robot and camera from the board's pose: angle, and distance of the origins.
-    board_mm : (s, k) array, or None without corners
-        3-D error at the board: the board is placed by the robot's chain, and each corner's line of sight is intersected
-        with it. Distance of the intersection from the corner, mean over the corners of a view.
-    pose_mm : (s, k) array, or None without corners
-        Distance between the corners as placed by the robot's chain and by the pose from the view alone, mean over the
-        corners. It contains the error of the latter pose, mostly along the line of sight.
-    mount_from_camera : (s, 4, 4) array, optional
-        Solution from the other poses of each split, mm.
+    rows : (s, k) int, rows of the poses that were held out
+    rotation_rad, translation_mm : (s, k), deviation of the chain through robot and camera from the board's pose: angle,
+        and distance of the origins
+    board_mm : (s, k), 3-D error at the board: the board is placed by the robot's chain, and each corner's line of sight
+        is intersected with it. Distance of the intersection from the corner, mean over the corners of a view.
+    pose_mm : (s, k), distance between the corners as placed by the robot's chain and by the pose from the view alone,
+        mean over the corners. It contains the error of the latter pose, mostly along the line of sight.
+    mount_from_camera : (s, 4, 4), solution from the other poses of each split, mm
     """
 
     rows: np.ndarray
@@ -131,14 +127,10 @@ class Compared(Brief):
 
     Parameters
     ----------
-    method : str
-        One of :data:`~stcal.handeye.METHODS`.
-    result : HandEye or None
-        Solution from all poses; None if the method fails.
-    held_out : HeldOutPoses or None
-        Errors on held-out poses; None if the method fails, or no poses were held out.
-    reason : str
-        Why the method fails; empty if it does not.
+    method : one of :data:`~stcal.handeye.METHODS`
+    result : solution from all poses; None if the method fails
+    held_out : errors on held-out poses; None if the method fails, or no poses were held out
+    reason : why the method fails; empty if it does not
     """
 
     method: str
@@ -153,24 +145,17 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
 
     Parameters
     ----------
-    count : int
-        Number of poses.
-    held_out : int, optional
-        Number of poses k to hold out at once; if None, a quarter of the poses, at least one.
-    repeats : int
-        Number of splits.
-    seed : int
-        Seed of the random order.
+    count : number of poses
+    held_out : number of poses k to hold out at once; if None, a quarter of the poses, at least one
+    repeats : number of splits
+    seed : seed of the random order
 
     Returns
     -------
     (repeats, k) int array
         Rows held out in each split, in ascending order.
 
-    Raises
-    ------
-    InputError
-        Fewer than three poses would remain.
+    Raises InputError: fewer than three poses would remain.
     """
     if held_out is not None and held_out < 1:
         raise InputError("E-OPTION-RANGE", f"cross-validation: held_out {held_out}: 1 or more needed")
@@ -199,23 +184,12 @@ def cross_validate(
 
     Parameters
     ----------
-    pairs, setup, method, views, options
-        See :func:`~stcal.handeye.handeye`.
-    rows : (s, k) int array, optional
-        Poses to hold out; those of :func:`splits` if None.
-    workers : int or None
-        Number of processes for adjustments of corners; as many as cores if None.
-    progress : callable, optional
-        Called with the number of splits done, and the number of all splits.
+    pairs, setup, method, views, options : see :func:`~stcal.handeye.handeye`
+    rows : (s, k) int, poses to hold out; those of :func:`splits` if None
+    workers : number of processes for adjustments of corners; as many as cores if None
+    progress : called with the number of splits done, and the number of all splits
 
-    Returns
-    -------
-    HeldOutPoses
-
-    Raises
-    ------
-    StcalError
-        A split cannot be solved; see :func:`~stcal.handeye.handeye`.
+    Raises StcalError: a split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
     problem = Problem(pairs, setup, views, options or HandEyeOptions()).mended()
     return refitted(problem, method, splits(len(pairs)) if rows is None else rows, workers, progress)
@@ -339,26 +313,17 @@ def compare(
 
     Parameters
     ----------
-    pairs, setup, views, options
-        See :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is skipped.
-    methods : tuple of str
-        Names out of :data:`~stcal.handeye.METHODS`.
-    rows, workers
-        See :func:`cross_validate`; nothing is held out if ``rows`` is empty.
-    progress : callable, optional
-        Called with the number of methods done, and the number of all methods.
+    pairs, setup, views, options : see :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is skipped
+    methods : names out of :data:`~stcal.handeye.METHODS`
+    rows, workers : see :func:`cross_validate`; nothing is held out if ``rows`` is empty
+    progress : called with the number of methods done, and the number of all methods
 
     Returns
     -------
     tuple of Compared
         One per method, in the order of ``methods``; a method that fails has a reason.
 
-    Raises
-    ------
-    InputError
-        The poses follow another convention.
-    DegenerateError
-        No method can solve these poses.
+    Raises InputError: the poses follow another convention. Raises DegenerateError: no method can solve these poses.
     """
     problem = Problem(pairs, setup, views, options or HandEyeOptions()).mended()
     problem.solved("pose")  # raises if the poses themselves are at fault, whatever the method
@@ -430,12 +395,9 @@ class HeldOutMotions(Brief):
 
     Parameters
     ----------
-    fitted : int
-        Number of motions that the solution uses.
-    names : tuple of (str, str)
-        Names of the poses from which and to which each motion leads.
-    rotation_rad, translation_mm : (k,) arrays
-        Errors of Â = X B X⁻¹ against A.
+    fitted : number of motions that the solution uses
+    names : (str, str), names of the poses from which and to which each motion leads
+    rotation_rad, translation_mm : (k,), errors of Â = X B X⁻¹ against A
     """
 
     fitted: int
@@ -453,10 +415,8 @@ def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
 
     Parameters
     ----------
-    mount_from_camera
-        X.
-    motions
-        The k motions: A of the mount, B of the camera.
+    mount_from_camera : X
+    motions : the k motions: A of the mount, B of the camera
 
     Returns
     -------
@@ -483,21 +443,11 @@ def predict_motions(
 
     Parameters
     ----------
-    pairs, setup, method, views, options
-        See :func:`~stcal.handeye.handeye`.
-    count : int
-        Number of motions to hold out.
+    pairs, setup, method, views, options : see :func:`~stcal.handeye.handeye`
+    count : number of motions to hold out
 
-    Returns
-    -------
-    HeldOutMotions
-
-    Raises
-    ------
-    InputError
-        Too few poses are left.
-    StcalError
-        The solution fails; see :func:`~stcal.handeye.handeye`.
+    Raises InputError: too few poses are left. Raises StcalError: the solution fails; see
+    :func:`~stcal.handeye.handeye`.
     """
     remaining = len(pairs) - count
     if count < 1 or remaining < LEAST_LEFT:

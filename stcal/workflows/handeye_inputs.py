@@ -74,12 +74,7 @@ class HandEyeInput:
 
 
 def one_source(
-    first: Path,
-    second: Path,
-    key: str,
-    statements: Said,
-    quaternions: Order = "wxyz",
-    timing: Timing | None = None,
+    first: Path, second: Path, key: str, statements: Said, quaternions: Order = "wxyz", timing: Timing | None = None
 ) -> tuple[Source, tuple[str, ...]]:
     """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
     tables of the package's own are joined as tables."""
@@ -130,40 +125,24 @@ def read_handeye(
 
     Parameters
     ----------
-    source : str, Path or Table
-        Folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``.
-    poses : str or Path, optional
-        The robot's poses at the photographs.
-    camera, board : str or Path, optional
-        Files of the camera and of the board, or boards, in the photographs.
-    second : str or Path, optional
-        File of the camera's poses.
-    key : str
-        Column by which rows of both files belong together, or ``image=Point Name``.
-    setup : {"eye-in-hand", "eye-to-hand"}, optional
-        What carries the camera; as a file says, or ``eye-in-hand``, if None.
-    rotation : sequence of str
-        Convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
-        ``robot=`` or ``camera=`` in front for one side.
-    length_unit : sequence of str
-        Unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise.
-    poses_are : sequence of str
-        Names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
-        ``camera_from_board`` or ``board_from_camera``.
-    quaternions : {"wxyz", "xyzw"}
-        As columns of quaternions are named, or x, y, z, w in the order in which they stand.
-    tolerance_s : float
-        Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
-    image_times : str or Path, optional
-        Table of the times of photographs.
-    time_offset : bool
-        Whether the offset of the two clocks is to be estimated.
-    robot : Robot, optional
-        The robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    source : folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``
+    poses : the robot's poses at the photographs
+    camera, board : files of the camera and of the board, or boards, in the photographs
+    second : file of the camera's poses
+    key : column by which rows of both files belong together, or ``image=Point Name``
+    setup : {"eye-in-hand", "eye-to-hand"}, what carries the camera; as a file says, or ``eye-in-hand``, if None
+    rotation : convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
+        ``robot=`` or ``camera=`` in front for one side
+    length_unit : unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise
+    poses_are : names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
+        ``camera_from_board`` or ``board_from_camera``
+    quaternions : {"wxyz", "xyzw"}, as columns of quaternions are named, or x, y, z, w in the order in which they stand
+    tolerance_s : time within which the nearest of the robot's poses is taken where none can be interpolated, s
+    image_times : table of the times of photographs
+    time_offset : whether the offset of the two clocks is to be estimated
+    robot : the robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------
@@ -171,10 +150,8 @@ def read_handeye(
         ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
         :func:`stcal.workflows.calibrate_handeye` and :func:`stcal.workflows.plan_handeye`.
 
-    Raises
-    ------
-    InputError
-        A file is missing or not of the required form, one file too many was given, or no image shows the board.
+    Raises InputError: A file is missing or not of the required form, one file too many was given, or no image shows the
+    board.
     """
     statements = Said.of_options(rotation, length_unit, poses_are, setup)
     paths = (None if path is None else Path(path) for path in (poses, camera, board, second, image_times))
@@ -240,7 +217,10 @@ class Files:
         extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
         for refused, message in (
             (self.robot is not None, "--with-kinematics: only with a folder of images, which show the arm's errors"),
-            (extra, f"{extra}: only with a folder of images; {place} {'is a file of poses' if of_file else 'are poses'}"),
+            (
+                extra,
+                f"{extra}: only with a folder of images; {place} {'is a file of poses' if of_file else 'are poses'}",
+            ),
             (
                 self.timing.image_times is not None,
                 "--image-times: only with a folder of images; poses have their times beside them",
@@ -401,20 +381,15 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
 
     Parameters
     ----------
-    given : HandEyeInput
-        Pairs of poses, of :func:`stcal.workflows.read_handeye`.
-    options : HandEyeOptions, optional
-        As for :func:`stcal.workflows.calibrate_handeye`.
+    given : pairs of poses, of :func:`stcal.workflows.read_handeye`
+    options : as for :func:`stcal.workflows.calibrate_handeye`
 
     Returns
     -------
     HandEyeInput, str
         The input, and a sentence that names the poses.
 
-    Raises
-    ------
-    InputError
-        The input consists of images, which determine the poses by themselves.
+    Raises InputError: the input consists of images, which determine the poses by themselves.
     """
     problem = given.problem(options or HandEyeOptions())
     if given.views is not None:

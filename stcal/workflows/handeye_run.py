@@ -54,39 +54,25 @@ def calibrate_handeye(
 
     Parameters
     ----------
-    given : HandEyeInput
-        Of :func:`stcal.workflows.read_handeye`.
-    method : str, optional
-        One of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best if
-        None.
-    options : HandEyeOptions, optional
-        Known errors, and further unknowns; the symmetries of the board are those of ``given``.
-    refine_camera : bool
-        Whether the intrinsics are adjusted, from those of the camera file with their σ.
-    time_offset : bool
-        Whether the offset of the two clocks is estimated first.
-    repeats : int
-        Number of splits of the cross-validation; 0 for none.
-    held_out : int, optional
-        Number of poses held out in each; a quarter if None.
-    seed : int
-        Seed of the splits.
-    motions : int, optional
-        Number of the last motions to predict from the poses before.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    given : of :func:`stcal.workflows.read_handeye`
+    method : one of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best
+        if None
+    options : known errors, and further unknowns; the symmetries of the board are those of ``given``
+    refine_camera : whether the intrinsics are adjusted, from those of the camera file with their σ
+    time_offset : whether the offset of the two clocks is estimated first
+    repeats : number of splits of the cross-validation; 0 for none
+    held_out : number of poses held out in each; a quarter if None
+    seed : seed of the splits
+    motions : number of the last motions to predict from the poses before
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------
     Outcome
         ``result``, a :class:`stcal.handeye.HandEye`, mm and rad; its errors on poses ``held_out``; ``all_notes()``.
 
-    Raises
-    ------
-    StcalError
-        As of :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    Raises StcalError: as of :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     options, offset, told = options or HandEyeOptions(), None, progress or (lambda *_: None)
     intrinsics = given.prior if refine_camera else options.intrinsics
@@ -330,26 +316,18 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
     Parameters
     ----------
-    given : HandEyeInput
-        Poses taken so far, of :func:`stcal.workflows.read_handeye`.
-    count : int
-        Number of poses to plan.
-    robot : Robot, optional
-        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
-    seed : int
-        Seed of the candidates.
+    given : poses taken so far, of :func:`stcal.workflows.read_handeye`
+    count : number of poses to plan
+    robot : robot within whose joint limits the poses are to be, from its own base to its flange, no tool
+    seed : seed of the candidates
 
     Returns
     -------
     Planned
         ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
-    DegenerateError
-        For the reasons given in :func:`stcal.handeye.handeye`.
+    Raises InputError: for the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of
+    the poses taken. Raises DegenerateError: for the reasons given in :func:`stcal.handeye.handeye`.
     """
     result = given.problem(HandEyeOptions(symmetries=given.symmetries)).solved().result
     camera = outline = None

@@ -277,10 +277,7 @@ def test_three_poses_tell_no_size():
 
 @pytest.mark.parametrize(
     ("factor", "unit"),
-    [
-        (25.4, "the robot's were in inches"),
-        pytest.param(0.1, "its lengths were in centimetres", marks=FULL),
-    ],
+    [(25.4, "the robot's were in inches"), pytest.param(0.1, "its lengths were in centimetres", marks=FULL)],
 )
 def test_units_of_one_side_are_named(factor, unit):
     pairs = simulated(np.random.default_rng(18), 12, **NOISE).pairs

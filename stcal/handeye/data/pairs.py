@@ -29,22 +29,17 @@ class HandEyePoses(Brief):
 
     Parameters
     ----------
-    base_from_flange, camera_from_board : Poses
-        m poses each, mm.
-    base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6) arrays, optional
-        Rotation (rad) and translation (mm), left perturbation in the first frame, where they are known.
-    names : tuple of str
-        Name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given.
-    where : str
-        Source of the poses.
-    camera_from_board_common : (m, 6, k) array, optional
-        Errors that the poses of the board have in common, as :func:`stcal.sfm.measure` states them: pose i errs by
-        ``common[i] @ z`` with the same z, k independent normal numbers of σ 1, for all. The covariances contain them.
+    base_from_flange, camera_from_board : m poses each, mm
+    base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6), rotation (rad) and translation (mm), left
+        perturbation in the first frame, where they are known
+    names : name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given
+    where : source of the poses
+    camera_from_board_common : (m, 6, k), errors that the poses of the board have in common, as
+        :func:`stcal.sfm.measure` states them: pose i errs by ``common[i] @ z`` with the same z, k independent normal
+        numbers of σ 1, for all. The covariances contain them.
 
-    Raises
-    ------
-    InputError
-        Unequal lengths; a pair that occurs twice; a board that stands still to the last digit while the flange moves.
+    Raises InputError: unequal lengths; a pair that occurs twice; a board that stands still to the last digit while the
+    flange moves.
     """
 
     base_from_flange: Poses
@@ -202,21 +197,17 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    quaternions : {"wxyz", "xyzw"}
-        ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order of the columns.
+    path : the file
+    quaternions : {"wxyz", "xyzw"}, ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order
+        of the columns
 
     Returns
     -------
     HandEyePoses
         Poses in mm; pairs are named by their lines.
 
-    Raises
-    ------
-    InputError
-        Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copied
-        poses.
+    Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
+    line; copied poses.
     """
     table = read_table(path, WHAT, quaternions)
     sides = [read_side(table, *names) for names in SIDES]

@@ -16,7 +16,7 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order
-from stcal.handeye.data.record import EVERY_FRAME, Content, Frames, Said, Side, Unit, require_each_once
+from stcal.handeye.data.record import EVERY_FRAME, Content, Known, Said, Side, require_each_once
 from stcal.handeye.data.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.poses.columns import find_column, places_of, read_rotations
@@ -43,14 +43,12 @@ def todays(table: Table) -> bool:
 
 def read_columns(table: Table, key: str, statements: Said) -> Content | None:
     """Returns the poses in the columns of a table; None where it has none."""
-    names, sides = _row_names(table, key), []
-    for frame in EVERY_FRAME:
-        side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, statements)
-        if side is not None:
-            sides.append(side)
-    if not sides:
-        side = _side(table, "", None, names, statements)
-        sides = [side] if side is not None else []
+    names = _row_names(table, key)
+    prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
+    read = [_side(table, prefix, frames, names, statements) for prefix, frames in prefixes.items()]
+    sides = [side for side in read if side is not None]
+    if not sides and (side := _side(table, "", None, names, statements)) is not None:
+        sides = [side]
     if not sides:
         return None
     roles = [side.frames.role for side in sides if side.frames is not None]
@@ -77,31 +75,27 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     return ()
 
 
-def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], statements: Said) -> Side | None:
+def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> Side | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
     place = _place(table, prefix)
-    if place is None:
+    turned = None if place is None else read_rotations(table, prefix, statements.rotation)
+    if place is None or turned is None:
         return None
-    turned = read_rotations(table, prefix, statements.rotation)
-    if turned is None:
-        return None
-    at, unit = place
     covariance = table.pose_covariances(prefix)
+    common = table.common_errors(covariance, prefix)
+    at, unit = place
     side = Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
-    return replace(side, covariance=covariance, common=table.common_errors(covariance, prefix))
+    return replace(side, covariance=covariance, common=common)
 
 
-def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
+def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
     for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
         for unit in (*LENGTHS, ""):
-            columns = [
-                find_column(table, prefix, f"{form.format(axis)}_{unit}" if unit else form.format(axis))
-                for axis in "xyz"
-            ]
-            present = [column for column in columns if column is not None]
+            names = (form.format(axis) + f"_{unit}" * bool(unit) for axis in "xyz")
+            present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
             if len(present) == len("xyz"):
                 values = np.column_stack([table.numbers(column) for column in present])
-                return values, Unit(unit, "by the columns", True) if unit else None
+                return values, Known(unit, "by the columns") if unit else None
             if present and unit and form == "{}":
                 raise InputError(
                     "E-TABLE-COLUMN-MISSING",
@@ -128,6 +122,7 @@ _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 _UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
 _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
 """A unit in the header of a table, which is no list of YAML."""
+_HEADER = re.compile(r"[^:\[{]*[,;\t]")
 _SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
 """A header of columns between which spaces stand, of six names at least, as a pose needs."""
 
@@ -151,7 +146,6 @@ class File:
 
     @property
     def first(self) -> str:
-        """The first line, without white space around it."""
         return next((line.strip() for _, line in self.lines if not separator_stated(line)), "")
 
 
@@ -237,7 +231,7 @@ def _of_tum(file: File) -> Content:
             order = list(said_convention(file.said.rotation, what, file.where, len("wxyz")).order)
     require_each_once(names, places, file.where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
-    turned, unit = f"quaternions {', '.join(order)}", Unit("m", "as in TUM")
+    turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
     rotation = of_quaternions(wxyz, places, file.where)
     side = Side(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
     return Content("TUM trajectory (timestamp, place, quaternion)", (side,))
@@ -252,11 +246,6 @@ def _row_of_numbers(file: File) -> list[float] | None:
 
 def _refuse_rows(file: File) -> Content:
     raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
-
-
-def _is_table(file: File) -> bool:
-    header = _BRACKETED_UNIT.sub("", file.first)
-    return bool(re.match(r"[^:\[{]*[,;\t]", header) or _SPACED.fullmatch(file.first))
 
 
 def _of_table(file: File) -> Content | None:
@@ -362,7 +351,7 @@ FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], Content | None]]
     (lambda file: bool(_UNIVERSAL.fullmatch(file.first)), _of_universal),
     (lambda file: len(_numbers(file.first) or ()) == TUM, _of_tum),
     (_row_of_numbers, _refuse_rows),
-    (_is_table, _of_table),
+    (lambda file: bool(_HEADER.match(_BRACKETED_UNIT.sub("", file.first)) or _SPACED.fullmatch(file.first)), _of_table),
     (lambda file: True, _of_yaml),
 )
 """Whether a file is of a format, by its content, and the reader of that format, in this order."""

@@ -10,12 +10,10 @@ from stcal.errors import InputError
 from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.record import (
     FRAMES,
-    MATRICES,
     Content,
-    Frames,
+    Known,
     Said,
     Side,
-    Unit,
     frames_of,
     of_matrices,
     require_each_once,
@@ -36,7 +34,7 @@ LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timesta
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
 SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
 """Setups by easy_handeye's names of them."""
-ROS = Unit("m", "as in ROS")
+ROS = Known("m", "as in ROS", False)
 
 
 def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | None:
@@ -61,11 +59,8 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
         return None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if (
-        isinstance(value, list)
-        and isinstance(value[0], Mapping)
-        and (content := _of_pairs(value, form, where)) is not None
-    ):
+    pairs = isinstance(value, list) and isinstance(value[0], Mapping)
+    if pairs and (content := _of_pairs(value, form, where)) is not None:
         return content
     side = _side_of(value, where)
     return None if side is None else Content(form, (side,))
@@ -82,10 +77,8 @@ def numbers(value: Any) -> np.ndarray | None:
         return flat.reshape(rows, columns) if fits and flat is not None else None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if not isinstance(value, np.ndarray) and not _all_numbers(value):
-        return None
     try:
-        return np.array(value, dtype=float)
+        return np.array(value, dtype=float) if isinstance(value, np.ndarray) or _all_numbers(value) else None
     except (ValueError, TypeError):
         return None
 
@@ -120,39 +113,36 @@ def _name_in(value: Mapping) -> str:
     return next((str(v).strip() for v in given if isinstance(v, str | int | float) and not isinstance(v, bool)), "")
 
 
-def _side_of(value: Any, where: str, frames: Frames | None = None) -> Side | None:
+def _side_of(value: Any, where: str, frames: Known | None = None) -> Side | None:
     """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping):
-        if (found := _matrix(value)) is not None:
+        if _matrix(value) is not None:
             value, places = [value], ("the pose",)
         else:
-            names, places, value = tuple(map(str, value)), tuple(map(str, value)), list(value.values())
+            names = places = tuple(map(str, value))
+            value = list(value.values())
             if any(_matrix(item) is None for item in value):
                 return None
-    else:
+    elif isinstance(value, list | np.ndarray):
         array = numbers(value)
-        if array is not None and array.shape in ((4, 4), (16,)):
-            value = [array]
-        places = tuple(f"pose {i}" for i in range(1, len(value) + 1)) if isinstance(value, list | np.ndarray) else ()
-    matrices = []
-    for item, place in zip(value if places else (), places, strict=True):
-        found = _matrix(item)
-        if found is None and not matrices:
-            return None
-        if found is None:
-            raise InputError(
-                "E-POSE-VALUE",
-                f"{where}: {place}: not a 4×4 matrix like the one before it; correct it, or take it out",
-            )
-        matrices.append(found)
-    if not matrices:
+        value = [array] if array is not None and array.shape in ((4, 4), (16,)) else value
+        places = tuple(f"pose {i}" for i in range(1, len(value) + 1))
+    else:
         return None
-    named = tuple(name for _, name in matrices)
+    found = [_matrix(item) for item in value]
+    if not found or found[0] is None:
+        return None
+    bad = [place for place, each in zip(places, found, strict=True) if each is None]
+    if bad:
+        raise InputError(
+            "E-POSE-VALUE", f"{where}: {bad[0]}: not a 4×4 matrix like the one before it; correct it, or take it out"
+        )
+    matrices, named = zip(*filter(None, found), strict=True)
     names = names or (named if all(named) else ())
     require_each_once(names, places[: len(names)], where)
-    rotation, translation = of_matrices(np.array([matrix for matrix, _ in matrices]), places, where)
-    return Side(rotation, translation, places, MATRICES, None, frames, names)
+    rotation, translation = of_matrices(np.array(matrices), places, where)
+    return Side(rotation, translation, places, "4×4 matrices", None, frames, names)
 
 
 def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None:
@@ -181,14 +171,14 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | Non
     fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
     frames = (
-        Frames(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
-        Frames("camera_from_board", "as easy_handeye writes it", False),
+        Known(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
+        Known("camera_from_board", "as easy_handeye writes it", False),
     )
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
     return Content("easy_handeye samples", _same_count(sides, where), setup)
 
 
-def _of_messages(values: Any, where: str, frames: Frames) -> Side:
+def _of_messages(values: Any, where: str, frames: Known) -> Side:
     """Returns the poses of a list of ROS's transforms, metres."""
     if not isinstance(values, list) or not values:
         raise InputError(
@@ -214,7 +204,7 @@ def _of_messages(values: Any, where: str, frames: Frames) -> Side:
 def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
     """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
-    named: dict[str, Frames] = {}
+    named: dict[str, Known] = {}
     others, names = [], ()
     for key, item in value.items():
         if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
@@ -226,7 +216,7 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
         if role is None or not shaped or (frames is None and _side_of(item, where) is None):
             others.append(str(key))
             continue
-        frames = frames or Frames(FRAMES[role][0], "by default", False)
+        frames = frames or Known(FRAMES[role][0], "by default", False)
         parts.setdefault(frames.name, {})[str(key)] = item
         named[frames.name] = frames
     if not parts:
@@ -256,7 +246,7 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
     return Content("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
-def _of_rotations(parts: dict[str, Any], where: str, frames: Frames) -> Side:
+def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> Side:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays = {}
     for key, value in parts.items():

@@ -24,14 +24,12 @@ class View(Brief):
 
     Parameters
     ----------
-    xyz_board : (k, 3) array
-        Places on the board, mm; k ≥ 4, not all on a line.
-    xy_px : (k, 2) array
-        Places in the image, px, with lens distortion.
-    covariance : (k, 2, 2) array, optional
-        Covariances of ``xy_px``, px², known up to a common factor. Without it, all corners have equal weight.
-    normal : (k, 3) array, optional
-        Unit normals of the planes that the corners lie in, for several boards in one frame. Without it, Z for all.
+    xyz_board : (k, 3), places on the board, mm; k ≥ 4, not all on a line
+    xy_px : (k, 2), places in the image, px, with lens distortion
+    covariance : (k, 2, 2), covariances of ``xy_px``, px², known up to a common factor. Without it, all corners have
+        equal weight.
+    normal : (k, 3), unit normals of the planes that the corners lie in, for several boards in one frame. Without it, Z
+        for all.
     """
 
     xyz_board: np.ndarray
@@ -77,10 +75,8 @@ class Views(Brief):
 
     Parameters
     ----------
-    camera : Camera
-        Camera that took the views.
-    views : tuple of View
-        m views, in the order of the poses.
+    camera : camera that took the views
+    views : m views, in the order of the poses
     """
 
     camera: Camera
@@ -131,25 +127,13 @@ def pairs_of_views(
 
     Parameters
     ----------
-    base_from_flange : Poses
-        m poses, mm, as the robot states them.
-    views : Views
-        m views, in the same order.
-    names : tuple of str
-        Name of each pair in messages; ``pose 1`` … where no names are given.
-    where : str
-        Source of the views, for messages.
+    base_from_flange : m poses, mm, as the robot states them
+    views : m views, in the same order
+    names : name of each pair in messages; ``pose 1`` … where no names are given
+    where : source of the views, for messages
 
-    Returns
-    -------
-    HandEyePoses
-
-    Raises
-    ------
-    InputError
-        Unequal lengths.
-    DegenerateError
-        A view in which no pose can be found; the message names it.
+    Raises InputError: unequal lengths. Raises DegenerateError: a view in which no pose can be found; the message names
+    it.
     """
     if len(views) != len(base_from_flange):
         raise InputError(

@@ -27,16 +27,11 @@ class Finding:
 
     Parameters
     ----------
-    title : str
-        Name of the matter.
-    word : {"good", "use with care", "do not use"}
-        The verdict.
-    said : str
-        What was found, in words.
-    value, limit : str
-        What was measured, and the limit of ``good``; empty where there is none.
-    remedy : str
-        What to do; empty where nothing has to be done.
+    title : name of the matter
+    word : {"good", "use with care", "do not use"}, the verdict
+    said : what was found, in words
+    value, limit : what was measured, and the limit of ``good``; empty where there is none
+    remedy : what to do; empty where nothing has to be done
     """
 
     title: str
@@ -53,8 +48,7 @@ class Verdict:
 
     Parameters
     ----------
-    findings : tuple of Finding
-        In the order in which they were made.
+    findings : in the order in which they were made
     """
 
     findings: tuple[Finding, ...]

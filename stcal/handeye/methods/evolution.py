@@ -49,17 +49,13 @@ class EvolutionOptions:
 
     Parameters
     ----------
-    population, generations : int
-        M and the number of generations.
-    factor, crossover : float
-        F and CR.
-    weight : float
-        λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated).
-    bounds_rad : Bounds
-        Bounds of the rotation vectors of the first population. The paper takes them from knowledge of the set-up; its
-        values are not legible in the source.
-    bounds_mm : Bounds, optional
-        Bounds of its translations; where None, about zero, as wide as the distance of the farthest board or flange.
+    population, generations : M and the number of generations
+    factor, crossover : F and CR
+    weight : λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated)
+    bounds_rad : bounds of the rotation vectors of the first population. The paper takes them from knowledge of the
+        set-up; its values are not legible in the source.
+    bounds_mm : bounds of its translations; where None, about zero, as wide as the distance of the farthest board or
+        flange
     seed : int
     """
 

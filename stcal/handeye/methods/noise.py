@@ -34,15 +34,11 @@ class Noise:
 
     Parameters
     ----------
-    robot_rad, robot_mm : float, optional
-        σ of base_from_flange, in the axes of the base, about the flange.
-    camera_rad, camera_mm : float, optional
-        σ of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to
-        be 0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
-    corner_px : float, optional
-        σ of a corner in the image, or the factor of the stated covariances of corners. Never 0.
-    board_mm : float, optional
-        σ of a corner's place on the board.
+    robot_rad, robot_mm : σ of base_from_flange, in the axes of the base, about the flange
+    camera_rad, camera_mm : σ of camera_from_board, about the board's origin. If nothing is known of either side,
+        ``robot_mm`` is taken to be 0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
+    corner_px : σ of a corner in the image, or the factor of the stated covariances of corners. Never 0.
+    board_mm : σ of a corner's place on the board
     """
 
     robot_rad: float | None = None

@@ -6,15 +6,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.remarks import Aside, Verdict, spoken
-from stcal.handeye.report.figures import (
-    BAD,
-    GOOD,
-    by_robot,
-    enlargement,
-    image_coverage,
-    image_figure,
-    pose_bars,
-)
+from stcal.handeye.report.figures import BAD, GOOD, by_robot, enlargement, image_coverage, image_figure, pose_bars
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
