@@ -186,9 +186,9 @@ def handeye(
     from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
     from stcal.handeye.report import export as forms
-    from stcal.handeye.report.file import HandEyeFile
+    from stcal.handeye.report.handeye_file import HandEyeFile
+    from stcal.handeye.report.handeye_page import outcome_report
     from stcal.handeye.report.outcome import judged
-    from stcal.handeye.report.page import outcome_report
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
@@ -202,78 +202,55 @@ def handeye(
     timing = Timing(time_tolerance, image_times, time_offset)
     exports = shared.exports_of(export or [], forms.FORMS)
     given, folder = files.given(timing), files.source is not None and files.source.is_dir()
-    needs, wrong_method, conflict = "E-OPTION-NEEDS", "E-OPTION-METHOD", "E-OPTION-CONFLICT"
-    for refused, code, message in (
-        (
-            camera_out and not (refine_camera or with_kinematics),
-            needs,
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
-        ),
-        (
-            refine_camera and not folder,
-            needs,
-            "--refine-camera: only with images; poses do not determine the intrinsics",
-        ),
-        (
-            camera_out and method not in (None, ALL, "reprojection"),
-            wrong_method,
-            f"--camera-out: {method} does not adjust the camera; leave --method out",
-        ),
-        (
-            method not in (None, ALL, *METHODS),
-            wrong_method,
-            f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed",
-        ),
-        (
-            robot_out and not with_kinematics,
-            needs,
-            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file",
-        ),
-        (
-            with_kinematics and not folder,
-            needs,
-            "--with-kinematics: only with a folder of images, which show the arm's errors",
-        ),
-        (
-            with_kinematics and method not in (None, "reprojection"),
-            wrong_method,
-            f"--with-kinematics: {method} does not solve for the arm; leave --method out",
-        ),
-        (
-            with_kinematics and four_dof,
-            conflict,
-            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
-        ),
-        (
-            (parent or child or camera_frame != "optical") and not (ros or urdf or exports),
-            needs,
-            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
-        ),
-        (
-            not folder and (sigma_px is not None or sigma_board_mm is not None),
-            needs,
-            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg",
-        ),
-        (
-            folder and sigma_camera_mm is not None,
-            needs,
-            "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px",
-        ),
-        (
-            (de_bounds_deg or de_bounds_mm) and method not in (ALL, "de", "de-polished"),
-            needs,
-            f"--de-bounds-…: only with --method de, de-polished or {ALL}",
-        ),
-    ):
-        if refused:
-            raise InputError(code, message)
+    by_corners = "only with a folder of images, which show the arm's errors"
+    for code, refusals in {
+        "E-OPTION-NEEDS": {
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given": (
+                camera_out and not (refine_camera or with_kinematics)
+            ),
+            "--refine-camera: only with images; poses do not determine the intrinsics": refine_camera and not folder,
+            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file": (
+                robot_out and not with_kinematics
+            ),
+            f"--with-kinematics: {by_corners}": with_kinematics and not folder,
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name": (
+                (parent or child or camera_frame != "optical") and not (ros or urdf or exports)
+            ),
+            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg": (
+                not folder and (sigma_px is not None or sigma_board_mm is not None)
+            ),
+            "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px": (
+                folder and sigma_camera_mm is not None
+            ),
+            f"--de-bounds-…: only with --method de, de-polished or {ALL}": (
+                (de_bounds_deg or de_bounds_mm) and method not in (ALL, "de", "de-polished")
+            ),
+        },
+        "E-OPTION-METHOD": {
+            f"--camera-out: {method} does not adjust the camera; leave --method out": (
+                camera_out and method not in (None, ALL, "reprojection")
+            ),
+            f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed": (
+                method not in (None, ALL, *METHODS)
+            ),
+            f"--with-kinematics: {method} does not solve for the arm; leave --method out": (
+                with_kinematics and method not in (None, "reprojection")
+            ),
+        },
+        "E-OPTION-CONFLICT": {
+            "--with-kinematics, --four-dof: give one of them; turns about one axis do not determine the kinematics": (
+                with_kinematics and four_dof
+            ),
+        },
+    }.items():
+        for message, refused in refusals.items():
+            if refused:
+                raise InputError(code, message)
     forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
     if with_kinematics:
         given = replace(given, robot=load_robot(with_kinematics))
-    shift, turn = (
-        _bounds("--de-bounds-mm", de_bounds_mm, 1.0),
-        _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
-    )
+    shift = _bounds("--de-bounds-mm", de_bounds_mm, 1.0)
+    turn = _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1))
     evolved = EvolutionOptions(bounds_mm=shift) if turn is None else EvolutionOptions(bounds_rad=turn, bounds_mm=shift)
     if dry_run:
         say("\n".join(given.dry_run()))
@@ -325,7 +302,9 @@ def handeye(
     if camera_out:
         if (adjusted := result.reprojection) is None:
             method = result.method
-            raise InputError(wrong_method, f"--camera-out: {method} does not adjust the camera; leave --method out")
+            raise InputError(
+                "E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out"
+            )
         camera_out.parent.mkdir(parents=True, exist_ok=True)
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")
@@ -334,7 +313,8 @@ def handeye(
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
-    shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
+    found = judged(outcome)
+    shared.require_passed(strict, found.failed(), report, found.doubt())
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":

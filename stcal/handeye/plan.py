@@ -114,7 +114,16 @@ def plan_poses(
         unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)
         normals = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
         sigma_after = np.array([worst_sigma(candidate, x, points) for candidate in normals])
-        row = _first_reachable(flange, np.argsort(sigma_after), reachable)
+        order = np.argsort(sigma_after)
+        batches = [order[start : start + ASKED] for start in range(0, len(order), ASKED)]
+        able = (batch if reachable is None else batch[reachable(flange[batch])] for batch in batches)
+        row = next((int(batch[0]) for batch in able if len(batch)), None)
+        if row is None:
+            raise InputError(
+                "E-PLAN-OUT-OF-REACH",
+                f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, "
+                "board and setup",
+            )
         normal = normals[row]
         sigma.append(float(sigma_after[row]))
         flanges.append(flange[row])
@@ -131,22 +140,6 @@ def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray
     jacobian = np.zeros((len(points), 3, 6))
     jacobian[:, :, :3], jacobian[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
     return float(np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).max()))
-
-
-def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Poses], np.ndarray] | None) -> int:
-    """Returns the row of the first pose that the robot reaches, in the given ``order`` (n,)."""
-    if reachable is None:
-        return int(order[0])
-    for start in range(0, len(order), ASKED):
-        batch = order[start : start + ASKED]
-        in_reach = np.flatnonzero(reachable(flange[batch]))
-        if len(in_reach):
-            return int(batch[in_reach[0]])
-    raise InputError(
-        "E-PLAN-OUT-OF-REACH",
-        f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, board and "
-        "setup",
-    )
 
 
 def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
@@ -195,10 +188,8 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     place = rng.uniform(distance.min(), distance.max(), (CANDIDATES, 1)) * sight
     # Start from a view that was seen, turn it to face the camera, roll it about the line of sight, then tilt it.
     base = rng.integers(len(earlier), size=CANDIDATES)
-    facing = (
-        earlier.rotation[base, :, 2]
-        * np.sign(np.einsum("ma,ma->m", earlier.rotation[base, :, 2], places[base]))[:, None]
-    )
+    facing = earlier.rotation[base, :, 2]
+    facing = facing * np.sign(np.einsum("ma,ma->m", facing, places[base]))[:, None]
     straight = _turned_onto(facing, sight) @ earlier.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
@@ -221,10 +212,6 @@ def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ma,ma->m", first, second))
     return Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None]).as_matrix()
-
-
-JOINT_DIGITS = 3
-"""Number of digits of joint values (deg or mm) on the terminal."""
 
 
 class HandEyePlanFile(ResultFile):
@@ -256,7 +243,7 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
     for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
         place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
         rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
-        cells.append([f"next {k + 1}", *(f"{values[k]:.{JOINT_DIGITS}f}" for values in joints.values())])
+        cells.append([f"next {k + 1}", *(f"{values[k]:.3f}" for values in joints.values())])
     last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
     blocks = [
         Table(heads, rows),
@@ -288,19 +275,17 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
     """
     joints = joints or {}
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
-    rows: list[Sequence] = [
-        ["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)]
-    ]
+    heads = ["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)]
+    rows: list[Sequence] = [heads]
     for k, turn in enumerate(planned.turn_rad):
         values = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
-        cells = [repr(float(value)) for value in values]
-        rows.append([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
+        poses = (cell for each in frames.values() for cell in pose_cells(each[k]))
+        rows.append([k + 1, *(repr(float(value)) for value in values), *poses])
     return csv_text(rows)
 
 
 def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
     """Returns the file of the planned poses, for programs."""
-    poses = {name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")}
     return HandEyePlanFile(
         format="stcal handeye plan 1",
         setup=result.setup,
@@ -309,5 +294,6 @@ def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarr
         sigma_mm=planned.sigma_mm,
         turn_rad=planned.turn_rad,
         joints=joints,
-        **poses,
+        base_from_flange=list(planned.base_from_flange),
+        camera_from_board=list(planned.camera_from_board),
     )

@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.mistakes import Guess, check_conventions, flip_note, flipped, repair
+from stcal.handeye.judge.mistakes import Guess, check_conventions, flipped, repair
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.methods import closed_form
@@ -52,6 +52,7 @@ REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
 AT_ONE_PLACE = Aside("the robot stood several times at one place: its errors there count once in σ")
 IN_COMMON = Aside("σ contain the errors that the board's poses have in common (columns common…)")
+UNSETTLED = "the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses"
 HELD_MM = 1e-6
 """σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
 
@@ -310,10 +311,12 @@ def _by_poses(task: _Task) -> Solved:
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
     if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
-        beyond = remarks.of_variance(solution.variance_factor, solution.redundancy)
-        notes += beyond
-        if beyond and solution.variance_factor > 1:
-            covariance = covariance * solution.variance_factor
+        factor, redundancy = solution.variance_factor, solution.redundancy
+        low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
+        if not low <= factor <= high:
+            times = f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect"
+            notes += (f"{times}; correct σ, or look for errors",)
+            covariance = covariance * max(factor, 1)
     if loop.camera_common is not None:
         added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
         common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
@@ -328,7 +331,7 @@ def _by_poses(task: _Task) -> Solved:
         z,
         solution.residuals,
         solution.outliers,
-        notes + remarks.of_rounds(solution.settled),
+        notes if solution.settled else (*notes, UNSETTLED),
         covariance,
         scale=state.scale,
         sigma_scale=sigma_scale,
@@ -383,7 +386,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         z,
         residuals,
         outliers,
-        notes + remarks.of_rounds(solution.settled),
+        notes if solution.settled else (*notes, UNSETTLED),
         covariance,
         scale=state.scale,
         sigma_scale=sigma_scale,
@@ -439,7 +442,6 @@ def _remarks(
     pairs, options, good = problem.pairs, problem.options, ~outliers
     tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
     notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
-    notes += flip_note(pairs.names, tilted)
     moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x)[:, :, :12], places(loop) is None)
     notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
     if not (options.with_scale or options.four_dof):

@@ -261,7 +261,7 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
     scale, at_board = result.scale, {}
     if views is not None:
         camera, adjusted_views = as_adjusted(result, views)
-        by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
+        by_view, _ = resect(Views(camera, tuple(adjusted_views)), pairs.names)
         pose_mm = [
             np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
             for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)

@@ -252,7 +252,7 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     assert code == 0
     assert [row["held_out"] for row in rows] == [None] * len(rows)
     assert "\nheld out (" not in shown.split("Methods")[0]
-    assert "verdict: use with care: errors on poses held out are not known" in shown
+    assert "May I use it? With care: errors on poses held out are not known" in shown
 
 
 @pytest.mark.slow
@@ -320,7 +320,7 @@ def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
     assert command(good, "--splits", 4, "--strict")[0] == 0
     code, out, err = command(bad, "--splits", 4)
     assert code == 0
-    assert "verdict: do not use" in out
+    assert "May I use it? No" in out
     code, _, err = command(bad, "--splits", 4, "--strict", "--out", tmp_path / "h.json")
     assert code == 4
     assert err.splitlines()[-1].startswith("error: --strict: failed: ")

@@ -14,7 +14,6 @@ from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import LENGTHS, Table, read_table
 
-WHAT = "pose file"
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
 """Transforms that each row must hold, with the inverse that is accepted in place of each."""
 
@@ -90,20 +89,18 @@ class HandEyePoses(Brief):
         """
         if unit not in LENGTHS:
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
-        factor, sides = LENGTHS[unit], []
+        sides = []
         for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
-            if isinstance(matrices, Poses):
-                sides.append(Poses(matrices.rotation, factor * matrices.translation))
-                continue
-            rigid = []
-            for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
-                name = names[i] if i < len(names) else f"pose {i + 1}"
-                try:
-                    rigid.append(Rigid.from_matrix(matrix))
-                except InputError as error:
-                    raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
-            poses = Poses.of(rigid)
-            sides.append(Poses(poses.rotation, factor * poses.translation))
+            if not isinstance(matrices, Poses):
+                rigid = []
+                for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
+                    try:
+                        rigid.append(Rigid.from_matrix(matrix))
+                    except InputError as error:
+                        name = names[i] if i < len(names) else f"pose {i + 1}"
+                        raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
+                matrices = Poses.of(rigid)
+            sides.append(Poses(matrices.rotation, LENGTHS[unit] * matrices.translation))
         return cls(*sides, names=tuple(names), where=where)
 
     def __len__(self) -> int:
@@ -121,20 +118,17 @@ class HandEyePoses(Brief):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
         flange, board = self.base_from_flange, self.camera_from_board
         first: dict[bytes, int] = {}
-        copies: list[tuple[int, int]] = []
-        for i in range(len(self)):
-            content = board.rotation[i].tobytes() + board.translation[i].tobytes()
-            if (j := first.setdefault(content, i)) != i:
-                copies.append((j, i))
+        same = ((first.setdefault(content, i), i) for i, content in enumerate(_bytes(board)))
+        copies = [(j, i) for j, i in same if j != i]
         for j, i in copies:
             pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
             moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
             turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
             if moved == 0 and turned < 1e-12:
-                more = f", and {len(copies) - 1} more pairs" if len(copies) > 1 else ""
-                every = f"{pair}{more} are identical poses"
-                out = "one of each" if more else "one of them"
-                raise InputError("E-POSES-IDENTICAL", f"{every}; take {out} out")
+                more, out = (
+                    (f", and {len(copies) - 1} more pairs", "one of each") if copies[1:] else ("", "one of them")
+                )
+                raise InputError("E-POSES-IDENTICAL", f"{pair}{more} are identical poses; take {out} out")
             raise InputError(
                 "E-POSES-IDENTICAL",
                 f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
@@ -146,13 +140,10 @@ class HandEyePoses(Brief):
 
         Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
         board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
-
-        Raises InputError: the poses of the flange were not read anew.
         """
-        flange, board = self.base_from_flange, self.camera_from_board
-        rows: dict[bytes, list[int]] = {}
-        for i in range(len(self)):
-            rows.setdefault(flange.rotation[i].tobytes() + flange.translation[i].tobytes(), []).append(i)
+        board, rows = self.camera_from_board, {}
+        for i, content in enumerate(_bytes(self.base_from_flange)):
+            rows.setdefault(content, []).append(i)
         copies = [same for same in rows.values() if len(same) > 1]
         if not copies:
             return
@@ -168,6 +159,10 @@ class HandEyePoses(Brief):
                 f"the board moved by up to {shift:.3g} mm and {np.degrees(turn):.3g}°; read the robot's pose anew with "
                 "each image",
             )
+
+
+def _bytes(poses: Poses) -> list[bytes]:
+    return [r.tobytes() + t.tobytes() for r, t in zip(poses.rotation, poses.translation, strict=True)]
 
 
 STALE = 0.2
@@ -209,7 +204,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
     line; copied poses.
     """
-    table = read_table(path, WHAT, quaternions)
+    table = read_table(path, "pose file", quaternions)
     sides = [read_side(table, *names) for names in SIDES]
     (flange, flange_covariance, _), (board, board_covariance, common) = sides
     names = tuple(f"line {line}" for line in table.lines)
@@ -382,8 +377,7 @@ class Motions:
     @classmethod
     def consecutive(cls, loop: Loop) -> "Motions":
         """Returns the motions from each pose to the next."""
-        at = np.arange(len(loop) - 1)
-        return cls.between(loop, at, at + 1)
+        return cls.between(loop, np.arange(len(loop) - 1), np.arange(1, len(loop)))
 
     @classmethod
     def all(cls, loop: Loop) -> "Motions":

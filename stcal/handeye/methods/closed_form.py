@@ -42,28 +42,20 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     candidates = [_linear(loop, np.arange(m)[None], with_scale)]
     rng = np.random.default_rng(SEED)
     if m > 3:
-        size = 3 if m < 6 else 4
         order = rng.permuted(np.tile(np.arange(m), (SUBSETS, 1)), axis=1)
-        candidates.append(_linear(loop, order[:, :size], with_scale))
+        candidates.append(_linear(loop, order[:, : 3 if m < 6 else 4], with_scale))
     parts = [np.concatenate(arrays) for arrays in zip(*candidates, strict=True)]
     turn, shift = _misses(loop, *parts)
-    shift = _in_board_units(shift, parts[4])
     best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
-    inside = (turn[best] <= 3 * np.median(turn[best])) & (shift[best] <= 3 * np.median(shift[best]))
+    turn, shift = turn[best], shift[best]
+    inside = (turn <= 3 * np.median(turn)) & (shift <= 3 * np.median(shift))
     if inside.sum() >= 3:
         again = _linear(loop, np.flatnonzero(inside)[None], with_scale)
         new_turn, new_shift = _misses(loop, *again)
-        new_shift = _in_board_units(new_shift, again[4])
-        if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
+        if np.median(new_turn) * np.median(new_shift) < np.median(turn) * np.median(shift):
             parts, best = again, 0
     x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
     return Rigid(x, t_x), Rigid(z, t_z), float(scale)
-
-
-def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Returns distances (s, m) over scales (s,); infinite for a board of no size."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(np.abs(scale) < LEAST_SCALE, np.inf, shift.T / np.abs(scale)).T
 
 
 def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
@@ -97,7 +89,6 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
-    eye = loop.camera_from_board
     scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
     t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
     return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
@@ -140,13 +131,17 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z."""
+    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
+    infinite for a board of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     chain = hand.rotation @ (x[:, None] @ eye.rotation)
     cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)
-    return np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(at + hand.translation - t_z[:, None], axis=2)
+    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(size < LEAST_SCALE, np.inf, shift.T / size).T
+    return np.arccos(np.clip(cosine, -1, 1)), shift
 
 
 def mean_pose(chain: Poses) -> Rigid:
@@ -169,36 +164,31 @@ AX_ZB = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORL
 def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
     """Returns X and Z by one of :data:`AX_XB`, whose Z is the mean of the chains, or :data:`AX_ZB`; ``unit_mm`` weighs
     like one radian. Raises ConvergenceError: OpenCV fails, or its result is not a rigid transform."""
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
+
+    def split(poses: Poses) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        return list(poses.rotation), list(poses.translation / unit_mm)
+
+    def rigid(rotation: np.ndarray, translation: np.ndarray) -> Rigid:
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
+            raise ConvergenceError(
+                "E-HANDEYE-METHOD-FAILS",
+                f"hand-eye: {method} returns no transform; the motions are too small or too alike for it",
+            )
+        u, _, vt = np.linalg.svd(rotation)
+        return Rigid(u @ vt, unit_mm * translation.ravel())
+
+    hand, eye = loop.stand_from_mount, split(loop.camera_from_board)
     try:
         with quiet_opencv():  # of few poses it prints lines of its own
             if method in AX_XB:
-                r, t = cv2.calibrateHandEye(*_split(hand, unit_mm), *_split(eye, unit_mm), method=AX_XB[method])
-                x = _rigid(r, t, unit_mm, method)
+                x = rigid(*cv2.calibrateHandEye(*split(hand), *eye, method=AX_XB[method]))
                 return x, mean_pose(loop.chain(x))
-            mount_from_stand = hand.inverse()
-            r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(
-                *_split(eye, unit_mm), *_split(mount_from_stand, unit_mm), method=AX_ZB[method]
-            )
+            r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(*eye, *split(hand.inverse()), method=AX_ZB[method])
     except cv2.error as error:
         raise ConvergenceError(
             "E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err}); use another method"
         ) from error
-    return _rigid(r_x, t_x, unit_mm, method).inverse(), _rigid(r_z, t_z, unit_mm, method).inverse()
-
-
-def _split(poses: Poses, unit_mm: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return list(poses.rotation), list(poses.translation / unit_mm)
-
-
-def _rigid(rotation: np.ndarray, translation: np.ndarray, unit_mm: float, method: str) -> Rigid:
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS",
-            f"hand-eye: {method} returns no transform; the motions are too small or too alike for it",
-        )
-    u, _, vt = np.linalg.svd(rotation)
-    return Rigid(u @ vt, unit_mm * translation.ravel())
+    return rigid(r_x, t_x).inverse(), rigid(r_z, t_z).inverse()
 
 
 GAP = 1e-4

@@ -42,6 +42,13 @@ class Bounds:
                 f"{FARTHEST:g} and a positive half width needed",
             )
 
+    def in_words(self, factor: float, unit: str) -> str:
+        """Returns the bounds in words, times ``factor``."""
+        about = "the closed-form solution" if self.centre is None else "zero"
+        if any(self.centre or ()):
+            about = ", ".join(f"{factor * coordinate:g}" for coordinate in self.centre or ()) + unit
+        return f"±{factor * self.half_width:.4g}{unit} about {about}"
+
 
 @dataclass(frozen=True, slots=True)
 class EvolutionOptions:
@@ -90,23 +97,12 @@ class EvolutionOptions:
 
     def in_words(self, unit_mm: float) -> str:
         """Returns in words the settings that the paper leaves to choose, or that its copy does not show."""
-        turn = _in_words(self.bounds_rad, 180 / np.pi, "°")
-        shift = _in_words(self.bounds_mm, 1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
+        turn = self.bounds_rad.in_words(180 / np.pi, "°")
+        shift = self.bounds_mm.in_words(1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
         return (
             f"differential evolution: first population {turn} and {shift}; λ {self.weight:g} with lengths in units of "
             f"{unit_mm:g} mm; the paper's own bounds are not legible, and what it reaches depends on them"
         )
-
-
-def _in_words(bounds: Bounds, factor: float, unit: str) -> str:
-    about = "the closed-form solution"
-    if bounds.centre is not None:
-        about = (
-            ", ".join(f"{factor * coordinate:g}" for coordinate in bounds.centre) + unit
-            if any(bounds.centre)
-            else "zero"
-        )
-    return f"±{factor * bounds.half_width:.4g}{unit} about {about}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

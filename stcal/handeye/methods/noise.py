@@ -91,44 +91,36 @@ class LoopComponents:
 
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect."""
-        lengths = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
-        squared = [robust_sigma(length, 3) ** 2 for length in lengths.T]
+        turn, shift = (robust_sigma(each, 3) ** 2 for each in np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T)
         turns = max(sum(name.endswith("_rad") for name in self.names), 1)
-        by_kind = {"rad": squared[0] / turns, "mm": squared[1], "factor": 1.0}
-        return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
+        by_kind = {"rad": turn / turns, "mm": shift, "factor": 1.0}
+        return np.maximum([by_kind[name.rpartition("_")[2]] for name in self.names], self.least())
 
     def least(self) -> np.ndarray:
         """Returns the lower limits (f,) of the variances."""
-        return np.square([LEAST[_kind(name)] for name in self.names])
-
-
-def _kind(name: str) -> str:
-    """Returns ``rad``, ``mm`` or ``factor``."""
-    return name.rpartition("_")[2]
+        return np.square([LEAST[name.rpartition("_")[2]] for name in self.names])
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
     """Returns the components at an estimate of X. Covariances of the camera's poses hold the images' noise up to a
     factor, as the intrinsics' errors have the same weak directions; it is estimated where the robot's σ are too."""
-    jacobians = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
-    stated = {"robot": loop.robot_covariance, "camera": loop.camera_covariance}
-    for side, (rad, mm) in {
-        "robot": (noise.robot_rad, noise.robot_mm),
-        "camera": (noise.camera_rad, noise.camera_mm),
-    }.items():
-        if stated[side] is None and rad is not None and mm is not None:
-            stated[side] = np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (len(loop), 1, 1))
     known, free = np.zeros((len(loop), 6, 6)), {}
-    for side, jacobian in jacobians.items():
-        if stated[side] is not None:
-            carried = jacobian @ stated[side] @ np.swapaxes(jacobian, 1, 2)
-            if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
-                free["camera_factor"] = carried
-            else:
-                known = known + carried
+    for side, jacobian, stated, rad, mm in (
+        ("robot", loop.by_robot(mount_from_camera, scale), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
+        ("camera", loop.by_camera(mount_from_camera, scale), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
+    ):
+        of_images = stated is not None
+        if stated is None and rad is not None and mm is not None:
+            stated = np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (len(loop), 1, 1))
+        if stated is None:
+            for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
+                free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
             continue
-        for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
-            free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
+        carried = jacobian @ stated @ np.swapaxes(jacobian, 1, 2)
+        if side == "camera" and of_images and "robot_rad" in free:
+            free["camera_factor"] = carried
+        else:
+            known = known + carried
     if len(free) == 4:  # shifts of robot and camera move the board alike
         del free["robot_mm"]
     if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses determine one component less

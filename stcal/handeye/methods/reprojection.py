@@ -96,10 +96,10 @@ class Reprojection:
         return np.where((distance < 10.0**-SAME_DIGITS)[:, None], self.corners[nearest], scale * np.asarray(xyz_board))
 
 
-def resected(pairs_names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
+def resected(names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
     """Returns camera_from_board of all views by the adjusted camera and board."""
     seen = tuple(view.moved(board.board(view.xyz_board)) for view in views.views)
-    return resect(Views(board.camera, seen), pairs_names).camera_from_board
+    return resect(Views(board.camera, seen), names)[0]
 
 
 def problem(
@@ -115,12 +115,9 @@ def problem(
     """Returns the problem, and the groups whose σ are to be estimated, from ``first``."""
     seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
     designed, corner = np.unique(seen, axis=0, return_inverse=True)
-    sigma, free = {}, []
-    for name in ("corner_px", *ROBOT, "board_mm"):
-        value = getattr(noise, name)
-        if value is None:
-            free.append(name)
-        sigma[name] = first[name] if value is None else value
+    stated = {name: getattr(noise, name) for name in ("corner_px", *ROBOT, "board_mm")}
+    sigma = {name: first[name] if value is None else value for name, value in stated.items()}
+    free = [name for name, value in stated.items() if value is None]
     if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of them only: tiny σ there
         sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
     robot = None
@@ -129,25 +126,25 @@ def problem(
         free = [name for name in free if not name.startswith("robot")]
     basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
-    corners = Corners(
-        loop.inverted,
-        base_from_flange,
-        designed,
-        np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
-        corner.ravel(),
-        np.concatenate([view.xy_px for view in views.views]),
-        np.concatenate([view.whitening() for view in views.views]),
-        robot,
-        sigma,
-        views.camera,
-        basis,
-        information,
-        with_scale,
-        arm,
-    )
     if arm is not None:
         sigma |= {name: first[name] for name in arm.parts()}
         free += list(arm.parts())
+    corners = Corners(
+        inverted=loop.inverted,
+        base_from_flange=base_from_flange,
+        xyz_board=designed,
+        view=np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
+        corner=corner.ravel(),
+        xy_px=np.concatenate([view.xy_px for view in views.views]),
+        weight=np.concatenate([view.whitening() for view in views.views]),
+        robot=robot,
+        sigma=sigma,
+        camera=views.camera,
+        basis=basis,
+        information=information,
+        with_scale=with_scale,
+        arm=arm,
+    )
     factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
@@ -379,7 +376,7 @@ def adjust_views(
     for _ in range(1 if arm is None else ARM_ROUNDS):
         linear, flange = None, base_from_flange
         if arm is not None:
-            linear, flange = LinearArm.about(arm, parameters), arm.poses(parameters)
+            linear, flange = LinearArm(parameters, arm.slope(parameters), arm.angles), arm.poses(parameters)
             loop = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
         used, good = _near(loop, *first), len(loop)
         while True:
@@ -404,7 +401,7 @@ def adjust_views(
             break
         parameters, first = parameters + state.arm, (state.mount_from_camera, state.stand_from_board, state.scale)
         sigma = FIRST | _sigma(corners)
-        if linear.moves_mm(state.arm) < SETTLED_MM:
+        if np.linalg.norm(linear.slope[:, 3:] @ state.arm, axis=1).max() < SETTLED_MM:
             break
     else:
         settled = False

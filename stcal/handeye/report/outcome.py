@@ -1,6 +1,6 @@
 """All results of a hand-eye command, and the verdict on them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -151,30 +151,33 @@ def judged(outcome: Outcome) -> Verdict:
         _of_size(outcome),
         _of_outliers(outcome),
     ]
-    return Verdict(tuple(each for each in (*tests, *of_notes(outcome.all_notes())) if each is not None))
+    for note in outcome.all_notes():  # the text behind a note's colon is the remedy
+        if not isinstance(note, Aside):
+            said, _, remedy = note.partition(": ")
+            tests.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
+    return Verdict(tuple(each for each in tests if each is not None))
 
 
 def _of_residuals(outcome: Outcome) -> Finding | None:
     """Refuses residuals that are too large for a sound robot and camera, even if they predict held-out poses well."""
-    if outcome.pairs is None or not (used := ~outcome.result.outliers).any():
+    result, used = outcome.result, ~outcome.result.outliers
+    if outcome.pairs is None or not used.any():
         return None
-    turn, shift = outcome.result.rms()
-    scale = outcome.result.scale
-    away = scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
+    turn, shift = result.rms()
+    away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
-    return Finding(
-        "Residuals",
-        BAD,
+    said = (
         f"the poses miss one another by {np.degrees(turn):.2g}° and {shift:.3g} mm (RMS), {shift / away:.0%} of the "
-        f"board's distance of {away:.0f} mm",
-        f"{np.degrees(turn):.2g}°, {shift:.3g} mm",
-        f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm",
-        ""
-        if any(isinstance(note, SizeDoubt) for note in outcome.all_notes())
-        else "pair each pose of the board with that of the flange at the same moment, and check units, directions and "
-        "the camera file",
+        f"board's distance of {away:.0f} mm"
     )
+    limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
+    remedy = (
+        "pair each pose of the board with that of the flange at the same moment, and check units, directions and the "
+        "camera file"
+    )
+    remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
+    return Finding("Residuals", BAD, said, f"{np.degrees(turn):.2g}°, {shift:.3g} mm", limit, remedy)
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
@@ -215,7 +218,8 @@ def _of_share(outcome: Outcome) -> Finding | None:
     if share is None or outcome.arm is not None:
         return None
     distance, sigma, shift = share
-    share_of_transform, word = sigma**2 / (sigma**2 + shift**2), _word(sigma**2 / (sigma**2 + shift**2), HALF, MOST)
+    share_of_transform = sigma**2 / (sigma**2 + shift**2)
+    word = _word(share_of_transform, HALF, MOST)
     alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
     said = (
         f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
@@ -302,13 +306,13 @@ def _of_outliers(outcome: Outcome) -> Finding:
     result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
     if not bad:
         return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
-    said, others, flips = [], bad, ()
+    said, flips = [], ()
     if outcome.pairs is not None:
         loop = Loop.of(outcome.pairs, result.setup)
         tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
         flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+    others = tuple(name for name in bad if name not in flips)
     if flips:
-        others = tuple(name for name in bad if name not in flips)
         tilt = "poses are tilted the other way, as the second pose of a flat target is"
         said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
     if others:
@@ -327,16 +331,6 @@ def _of_outliers(outcome: Outcome) -> Finding:
 
 def _few(names: Sequence[str]) -> str:
     return ", ".join(map(spoken, names[:SHOWN])) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-
-
-def of_notes(notes: Iterable[str]) -> list[Finding]:
-    """Returns a finding for each note except asides. The text behind a note's colon becomes the remedy."""
-    findings = []
-    for note in notes:
-        if not isinstance(note, Aside):
-            said, _, remedy = note.partition(": ")
-            findings.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
-    return findings
 
 
 def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: str) -> Finding:

@@ -10,9 +10,9 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.file import HandEyeFile
+from stcal.handeye.report.handeye_file import HandEyeFile
+from stcal.handeye.report.handeye_page import outcome_report
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.page import outcome_report
 from stcal.handeye.solve import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import camera_prior

@@ -6,27 +6,19 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 import stcal
+from stcal.handeye.choose import Candidate
 from stcal.handeye.data.pairs import FRAMES, Setup
-from stcal.handeye.judge.remarks import Word
+from stcal.handeye.judge.remarks import Finding, Word
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared
 from stcal.io.json import Finite, Matrix, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 
-class FindingRow(Part):
-    title: str
-    word: Word
-    said: str
-    value: str
-    limit: str
-    remedy: str
-
-
 class VerdictPart(Part):
     word: Word
     sentence: Annotated[str, BeforeValidator(lambda said: said if isinstance(said, str) else said())]
-    findings: list[FindingRow]
+    findings: list[Finding]
 
 
 class BoardSize(Part):
@@ -97,20 +89,14 @@ class MethodRow(Part):
     splits: SplitErrors | None
 
 
-class Way(Part):
-    method: str
-    camera: bool
-    scale: bool
-
-
 class TriedRow(Part):
-    candidate: Way
+    candidate: Candidate
     mean_mm: Finite
     reason: str
 
 
 class ChoicePart(Part):
-    chosen: Way
+    chosen: Candidate
     sentence: str
     tried: list[TriedRow]
 
@@ -239,7 +225,7 @@ class HandEyeFile(ResultFile):
             parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
             optional["arm"] = parts | {"plain": arm.plain and arm.plain.summary()}
         if whole:
-            optional |= {"splits": held_out, "methods": [_method(each, len(result.names)) for each in outcome.compared]}
+            optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
         return cls.model_validate(
             {
                 "format": "stcal handeye 1",
@@ -274,8 +260,9 @@ def _pose(result: HandEye, i: int) -> dict:
     return row if adjusted is None else row | {"corner_rms_px": adjusted.rms_px(i)}
 
 
-def _method(each: Compared, count: int) -> dict:
+def _method(each: Compared) -> dict:
     result, held_out = each.result, each.held_out
-    bad, transforms = (np.zeros(count, bool), {}) if result is None else (result.outliers, result.transforms)
-    means = held_out and held_out.summary(bad)
-    return {"method": each.method, "reason": each.reason, "held_out": means, "splits": held_out, **transforms}
+    row = {"method": each.method, "reason": each.reason, "held_out": None, "splits": held_out}
+    if result is None:
+        return row
+    return row | {"held_out": held_out and held_out.summary(result.outliers), **result.transforms}
