@@ -185,7 +185,7 @@ def handeye(
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
-    from stcal.handeye.report import export as forms
+    from stcal.handeye.report import transform_export as forms
     from stcal.handeye.report.handeye_file import HandEyeFile
     from stcal.handeye.report.handeye_page import outcome_report
     from stcal.handeye.report.outcome import judged

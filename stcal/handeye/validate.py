@@ -13,12 +13,12 @@ from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
-from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.data.corner_views import View, Views, resect
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Motions, Setup
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.methods.noise import UNKNOWNS
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import IN_COMMON, METHODS, HandEyeOptions, Problem
+from stcal.handeye.solving import IN_COMMON, METHODS, HandEyeOptions, HandEyeProblem
 from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
@@ -28,6 +28,7 @@ SETUP_BETTER = 4.0
 LEAST_LEFT = 3
 """Least number of poses that must remain to solve with."""
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
+TRANSFORMS = ("mount_from_camera", "stand_from_board")
 SCATTERED = 1.5
 """Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
 scatters as much if the poses err as assumed."""
@@ -191,12 +192,12 @@ def cross_validate(
 
     Raises StcalError: a split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
-    problem = Problem(pairs, setup, views, options or HandEyeOptions()).mended()
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
     return refitted(problem, method, splits(len(pairs)) if rows is None else rows, workers, progress)
 
 
 def refitted(
-    problem: Problem,
+    problem: HandEyeProblem,
     method: str | None,
     rows: np.ndarray,
     workers: int | None = 1,
@@ -208,14 +209,14 @@ def refitted(
     return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
 
 
-def errors_without(problem: Problem, method: str | None, out: np.ndarray) -> dict[str, np.ndarray]:
+def errors_without(problem: HandEyeProblem, method: str | None, out: np.ndarray) -> dict[str, np.ndarray]:
     """Solves without the poses ``out``, (k,). Returns :func:`errors_of` these poses."""
     with naming_held_out(problem, out):
         result = problem.without(out).solved(method).result
     return errors_of(result, problem[out])
 
 
-def errors_of(result: HandEye, unseen: Problem) -> dict[str, np.ndarray]:
+def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
     """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
     pairs, arm, adjusted = unseen.pairs, unseen.options.arm, result.reprojection
     if arm is not None and adjusted is not None and adjusted.arm is not None:
@@ -224,7 +225,7 @@ def errors_of(result: HandEye, unseen: Problem) -> dict[str, np.ndarray]:
 
 
 @contextmanager
-def naming_held_out(problem: Problem, out: np.ndarray) -> Iterator[None]:
+def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
     """Adds to a DegenerateError the names of the poses ``out``, (k,), that were held out."""
     try:
         yield
@@ -238,8 +239,12 @@ def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) ->
     if views is None:
         return predicted(result, pairs, None)["translation_mm"]
     camera, adjusted_views = as_adjusted(result, views)
-    poses = zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
-    return np.array([_beside(view, camera, pose) for view, pose in poses])
+    return np.array(
+        [
+            _beside(view, camera, pose)
+            for view, pose in zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
+        ]
+    )
 
 
 def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
@@ -273,7 +278,7 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
 
 
 @one_thread()
-def better_setup(problem: Problem, rows: np.ndarray) -> tuple[str, ...]:
+def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     """Returns a note with both errors if method ``pose`` predicts held-out poses ``rows`` (s, k) far better in the
     other setup."""
     setup = problem.setup
@@ -325,7 +330,7 @@ def compare(
 
     Raises InputError: the poses follow another convention. Raises DegenerateError: no method can solve these poses.
     """
-    problem = Problem(pairs, setup, views, options or HandEyeOptions()).mended()
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
     problem.solved("pose")  # raises if the poses themselves are at fault, whatever the method
     rows = splits(len(pairs)) if rows is None else rows
     compared, told = [], progress or (lambda *_: None)
@@ -364,13 +369,11 @@ def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
 
 def _differences(others: list[HandEye], result: HandEye) -> list[np.ndarray]:
     """Returns the differences (n, 6) of X and of Z of other results against ``result``."""
-    return [
-        Poses.of([getattr(other, name) for other in others]).difference(Poses.of([getattr(result, name)] * len(others)))
-        for name in ("mount_from_camera", "stand_from_board")
-    ]
+    pairs = [[(getattr(each, name), getattr(result, name)) for each in others] for name in TRANSFORMS]
+    return [Poses.of([a for a, _ in each]).difference(Poses.of([b for _, b in each])) for each in pairs]
 
 
-def with_common_errors(result: HandEye, problem: Problem) -> HandEye:
+def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:
     """Returns a result with covariances that contain what one σ of each common error of the board's poses moves it."""
     common, seen = problem.pairs.camera_from_board_common, problem.pairs.camera_from_board
     if common is None:
@@ -449,15 +452,15 @@ def predict_motions(
     Raises InputError: too few poses are left. Raises StcalError: the solution fails; see
     :func:`~stcal.handeye.handeye`.
     """
-    remaining = len(pairs) - count
-    if count < 1 or remaining < LEAST_LEFT:
+    remaining, most = len(pairs) - count, max(len(pairs) - LEAST_LEFT, 0)
+    if not 1 <= count <= most:
         raise InputError(
             "E-OPTION-RANGE",
-            f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {max(len(pairs) - LEAST_LEFT, 0)} "
-            "can be held out; give another number, or more poses",
+            f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {most} can be held out; give "
+            "another number, or more poses",
         )
-    problem = Problem(pairs, setup, views, options or HandEyeOptions())
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions())
     result = problem[np.arange(remaining)].solved(method).result
-    errors = motion_errors(result.mount_from_camera, Motions.consecutive(Loop.of(pairs, setup))[remaining - 1 :])
+    errors = motion_errors(result.mount_from_camera, Motions.consecutive(problem.loop)[remaining - 1 :])
     names = tuple(zip(pairs.names[remaining - 1 : -1], pairs.names[remaining:], strict=True))
     return HeldOutMotions(remaining - 1, names, errors[:, 0], errors[:, 1])

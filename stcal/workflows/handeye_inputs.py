@@ -13,13 +13,13 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
-from stcal.handeye.data.pairs import Setup
+from stcal.handeye.data.inputs import ToldPairs, own_told, read_pairs, read_two, require_own
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.mistakes import flipped, tilted
+from stcal.handeye.judge.conventions import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.solve import Problem
+from stcal.handeye.solving import HandEyeProblem
 from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -41,7 +41,7 @@ from stcal.workflows.robot_at_images import (
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
 PREFIXES = "base_from_flange_", "camera_from_board_"
-Source = Path | Table | Told
+Source = Path | Table | ToldPairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +68,9 @@ class HandEyeInput:
     timed: Timed | None = None
     notes: tuple[str, ...] = ()
 
-    def problem(self, options: HandEyeOptions) -> Problem:
+    def problem(self, options: HandEyeOptions) -> HandEyeProblem:
         """Returns what is to be solved."""
-        return Problem(self.pairs, self.setup or "eye-in-hand", self.views, options)
+        return HandEyeProblem(self.pairs, self.setup or "eye-in-hand", self.views, options)
 
 
 def one_source(
@@ -191,7 +191,7 @@ class Files:
         self._require_no_images()
         if isinstance(source, Table):
             return HandEyeInput(source.where, read_poses(source, self.quaternions), setup=statements.setup)
-        if isinstance(source, Told):
+        if isinstance(source, ToldPairs):
             told = source
         elif (told := read_pairs(source, statements, quaternions=self.quaternions)) is None:
             pairs = read_poses(source, self.quaternions)  # first: a table that is not understood states nothing
@@ -202,8 +202,10 @@ class Files:
             raise InputError(
                 "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
             )
-        known = {name: getattr(told, name) for name in ("left_out", "understood", "timed")}
-        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **known)
+        setup, left_out = stated or told.setup, told.left_out
+        return HandEyeInput(
+            where, told.pairs, left_out=left_out, understood=told.understood, setup=setup, timed=told.timed
+        )
 
     def _of_images(self) -> dict[str, Path | None]:
         """Returns the options of images, by name."""
@@ -212,7 +214,7 @@ class Files:
     def _require_no_images(self) -> None:
         """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
         source = self.source
-        of_file, of_pairs, of_table = (isinstance(source, kind) for kind in (Path, Told, Table))
+        of_file, of_pairs, of_table = (isinstance(source, kind) for kind in (Path, ToldPairs, Table))
         place = source.pairs.where if of_pairs else source.where if of_table else source
         extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
         for refused, message in (
@@ -250,7 +252,7 @@ class Files:
             inputs = self.read()
             stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
             lines, count = list(inputs.understood), f"pairs: {len(inputs.pairs)}"
-            if not lines and not isinstance(source, Told):
+            if not lines and not isinstance(source, ToldPairs):
                 lines = own_told(source, self.quaternions)
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
@@ -280,6 +282,7 @@ class _Photographs:
     design: Board
     model: CameraModel
     images: list[ImageFile]
+    robot: RobotPoses
     at_images: AtImages
     arm: Arm | None
     row_of: dict[str, int]
@@ -318,26 +321,19 @@ class _Photographs:
         left_out = [(each.name, each.reason) for each in skipped]
         left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        return cls(files, folder, design, model, images, at_images, arm, row_of, matching, tuple(left_out))
-
-    @property
-    def robot(self) -> RobotPoses:
-        return self.at_images.robot
-
-    def lines(self) -> list[str]:
-        """Returns lines on how the files were understood."""
-        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
-        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
-        return [
-            *self.robot_lines(),
-            f"camera: {camera}: {width} × {height} px, focal length {focal_px:.6g} px",
-            f"board: {board}: {kind_of(self.design)}",
-        ]
+        return cls(files, folder, design, model, images, robot, at_images, arm, row_of, matching, tuple(left_out))
 
     def robot_lines(self) -> tuple[str, ...]:
         """Returns lines on how the robot's poses were read and matched."""
         matched = (f"images matched {self.matching}",) if self.matching else ()
         return f"robot: {self.robot.understood}", *matched
+
+    def lines(self) -> list[str]:
+        """Returns lines on how the files were understood."""
+        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
+        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
+        size = f"{width} × {height} px, focal length {focal_px:.6g} px"
+        return [*self.robot_lines(), f"camera: {camera}: {size}", f"board: {board}: {kind_of(self.design)}"]
 
     def pairs(self, workers: int | None, progress: Progress) -> HandEyeInput:
         """Returns the pairs of all images that show the board and have a pose."""
@@ -350,8 +346,8 @@ class _Photographs:
                 f"image folder {self.folder}: the board is in none of {len(with_pose)} images: "
                 f"{': '.join(without_board[0])}",
             )
-        views = (View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
-        views, rows = Views(detections.camera, tuple(views)), np.array([self.row_of[name] for name in found])
+        camera, rows = detections.camera, np.array([self.row_of[name] for name in found])
+        views = Views(camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values()))
         pairs = pairs_of_views(self.robot.base_from_flange[rows], views, tuple(found), str(self.folder))
         if self.robot.covariance is not None:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
@@ -361,7 +357,7 @@ class _Photographs:
             pairs,
             views,
             detections.symmetries,
-            camera_prior(refinable(self.model.calibrated(detections.camera.width, detections.camera.height))),
+            camera_prior(refinable(self.model.calibrated(camera.width, camera.height))),
             next((getattr(self.design, key) for key in PITCHES if hasattr(self.design, key)), None),
             (*without_board, *self.left_out),
             (*understood, *(f"board: {part}" for part in detections.unused())),

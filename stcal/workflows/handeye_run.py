@@ -14,13 +14,13 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pairs import HandEyePoses, rms_of
+from stcal.handeye.handeye_pipeline import validated
+from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
-from stcal.handeye.pipeline import validated
 from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import Problem
+from stcal.handeye.solving import HandEyeProblem
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
 from stcal.io.cameras.model import CameraPrior
@@ -114,7 +114,9 @@ def calibrate_handeye(
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
-def _compared(problem: Problem, rows: np.ndarray, workers: int | None, progress: Callable[[int, int], None]) -> Outcome:
+def _compared(
+    problem: HandEyeProblem, rows: np.ndarray, workers: int | None, progress: Callable[[int, int], None]
+) -> Outcome:
     """Returns the results of all methods, and that of the default method as the result."""
     pairs, views, options = problem.pairs, problem.views, problem.options
     result = problem.solved().result
@@ -132,7 +134,7 @@ NO_COVARIANCE = Aside(
 def with_arm(
     outcome: Outcome,
     arm: Arm,
-    problem: Problem,
+    problem: HandEyeProblem,
     prior: CameraPrior | None,
     rows: np.ndarray,
     workers: int | None,
@@ -152,8 +154,7 @@ def with_arm(
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
     values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
-    parameters, sigma = (dict(zip(arm.names(), each, strict=True)) for each in values)
-    found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
+    found = ArmFound(arm.robot.name, *(dict(zip(arm.names(), each, strict=True)) for each in values), outcome.held_out)
     if held_out is not None and outcome.held_out is not None:
         now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:
@@ -203,24 +204,20 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
     pairs, views, noise = problem.pairs, problem.views, options.noise
     offset = estimate_offset(pairs, timed.stream, timed.seconds, problem.setup, noise, options.with_scale)
     rows = np.flatnonzero(offset.kept)
-    outside = [
-        (name, "outside of the robot's times at the time offset")
-        for name, k in zip(pairs.names, offset.kept, strict=True)
-        if not k
-    ]
+    outside = [name for name, kept in zip(pairs.names, offset.kept, strict=True) if not kept]
     given = replace(
         given,
         pairs=replace(pairs[rows], base_from_flange=offset.base_from_flange),
         views=None if views is None else views[rows],
         symmetries=(),
-        left_out=(*given.left_out, *outside),
+        left_out=(*given.left_out, *((name, "outside of the robot's times at the time offset") for name in outside)),
         understood=(*given.understood, *problem.notes),
     )
     return given, problem.options, offset
 
 
 @one_thread()
-def lag_tried(problem: Problem, timed: Timed | None, result: HandEye) -> tuple[HandEye, tuple[str, ...]]:
+def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> tuple[HandEye, tuple[str, ...]]:
     """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
     with the lag goes. Without times, the order of smooth rows gives velocities."""
     pairs, setup, options, stated = problem.pairs, problem.setup, problem.options, timed
@@ -233,7 +230,9 @@ def lag_tried(problem: Problem, timed: Timed | None, result: HandEye) -> tuple[H
         plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
-        before, after = (Problem(each, setup, None, plain).solved("pose").result for each in (pairs[lag.kept], shifted))
+        before, after = (
+            HandEyeProblem(each, setup, None, plain).solved("pose").result for each in (pairs[lag.kept], shifted)
+        )
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]
@@ -242,16 +241,13 @@ def lag_tried(problem: Problem, timed: Timed | None, result: HandEye) -> tuple[H
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
-    with_which, ahead = f"with which residuals fall from {old} to {new}", lag.seconds > 0
-    if stated is not None:
-        clock = f"{1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {'ahead of' if ahead else 'behind'}"
-        said = f"by the motions the robot's clock is {clock} the camera's, {with_which}: solve with --time-offset"
-    else:
-        late = f"{abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
-        said = (
-            f"by the motions the board's poses are {late} than the robot's, {with_which}: give both with times, and "
-            "--time-offset"
-        )
+    size, sigma, ahead = abs(lag.seconds), lag.sigma_s, lag.seconds > 0
+    clock = f"robot's clock is {1e3 * size:.3g} ± {1e3 * sigma:.2g} ms {'ahead of' if ahead else 'behind'} the camera's"
+    remedy = "solve with --time-offset"
+    if stated is None:
+        late = f"{size / ROW_S:.2g} ± {sigma / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
+        clock, remedy = f"board's poses are {late} than the robot's", "give both with times, and --time-offset"
+    said = f"by the motions the {clock}, with which residuals fall from {old} to {new}: {remedy}"
     if not any(isinstance(note, SizeDoubt) for note in after.notes):
         result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
     return result, (Grave(said) if harmful else said,)
@@ -278,7 +274,7 @@ def _moving(pairs: HandEyePoses, timed: Timed | None) -> Timed | None:
     return timed if smooth else None
 
 
-def _lag_t(problem: Problem, timed: Timed, result: HandEye) -> float:
+def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
     """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
     good = np.flatnonzero(~result.outliers)
     loop, x = problem.loop[good], result.mount_from_camera

@@ -7,11 +7,11 @@ import pytest
 
 import stcal.handeye
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.report.outcome import judged
-from stcal.handeye.solve import Problem, handeye
+from stcal.handeye.solving import HandEyeProblem, handeye
 from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye, lag_tried
 from tests.outcome import fails_with
@@ -27,7 +27,7 @@ def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
 
 
 def told(given: HandEyeInput) -> tuple[str, ...]:
-    return lag_tried(Problem(given.pairs), given.timed, handeye(given.pairs))[1]
+    return lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1]
 
 
 @pytest.mark.slow
@@ -50,7 +50,7 @@ def test_clocks_that_agree_are_not_blamed(seed):
 def test_a_doubt_of_the_size_ends_with_the_lag():
     given = given_of(19, 0.05)
     doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
-    again, notes = lag_tried(Problem(given.pairs), given.timed, doubted)
+    again, notes = lag_tried(HandEyeProblem(given.pairs), given.timed, doubted)
     assert not any(isinstance(note, SizeDoubt) for note in again.notes)
     assert len(notes) == 1
 

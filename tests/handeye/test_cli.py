@@ -333,9 +333,9 @@ def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command,
     sides = {name: getattr(truth, name).inverse() for name in ("base_from_flange", "camera_from_board")}
     words = (write(tmp_path / "poses.csv", sides), "--method", "pose", "--splits", 2)
     _, out, _ = command(*words, "--out", tmp_path / "h.json")
-    starts = ("verdict:", "what to do:")
+    starts = ("May I use it?", "what to do:")
     verdict, remedy = (next(line for line in out.splitlines() if line.startswith(start)) for start in starts)
-    assert "do not use" in verdict
+    assert "No: " in verdict
     assert "flange_from_base" in remedy
     assert "board_from_camera" in remedy
     assert command(*words, "--quiet") == (0, "", f"warning: {verdict}\n")

@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.handeye import handeye
-from stcal.handeye.data.pairs import read_poses
-from stcal.handeye.solve import HandEyeOptions, Problem
-from stcal.handeye.solve import handeye as handeye_by
+from stcal.handeye.data.pose_pairs import read_poses
+from stcal.handeye.solving import HandEyeOptions, HandEyeProblem
+from stcal.handeye.solving import handeye as handeye_by
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
@@ -77,9 +77,9 @@ def test_a_closed_form_by_the_jackknife_contains_them():
     found = []
     for seed in range(20):
         pairs, truth = draw(seed)
-        solution = Problem(pairs).solved("shah")
+        solution = HandEyeProblem(pairs).solved("shah")
         result = with_jackknife(solution.result, [solution.without(np.array([i])) for i in range(len(pairs))])
-        found.append(squared(with_common_errors(result, Problem(pairs)), truth) / 6)
+        found.append(squared(with_common_errors(result, HandEyeProblem(pairs)), truth) / 6)
     assert np.mean(found) < chi2.ppf(0.999, 120) / 120 * 1.3  # a jackknife of sixteen poses
 
 

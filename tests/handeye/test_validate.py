@@ -17,8 +17,8 @@ from stcal.handeye import (
     predict_motions,
     splits,
 )
-from stcal.handeye.data.pairs import Loop, Motions
-from stcal.handeye.solve import handeye
+from stcal.handeye.data.pose_pairs import Loop, Motions
+from stcal.handeye.solving import handeye
 from stcal.handeye.validate import predicted
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated, simulated_views

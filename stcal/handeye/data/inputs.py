@@ -11,9 +11,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.pairs import HandEyePoses, Setup, inverted
+from stcal.handeye.data.pose_pairs import HandEyePoses, Setup, inverted
 from stcal.handeye.data.recognise import read_columns, read_content, todays
-from stcal.handeye.data.record import FRAMES, Content, Known, Role, Said, Side, inverse_name
+from stcal.handeye.data.record import FRAMES, Known, PoseContent, PoseSide, Role, Said, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
@@ -60,7 +60,7 @@ class Posed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class ToldPairs:
     """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
     (name, why); ``timed`` : where the robot's poses were taken by time."""
 
@@ -71,7 +71,7 @@ class Told:
     timed: Timed | None = None
 
     @classmethod
-    def of(cls, robot: Posed, camera: Posed, names: Sequence[str], where: str, **more: Any) -> "Told":
+    def of(cls, robot: Posed, camera: Posed, names: Sequence[str], where: str, **more: Any) -> "ToldPairs":
         """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
         covariances = robot.covariance, camera.covariance
         pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
@@ -79,7 +79,7 @@ class Told:
         return cls(pairs, lines, **more)
 
 
-def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
+def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs | None:
     """Returns the pose pairs of one file; None where it is one of the package's own tables.
 
     Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
@@ -100,7 +100,7 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
             f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}; "
             "write both in one unit, or to two files for --a and --b",
         )
-    return Told.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
+    return ToldPairs.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
 
 
 def read_two(
@@ -111,7 +111,7 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
-) -> Told | None:
+) -> ToldPairs | None:
     """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
     tables.
 
@@ -156,7 +156,7 @@ def read_two(
     ]
     lines = (f"rows joined {how}",) if how else ()
     more = {"lines": lines, "setup": setup, "left_out": tuple(left_out), "timed": stamped}
-    return Told.of(robot[a], camera[b], robot[a].called(), where, **more)
+    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, **more)
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
@@ -202,7 +202,7 @@ def _by_time(
     setup: Setup | None,
     where: str,
     tolerance_s: float,
-) -> Told:
+) -> ToldPairs:
     """Returns the robot's poses at the camera's times."""
     stream = Stream.of(times, robot.poses, Path(robot.where).name)
     seconds = stream.after_origin(wanted)
@@ -218,10 +218,10 @@ def _by_time(
     at_images, seen = replace(robot, poses=taken.base_from_flange, covariance=None), camera[rows.tolist()]
     left_out = tuple((name, why) for name, why in zip(camera.names, taken.why, strict=True) if why)
     more = {"lines": lines, "setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
-    return Told.of(at_images, seen, seen.names, where, **more)
+    return ToldPairs.of(at_images, seen, seen.names, where, **more)
 
 
-def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed:
+def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> Posed:
     """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
     with a line on how they were read."""
     wanted, first, statements = FRAMES[role][0], content.sides[0], statements.of(role)
@@ -248,7 +248,7 @@ def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed
     return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), guessed, common)
 
 
-def _direction(side: Side, role: Role, path: Path, statements: Said) -> Known:
+def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Known:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option = statements.frames_of(role)
     if option is not None:
@@ -267,7 +267,7 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Known:
     return Known(FRAMES[role][0], "by default")
 
 
-def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
+def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
     """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
     unit, option = side.unit, statements.length_unit
     if option is not None and not (unit is not None and unit.stated):

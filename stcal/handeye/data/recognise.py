@@ -16,7 +16,7 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order
-from stcal.handeye.data.record import EVERY_FRAME, Content, Known, Said, Side, require_each_once
+from stcal.handeye.data.record import EVERY_FRAME, Known, PoseContent, PoseSide, Said, require_each_once
 from stcal.handeye.data.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.poses.columns import find_column, places_of, read_rotations
@@ -41,7 +41,7 @@ def todays(table: Table) -> bool:
     return bool(placed) and all(f"{prefix}qw" in table for prefix in placed)
 
 
-def read_columns(table: Table, key: str, statements: Said) -> Content | None:
+def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
     """Returns the poses in the columns of a table; None where it has none."""
     names = _row_names(table, key)
     prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
@@ -57,7 +57,7 @@ def read_columns(table: Table, key: str, statements: Said) -> Content | None:
         raise InputError(
             "E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed, take the others out"
         )
-    return Content(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
+    return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
 
 def _row_names(table: Table, key: str) -> tuple[str, ...]:
@@ -75,7 +75,7 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     return ()
 
 
-def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> Side | None:
+def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> PoseSide | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
     place = _place(table, prefix)
     turned = None if place is None else read_rotations(table, prefix, statements.rotation)
@@ -84,7 +84,7 @@ def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...
     covariance = table.pose_covariances(prefix)
     common = table.common_errors(covariance, prefix)
     at, unit = place
-    side = Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
+    side = PoseSide(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
     return replace(side, covariance=covariance, common=common)
 
 
@@ -149,7 +149,7 @@ class File:
         return next((line.strip() for _, line in self.lines if not separator_stated(line)), "")
 
 
-def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Content | None:
+def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
     """Returns the content of a file. Returns None for the package's own tables, and for tables whose readers give
     better messages.
 
@@ -206,7 +206,7 @@ def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: i
     return np.array(values), places
 
 
-def _of_universal(file: File) -> Content:
+def _of_universal(file: File) -> PoseContent:
     """Returns the poses of lines ``p[x, y, z, rx, ry, rz]``."""
 
     def inside(line: str) -> list[float] | None:
@@ -215,10 +215,10 @@ def _of_universal(file: File) -> Content:
 
     values, places = _table_of(file, inside, 6)
     rotation, words = turned_values(values[:, 3:], file.said.rotation, "the numbers after x, y, z", places, file.where)
-    return Content("rows of numbers", (Side(rotation, values[:, :3], places, words),))
+    return PoseContent("rows of numbers", (PoseSide(rotation, values[:, :3], places, words),))
 
 
-def _of_tum(file: File) -> Content:
+def _of_tum(file: File) -> PoseContent:
     """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
     values, places = _table_of(file, _numbers, TUM)
     names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
@@ -233,8 +233,8 @@ def _of_tum(file: File) -> Content:
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
     turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
     rotation = of_quaternions(wxyz, places, file.where)
-    side = Side(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
-    return Content("TUM trajectory (timestamp, place, quaternion)", (side,))
+    side = PoseSide(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
+    return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
 
 
 def _row_of_numbers(file: File) -> list[float] | None:
@@ -244,11 +244,11 @@ def _row_of_numbers(file: File) -> list[float] | None:
     return _numbers(file.first) or (_numbers(others[0]) if named else None)
 
 
-def _refuse_rows(file: File) -> Content:
+def _refuse_rows(file: File) -> PoseContent:
     raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
 
 
-def _of_table(file: File) -> Content | None:
+def _of_table(file: File) -> PoseContent | None:
     table = read_table(file.path, "pose file", file.quaternions)
     return None if todays(table) else read_columns(table, file.key, file.said)
 
@@ -260,7 +260,7 @@ def _is_json(file: File) -> bool:
         return False
 
 
-def _of_values(file: File, value: Any, form: str) -> Content:
+def _of_values(file: File, value: Any, form: str) -> PoseContent:
     content = read_tree(value, form, file.said, file.where)
     if content is None:
         held = f"keys {', '.join(map(str, list(value)[:SHOWN]))} …" if isinstance(value, dict) else form
@@ -268,7 +268,7 @@ def _of_values(file: File, value: Any, form: str) -> Content:
     return content
 
 
-def _of_yaml(file: File) -> Content:
+def _of_yaml(file: File) -> PoseContent:
     if len(file.text.encode("utf-8")) > SETTINGS_BYTES:
         raise InputError(
             "E-FILE-TOO-LARGE",
@@ -285,7 +285,7 @@ def _of_yaml(file: File) -> Content:
     return _of_values(file, documents[0], "YAML")
 
 
-def _of_npz(file: File) -> Content:
+def _of_npz(file: File) -> PoseContent:
     """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
     others = []
@@ -341,7 +341,7 @@ def _damaged(where: str, error: Exception) -> InputError:
     )
 
 
-FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], Content | None]], ...] = (
+FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], PoseContent | None]], ...] = (
     (
         lambda file: file.data.startswith(NPY),
         lambda file: _of_values(file, _array(file.data, file.where), "NumPy array"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.handeye.data.pairs import Setup
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -39,7 +39,7 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Side:
+class PoseSide:
     """Poses of the robot or of the camera.
 
     ``rotation``, ``translation`` : (m, 3, 3), (m, 3), lengths in ``unit``; ``places`` : place of each pose in its file,
@@ -70,17 +70,17 @@ class Side:
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
-    """Content of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
+class PoseContent:
+    """PoseContent of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
     known, or one side of each role; ``setup`` : setup that the file states, if any; ``passed_over`` : other content of
     the file that is not used."""
 
     form: str
-    sides: tuple[Side, ...]
+    sides: tuple[PoseSide, ...]
     setup: Setup | None = None
     passed_over: tuple[str, ...] = ()
 
-    def of(self, role: Role) -> Side | None:
+    def of(self, role: Role) -> PoseSide | None:
         """Returns the side that is stated to be of this role."""
         return next((side for side in self.sides if side.frames is not None and side.frames.role == role), None)
 

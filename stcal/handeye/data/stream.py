@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import rms_of
+from stcal.handeye.data.pose_pairs import rms_of
 
 LONGEST_S = 0.25
 """Largest distance in time of two samples between which a pose is interpolated."""

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.pairs import Setup
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.record import (
     FRAMES,
-    Content,
     Known,
+    PoseContent,
+    PoseSide,
     Said,
-    Side,
     frames_of,
     of_matrices,
     require_each_once,
@@ -37,7 +37,7 @@ SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to
 ROS = Known("m", "as in ROS", False)
 
 
-def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | None:
+def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
     """Returns the poses in plain values; None where there are none."""
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
@@ -49,7 +49,7 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
         if content is not None:
             return content
         if (side := _side_of(value, where)) is not None:
-            return Content(form, (side,))
+            return PoseContent(form, (side,))
         for key in HOLDERS:
             if isinstance(value.get(key), Mapping | list | np.ndarray):
                 content = read_tree(value[key], form, statements, where)
@@ -63,7 +63,7 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
     if pairs and (content := _of_pairs(value, form, where)) is not None:
         return content
     side = _side_of(value, where)
-    return None if side is None else Content(form, (side,))
+    return None if side is None else PoseContent(form, (side,))
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -113,7 +113,7 @@ def _name_in(value: Mapping) -> str:
     return next((str(v).strip() for v in given if isinstance(v, str | int | float) and not isinstance(v, bool)), "")
 
 
-def _side_of(value: Any, where: str, frames: Known | None = None) -> Side | None:
+def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | None:
     """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping):
@@ -142,10 +142,10 @@ def _side_of(value: Any, where: str, frames: Known | None = None) -> Side | None
     names = names or (named if all(named) else ())
     require_each_once(names, places[: len(names)], where)
     rotation, translation = of_matrices(np.array(matrices), places, where)
-    return Side(rotation, translation, places, "4×4 matrices", None, frames, names)
+    return PoseSide(rotation, translation, places, "4×4 matrices", None, frames, names)
 
 
-def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None:
+def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent | None:
     """Returns easy_handeye's samples, in which the robot's poses are inverted for a camera that stands still."""
     samples, parameters = value.get("samples", value), value.get("parameters")
     if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
@@ -175,10 +175,10 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | Non
         Known("camera_from_board", "as easy_handeye writes it", False),
     )
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
-    return Content("easy_handeye samples", _same_count(sides, where), setup)
+    return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
 
 
-def _of_messages(values: Any, where: str, frames: Known) -> Side:
+def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
     """Returns the poses of a list of ROS's transforms, metres."""
     if not isinstance(values, list) or not values:
         raise InputError(
@@ -198,10 +198,10 @@ def _of_messages(values: Any, where: str, frames: Known) -> Side:
         rows.append(row)
     require_finite(np.array(rows), places, where)
     rotation = of_quaternions(np.array(rows)[:, 3:], places, where)
-    return Side(rotation, np.array(rows)[:, :3], places, "quaternions x, y, z, w by name", ROS, frames)
+    return PoseSide(rotation, np.array(rows)[:, :3], places, "quaternions x, y, z, w by name", ROS, frames)
 
 
-def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
+def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
     """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
     named: dict[str, Known] = {}
@@ -243,10 +243,10 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
         require_each_once(names, sides[0].places, where)
         sides = [replace(side, names=names) for side in sides]
     opencv = any("2" in key for item in parts.values() for key in item)
-    return Content("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
+    return PoseContent("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
-def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> Side:
+def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays = {}
     for key, value in parts.items():
@@ -266,7 +266,7 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> Side:
     places = tuple(f"pose {i}" for i in range(1, count + 1))
     at = at.reshape(count, 3)
     require_finite(at, places, where)
-    return Side(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
+    return PoseSide(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
 
 
 def _flat(value: Any) -> Any:
@@ -274,7 +274,7 @@ def _flat(value: Any) -> Any:
     return value if array is None else array.ravel().tolist()
 
 
-def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> Content | None:
+def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | None:
     """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
     stacks: dict[str, Any] = {}
     for key, entry in value[0].items():
@@ -295,10 +295,10 @@ def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> Content | None
     if content is None:
         return None
     sides = tuple(replace(side, unit=ROS) for side in content.sides) if moveit else content.sides
-    return Content("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
+    return PoseContent("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
 
 
-def _same_count(sides: list[Side], where: str) -> tuple[Side, ...]:
+def _same_count(sides: list[PoseSide], where: str) -> tuple[PoseSide, ...]:
     if len({len(side) for side in sides}) > 1:
         counts = " and ".join(f"{len(side)} of {side.frames.name if side.frames else 'one side'}" for side in sides)
         raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import STALE, HandEyePoses, Loop, Setup, apart
-from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
+from stcal.handeye.data.pose_pairs import STALE, HandEyePoses, Loop, Setup, apart
+from stcal.handeye.judge.observable import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
 from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses

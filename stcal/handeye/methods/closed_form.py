@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.rigid import Poses, Rigid, best_rotations
-from stcal.handeye.data.pairs import Loop, Motions
+from stcal.handeye.data.pose_pairs import Loop, Motions
 from stcal.io.device import quiet_opencv
 
 SUBSETS = 200

@@ -10,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
-from stcal.handeye.data.pairs import Motions
+from stcal.handeye.data.pose_pairs import Motions
 
 MOST = 100_000
 """Largest number of candidates, and of generations."""

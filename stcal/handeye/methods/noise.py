@@ -9,7 +9,7 @@ from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
 from stcal.geometry.variances import component_variances
-from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""

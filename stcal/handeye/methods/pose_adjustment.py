@@ -10,7 +10,7 @@ from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise, perturbed
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01

@@ -15,8 +15,8 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import Loop
-from stcal.handeye.data.views import Views, resect, whitened
+from stcal.handeye.data.corner_views import Views, resect, whitened
+from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
 from stcal.handeye.methods.noise import CAUTION, FARTHEST, UNKNOWNS, Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
@@ -304,7 +304,7 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, pri
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class AdjustedCorners:
     """An adjustment of corners.
 
     ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses,
@@ -360,7 +360,7 @@ def adjust_views(
     with_scale: bool = False,
     camera: CameraPrior | None = None,
     arm: ArmModel | None = None,
-) -> Adjusted:
+) -> AdjustedCorners:
     """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
 
     ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
@@ -414,7 +414,7 @@ def adjust_views(
         wider, unknown = corners.with_intrinsics(*UNKNOWN_LENS), UNKNOWN_LENS[0].shape[1]
         step = wider.problem().at(values | {"camera": Vector(np.zeros((1, unknown)))})
         gain = (float(step.right @ generalised_inverse(step.normal) @ step.right) + step.reduction.gain) / unknown
-    return Adjusted(
+    return AdjustedCorners(
         loop=loop,
         used=used,
         corners=corners,

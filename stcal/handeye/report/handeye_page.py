@@ -4,13 +4,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.choose import Choice
-from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.data.views import Views
+from stcal.handeye.choose import ChosenWay
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, spoken
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import FACTORS
+from stcal.handeye.solving import FACTORS
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
 from stcal.report import document
 from stcal.report.document import (
@@ -174,7 +174,7 @@ def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Bl
     return [table, fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix))]
 
 
-def _tried(choice: Choice | None) -> list[Block]:
+def _tried(choice: ChosenWay | None) -> list[Block]:
     """Returns a table with a row per way of solving that was tried."""
     if choice is None:
         return []

@@ -8,14 +8,14 @@ from scipy.stats import f
 
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import skew
-from stcal.handeye.choose import Choice
-from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.data.views import Views
-from stcal.handeye.judge.mistakes import flipped
-from stcal.handeye.judge.observability import COMMON_MM, in_words
+from stcal.handeye.choose import ChosenWay
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
+from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.judge.conventions import flipped
+from stcal.handeye.judge.observable import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, SizeDoubt, Verdict, Word, spoken
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions
+from stcal.handeye.solving import HandEyeOptions
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 
@@ -65,7 +65,7 @@ class Outcome:
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
-    choice: Choice | None = None
+    choice: ChosenWay | None = None
     pairs: HandEyePoses | None = None
     views: Views | None = None
     understood: tuple[str, ...] = ()
@@ -202,10 +202,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     expected = (1 + unknowns / predicting) / (1 - unknowns / equations)
     dof = equations / 2, (equations - unknowns) / 2
     limits = [fitted * float(np.sqrt(expected * f.ppf(1 - odds, *dof))) for odds in (SUSPICIOUS, FAILED)]
-    word = _word(error, *limits)
-    promise = f"as the residuals of {fitted:.3g} mm promise"
-    if word != GOOD:
-        promise = f"where the residuals of {fitted:.3g} mm promise {fitted * np.sqrt(expected):.3g} mm"
+    word, promised = _word(error, *limits), f"the residuals of {fitted:.3g} mm promise"
+    promise = f"as {promised}" if word == GOOD else f"where {promised} {fitted * np.sqrt(expected):.3g} mm"
     said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
     remedy = "take more poses, and look for poses that do not belong to the others"
     return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
@@ -277,18 +275,18 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     ratio = observability.sigma_mm / COMMON_MM
     word = _word(ratio, AS_ONE, AS_THREE)
     first, second, _ = np.degrees(observability.turns_rad)
+    title, value, limit = "Motions of the flange", f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}"
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
         remedy = (
             f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
             f"robot with four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
         )
-        return Finding("Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", remedy)
+        return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
-    value = f"{ratio:.2f} × σ of a pose"
-    return _graded("Motions of the flange", word, said, value, f"{AS_ONE:g}", observability.missing())
+    return _graded(title, word, said, value, limit, observability.missing())
 
 
 def _of_size(outcome: Outcome) -> Finding | None:
@@ -319,9 +317,7 @@ def _of_outliers(outcome: Outcome) -> Finding:
         said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
     remedies = []
     if flips and outcome.views is None:
-        remedies.append(
-            "solve with --undo-flips, which takes the other tilt, or give images instead of the board's poses"
-        )
+        remedies.append("solve with --undo-flips, which takes the other tilt, or give images, not the board's poses")
     if others:
         which = _few(others) if flips else "these poses"
         remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")

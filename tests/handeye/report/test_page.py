@@ -13,7 +13,7 @@ from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.handeye_file import HandEyeFile
 from stcal.handeye.report.handeye_page import outcome_report
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.solve import FACTORS, handeye
+from stcal.handeye.solving import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text

@@ -7,8 +7,8 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import FRAMES, Setup, rms_of
-from stcal.handeye.judge.observability import Observability
+from stcal.handeye.data.pose_pairs import FRAMES, Setup, rms_of
+from stcal.handeye.judge.observable import Observability
 from stcal.handeye.judge.remarks import Verdict
 from stcal.handeye.methods.reprojection import Reprojection
 
@@ -21,8 +21,7 @@ class HandEye(Brief):
     ----------
     method : name of the method, one of :data:`~stcal.handeye.METHODS`
     setup : ``eye-in-hand`` or ``eye-to-hand``
-    mount_from_camera, stand_from_board : the two unknowns, mm. :mod:`stcal.handeye.data.pairs` defines mount and stand.
-        See :attr:`transforms`.
+    mount_from_camera, stand_from_board : the two unknowns, mm; see :attr:`transforms`
     residuals : (m, 6), deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation
         (mm) at the board's origin, in the axes of the stand
     names : names of the poses

@@ -15,9 +15,9 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.record import FRAMES
-from stcal.handeye.data.views import Views
 from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose

@@ -9,19 +9,19 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.handeye.choose import choose
-from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
-from stcal.handeye.data.views import Views
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import HandEyePoses, LengthUnit, Setup
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions, Problem
+from stcal.handeye.solving import HandEyeOptions, HandEyeProblem
 from stcal.handeye.validate import LEAST_LEFT, refitted, splits
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
 
 def validated(
-    problem: Problem,
+    problem: HandEyeProblem,
     method: str | None,
     rows: np.ndarray,
     prior: CameraPrior | None = None,
@@ -110,7 +110,7 @@ def handeye(
         raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
     else:
         pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)
-    problem = Problem(pairs, asked, views, options or HandEyeOptions())
+    problem = HandEyeProblem(pairs, asked, views, options or HandEyeOptions())
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
     prior = None if views is None else problem.options.camera
     choosing = method is None and not problem.options.names_unknowns

@@ -12,11 +12,12 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import ByValue, require_fields
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
-from stcal.handeye.data.views import Views
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.mistakes import Guess, check_conventions, flipped, repair
-from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
+from stcal.handeye.judge.conventions import Guess, check_conventions, flipped, repair
+from stcal.handeye.judge.observable import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
@@ -24,12 +25,11 @@ from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places, places
-from stcal.handeye.methods.reprojection import CAMERA_GAIN, Adjusted, adjust_views, in_common, of_poses, resected
-from stcal.handeye.result import HandEye
+from stcal.handeye.methods.reprojection import CAMERA_GAIN, AdjustedCorners, adjust_views, in_common, of_poses, resected
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
-S = TypeVar("S", PoseSolution, Adjusted)
+S = TypeVar("S", PoseSolution, AdjustedCorners)
 METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", "pose", "reprojection")
 """Names of all methods."""
 UNIT_MM = 1000.0
@@ -96,7 +96,7 @@ class HandEyeOptions(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class HandEyeProblem:
     """What is solved: ``pairs`` of poses in a ``setup``, the ``views`` from which they were computed, and ``options``;
     ``notes`` : on repairs; ``part`` : whether the poses are a part of others, of which conventions were judged."""
 
@@ -110,12 +110,12 @@ class Problem:
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def __getitem__(self, rows: np.ndarray) -> "Problem":
+    def __getitem__(self, rows: np.ndarray) -> "HandEyeProblem":
         """Returns the problem of these poses alone."""
         views, arm = (None if each is None else each[rows] for each in (self.views, self.options.arm))
         return replace(self, pairs=self.pairs[rows], views=views, options=replace(self.options, arm=arm))
 
-    def without(self, out: np.ndarray) -> "Problem":
+    def without(self, out: np.ndarray) -> "HandEyeProblem":
         """Returns the problem without the poses ``out``, (k,)."""
         return replace(self[np.setdiff1d(np.arange(len(self)), out)], part=True)
 
@@ -124,7 +124,7 @@ class Problem:
         """The poses in the terms of the equation."""
         return Loop.of(self.pairs, self.setup)
 
-    def mended(self) -> "Problem":
+    def mended(self) -> "HandEyeProblem":
         """Returns the problem with the numberings of a symmetric board corrected, and a note on that."""
         if not self.options.symmetries:
             return self
@@ -192,7 +192,7 @@ def handeye(
 ) -> HandEye:
     """Returns the result of one method, with σ estimated from its own residuals. Parameters and errors as for
     :func:`stcal.handeye.handeye`, which chooses a method and widens σ."""
-    return Problem(pairs, setup, views, options or HandEyeOptions()).solved(method).result
+    return HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).solved(method).result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,7 +200,7 @@ class _Task:
     """A ``problem`` after repair, with its ``loop``; ``guess`` : returns first X, Z and scale of a loop and
     ``with_scale``; ``seen`` : observability."""
 
-    problem: Problem
+    problem: HandEyeProblem
     loop: Loop
     guess: Guess
     seen: Observability
@@ -212,7 +212,7 @@ class Solved:
 
     task: _Task
     result: HandEye
-    solution: PoseSolution | Adjusted | None = None
+    solution: PoseSolution | AdjustedCorners | None = None
 
     def without(self, out: np.ndarray) -> HandEye:
         """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
@@ -223,7 +223,7 @@ class Solved:
             again = _by_equations(replace(task, problem=problem, loop=problem.loop), self.result.method)
             x, z = again.mount_from_camera, again.stand_from_board
             return replace(self.result, mount_from_camera=x, stand_from_board=z)
-        if isinstance(solution, Adjusted):
+        if isinstance(solution, AdjustedCorners):
             state = solution.without(out)
             board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
         else:
@@ -268,27 +268,24 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if method == "de":
             notes = (*notes, Aside(evolution.in_words(unit_mm)))
         z = closed_form.mean_pose(loop.chain(x))
-    return _result(task, method, x, z, task.loop.residuals(x, z), np.zeros(len(pairs), bool), notes)
+    return _result(task, method, (x, z), task.loop.residuals(x, z), np.zeros(len(pairs), bool), notes)
 
 
 def _result(
     task: _Task,
     method: str,
-    x: Rigid,
-    z: Rigid,
+    found: tuple[Rigid, Rigid],
     residuals: np.ndarray,
     outliers: np.ndarray,
     notes: tuple[str, ...],
-    covariance: np.ndarray | None = None,
     **more: Any,
 ) -> HandEye:
-    """Returns the result; ``covariance`` : (12, 12) or more, of X and Z first; ``more`` : further fields."""
+    """Returns the result of X and Z ``found``; ``more`` : further fields, with their covariance (12, 12) or more."""
+    covariance, names = more.pop("covariance", None), task.problem.pairs.names
     if covariance is not None:
         more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
-    names, seen = task.problem.pairs.names, task.seen
-    return HandEye(
-        method, task.problem.setup, x, z, residuals, names, outliers, observability=seen, notes=notes, **more
-    )
+    more |= {"observability": task.seen, "notes": notes}
+    return HandEye(method, task.problem.setup, *found, residuals, names, outliers, **more)
 
 
 def _by_poses(task: _Task) -> Solved:
@@ -324,29 +321,23 @@ def _by_poses(task: _Task) -> Solved:
         error = of_poses(loop, solution, problem.views, options.camera)
         covariance = covariance + error.covariance(inverse) - inverse
     stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-    result = _result(
-        task,
-        "pose",
-        x,
-        z,
-        solution.residuals,
-        solution.outliers,
-        notes if solution.settled else (*notes, UNSETTLED),
-        covariance,
-        scale=state.scale,
-        sigma_scale=sigma_scale,
-        sigma={name: value for name, value in stated.items() if value} | solution.sigma,
-        estimated=tuple(solution.sigma),
-        common_covariance=common,
-    )
-    return Solved(task, result, solution)
+    more = {
+        "covariance": covariance,
+        "scale": state.scale,
+        "sigma_scale": sigma_scale,
+        "sigma": {name: value for name, value in stated.items() if value} | solution.sigma,
+        "estimated": tuple(solution.sigma),
+        "common_covariance": common,
+    }
+    notes = notes if solution.settled else (*notes, UNSETTLED)
+    return Solved(task, _result(task, "pose", (x, z), solution.residuals, solution.outliers, notes, **more), solution)
 
 
 def _by_views(task: _Task, views: Views) -> Solved:
     problem, options, pairs = task.problem, task.problem.options, task.problem.pairs
     first, scaled = task.guess(task.loop, options.with_scale), options.with_scale
 
-    def adjusted_by(loop: Loop, noise: Noise) -> Adjusted:
+    def adjusted_by(loop: Loop, noise: Noise) -> AdjustedCorners:
         flange, intrinsics = pairs.base_from_flange, options.intrinsics
         return adjust_views(loop, flange, views, first, noise, intrinsics, scaled, options.camera, options.arm)
 
@@ -379,22 +370,16 @@ def _by_views(task: _Task, views: Views) -> Solved:
     if doubted:
         which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
         notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-    result = _result(
-        task,
-        "reprojection",
-        x,
-        z,
-        residuals,
-        outliers,
-        notes if solution.settled else (*notes, UNSETTLED),
-        covariance,
-        scale=state.scale,
-        sigma_scale=sigma_scale,
-        sigma=solution.sigma,
-        estimated=solution.estimated,
-        reprojection=solution.found,
-    )
-    return Solved(task, result, solution)
+    more = {
+        "covariance": covariance,
+        "scale": state.scale,
+        "sigma_scale": sigma_scale,
+        "sigma": solution.sigma,
+        "estimated": solution.estimated,
+        "reprojection": solution.found,
+    }
+    notes = notes if solution.settled else (*notes, UNSETTLED)
+    return Solved(task, _result(task, "reprojection", (x, z), residuals, outliers, notes, **more), solution)
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:

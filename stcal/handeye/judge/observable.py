@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import freeze
-from stcal.handeye.data.pairs import FRAMES, Loop, Setup
+from stcal.handeye.data.pose_pairs import FRAMES, Loop, Setup
 from stcal.io.table import LENGTHS, UNIT_WORDS
 
 UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}

@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pose_pairs import HandEyePoses
 
 LEAST_CORNERS = 4
 SAME_COSINE, APART = 1 - 1e-9, 0.02
