@@ -84,6 +84,7 @@ class PoseFiles:
 POSE_FILES = PoseFiles()
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
+SIGMA, MANY = Opt(min=0), Opt(min=1, max=100_000)
 
 
 def handeye(
@@ -95,47 +96,30 @@ def handeye(
         "in their files and solved for; the one that predicts held-out poses best is used.",
     ] = None,
     sigma_robot_mm: Annotated[
-        float | None, "Set σ of the flange's position, mm; needs --sigma-robot-deg.", Opt(min=0)
+        float | None, "Set σ of the flange's position, mm; with --sigma-robot-deg.", SIGMA
     ] = None,
-    sigma_robot_deg: Annotated[
-        float | None, "Set σ of the flange's rotation; estimated if not given.", Opt(min=0)
-    ] = None,
-    sigma_camera_mm: Annotated[
-        float | None, "Set σ of the board's position, mm; needs --sigma-camera-deg.", Opt(min=0)
-    ] = None,
-    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", Opt(min=0)] = None,
-    sigma_px: Annotated[
-        float | None, "Set the σ of a corner, px; for dots and tags, as a factor of their own σ.", Opt(min=1e-9)
-    ] = None,
-    sigma_board_mm: Annotated[
-        float | None, "Set the σ of a corner's position on the board, mm; 0 if exact.", Opt(min=0)
-    ] = None,
-    refine_camera: Annotated[
-        bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
-    ] = False,
+    sigma_robot_deg: Annotated[float | None, "Set σ of the flange's rotation; estimated if not given.", SIGMA] = None,
+    sigma_camera_mm: Annotated[float | None, "Set σ of the board's position; with --sigma-camera-deg.", SIGMA] = None,
+    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", SIGMA] = None,
+    sigma_px: Annotated[float | None, "Set σ of a corner, px; of dots and tags, a factor.", Opt(min=1e-9)] = None,
+    sigma_board_mm: Annotated[float | None, "Set σ of a corner's position on the board; 0 if exact.", SIGMA] = None,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones and weighted by their σ."] = False,
     with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     with_kinematics: Annotated[
         Path | None,
-        "Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
-        "columns q1_deg … of --poses.",
+        "Adjust this robot (TOML) and the intrinsics too, from images and joint values: columns q1_deg … of --poses.",
     ] = None,
-    robot_out: Annotated[
-        Path | None, "Write the robot of --with-kinematics to this file, as adjusted (TOML).", WRITES
-    ] = None,
+    robot_out: Annotated[Path | None, "Write the adjusted robot of --with-kinematics to this file.", WRITES] = None,
     undo_flips: Annotated[
         bool,
         "Replace a pose of a flat target by its second solution, tilted the other way, if only that one agrees with "
         "the other poses; not with images.",
     ] = False,
     four_dof: Annotated[bool, "Solve only for what a flange determines that turns about one axis (SCARA)."] = False,
-    held_out: Annotated[
-        int | None, "Hold out this many poses in each split; a quarter of them if not given.", Opt(min=1, max=100_000)
-    ] = None,
+    held_out: Annotated[int | None, "Hold out this many poses in each split; a quarter if not given.", MANY] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
     seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
-    time_offset: Annotated[
-        bool, "Find the offset between the clocks of robot and camera from poses with times, and apply it."
-    ] = False,
+    time_offset: Annotated[bool, "Find the offset between the clocks of robot and camera, and apply it."] = False,
     image_times: Annotated[
         Path | None, "Read the times of the images from this file: image, time_s (CSV); if not given, from their names."
     ] = None,
@@ -143,10 +127,7 @@ def handeye(
         float, "Take the robot's nearest pose within this time, s, if none can be interpolated.", Opt(min=0, max=3600)
     ] = 0.02,
     motions_held_out: Annotated[
-        int | None,
-        "Hold out this many motions at the end, and predict them from the motions before, as the paper on "
-        "differential evolution does with 6 of 24.",
-        Opt(min=1, max=100_000),
+        int | None, "Hold out this many motions at the end, and predict them from the motions before.", MANY
     ] = None,
     out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
     ros: Annotated[Path | None, "Write a static transform of ROS to this file (YAML, metres).", WRITES] = None,
@@ -154,20 +135,16 @@ def handeye(
     opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        "Write the transform to this file; repeat it for more files. Forms: ros2, moveit, moveit2, easy-handeye, "
-        "easy-handeye2.",
+        "Write the transform to this file; may be repeated. Forms: ros2, moveit, moveit2, easy-handeye, easy-handeye2.",
         Opt(metavar="FORM=FILE"),
     ] = None,
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
     child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
         Literal["optical", "link"],
-        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical frame "
-        "below it.",
+        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with that frame below it.",
     ] = "optical",
-    camera_out: Annotated[
-        Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
-    ] = None,
+    camera_out: Annotated[Path | None, "Write the adjusted camera with σ to this file (cameras.txt).", WRITES] = None,
     de_bounds_deg: Annotated[
         str | None,
         "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
@@ -259,9 +236,8 @@ def handeye(
         inputs = given.read(files.workers, progress)
         for line in inputs.understood:
             say(line)
-        options = HandEyeOptions(
-            noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolved
-        )
+        prior = inputs.prior if refine_camera else None
+        options = HandEyeOptions(noise, prior, with_scale, inputs.symmetries, four_dof, evolved)
         if undo_flips:
             inputs, undone = without_flips(inputs, options)
             say(undone)
@@ -301,10 +277,8 @@ def handeye(
     write_if(report, document.page)
     if camera_out:
         if (adjusted := result.reprojection) is None:
-            method = result.method
-            raise InputError(
-                "E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out"
-            )
+            by = result.method
+            raise InputError("E-OPTION-METHOD", f"--camera-out: {by} does not adjust the camera; leave --method out")
         camera_out.parent.mkdir(parents=True, exist_ok=True)
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")

@@ -1,10 +1,10 @@
-from .handeye_pipeline import handeye as handeye
 from .data.corner_views import View as View
 from .data.corner_views import Views as Views
 from .data.corner_views import pairs_of_views as pairs_of_views
 from .data.pose_pairs import SETUPS as SETUPS
 from .data.pose_pairs import HandEyePoses as HandEyePoses
 from .data.pose_pairs import read_poses as read_poses
+from .handeye_pipeline import handeye as handeye
 from .handeye_result import HandEye as HandEye
 from .judge.remarks import Finding as Finding
 from .judge.remarks import Verdict as Verdict

@@ -115,16 +115,11 @@ class Tried:
 class ChosenWay:
     """The candidates that were tried, and the one that was chosen.
 
-    Parameters
-    ----------
-    tried : all candidates, those that trust the files first
-    chosen : the candidate that was chosen
-    result : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more
-        than the σ allow.
-    held_out : errors of the choice as a whole: in each split, of the candidate that the errors on all other poses
-        choose
-    sentence : the choice, what it gains, and what it says about camera file, board and robot
-    notes : notes on answers that contradict each other
+    ``tried`` : all candidates, those that trust the files first; ``chosen`` : the candidate that was chosen; ``result``
+    : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more than the
+    σ allow; ``held_out`` : errors of the choice as a whole: in each split, of the candidate that the errors on all
+    other poses choose; ``sentence`` : the choice, what it gains, and what it says about camera file, board and robot;
+    ``notes`` : notes on answers that contradict each other.
     """
 
     tried: tuple[Tried, ...]
@@ -241,9 +236,8 @@ def choose(
     held_out = HeldOutPoses.of_splits(rows, errors)
     every = ((candidate, finished[candidate]) for candidate in candidates)
     tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in every)
-    rivals = [
-        each for each in able if each is not chosen and not each.closed and _behind(each, chosen, rows) <= AS_GOOD
-    ]
+    others = (each for each in able if each is not chosen and not each.closed)
+    rivals = [each for each in others if _behind(each, chosen, rows) <= AS_GOOD]
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in chosen.partial])
     result = replace(held_out, mount_from_camera=of_splits).widened(result)

@@ -79,10 +79,8 @@ class HandEye(Brief):
         ``sentence()`` adds the reasons, ``remedies()`` what to do. Raises InputError if nobody judged the result.
         """
         if self.judgement is None:
-            raise InputError(
-                "E-HANDEYE-NOT-JUDGED",
-                f"hand-eye: the solution of {self.method} alone has no verdict; handeye.handeye judges what it returns",
-            )
+            said = f"hand-eye: the solution of {self.method} alone has no verdict"
+            raise InputError("E-HANDEYE-NOT-JUDGED", f"{said}; handeye.handeye judges what it returns")
         return self.judgement
 
     @property
@@ -103,10 +101,8 @@ class HandEye(Brief):
 
     def _named(self, name: str) -> Rigid:
         if name not in self.transforms:
-            raise InputError(
-                "E-HANDEYE-NO-TRANSFORM",
-                f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}",
-            )
+            said = f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}"
+            raise InputError("E-HANDEYE-NO-TRANSFORM", said)
         return self.transforms[name]
 
     def widened(self, factor: float) -> "HandEye":

@@ -119,11 +119,8 @@ def plan_poses(
         able = (batch if reachable is None else batch[reachable(flange[batch])] for batch in batches)
         row = next((int(batch[0]) for batch in able if len(batch)), None)
         if row is None:
-            raise InputError(
-                "E-PLAN-OUT-OF-REACH",
-                f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, "
-                "board and setup",
-            )
+            said = f"plan: none of {len(flange)} views of the whole board is in the robot's reach"
+            raise InputError("E-PLAN-OUT-OF-REACH", f"{said}; check robot file, board and setup")
         normal = normals[row]
         sigma.append(float(sigma_after[row]))
         flanges.append(flange[row])
@@ -228,9 +225,7 @@ class HandEyePlanFile(ResultFile):
     base_from_flange: list[Pose] = Field(description="poses to take, in order")
     camera_from_board: list[Pose] = Field(description="how the board is seen there")
     turn_rad: Vector = Field(description="of each pose against the nearest pose taken")
-    joints: dict[str, Vector] = Field(
-        description="values of the poses by column, deg or mm; empty without a robot file"
-    )
+    joints: dict[str, Vector] = Field(description="values of the poses by column, deg or mm; empty without a robot")
 
 
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:

@@ -145,21 +145,15 @@ class HandEyeProblem:
             choices = ", ".join(METHODS)
             raise InputError("E-OPTION-METHOD", f"hand-eye: method {method!r} is unknown; one of {choices} needed")
         if method == "reprojection" and (self.views is None or len(self.views) != len(pairs)):
-            raise InputError(
-                "E-HANDEYE-NEEDS-VIEWS",
-                "hand-eye: reprojection needs the corners of every pose; give views, or use method pose",
-            )
+            said = "hand-eye: reprojection needs the corners of every pose; give views, or use method pose"
+            raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
         if options.arm is not None and method != "reprojection":
-            raise InputError(
-                "E-HANDEYE-NEEDS-VIEWS",
-                f"hand-eye: {method} does not solve for the arm; give views, and method reprojection",
-            )
+            said = f"hand-eye: {method} does not solve for the arm; give views, and method reprojection"
+            raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
         seen = self.require_observable()
         if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
-            raise DegenerateError(
-                "E-HANDEYE-FEW-POSES",
-                f"{pairs.where}: {len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more",
-            )
+            said = f"{len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
+            raise DegenerateError("E-HANDEYE-FEW-POSES", f"{pairs.where}: {said}")
         problem = self.mended()
         if options.arm is None:
             problem.pairs.require_moving_flange()
@@ -238,9 +232,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     """Solves AX = XB or AX = ZB by the named method."""
     options, pairs, loop, notes = task.problem.options, task.problem.pairs, task.loop, task.problem.notes
     if options.four_dof:
-        raise DegenerateError(
-            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with --four-dof use method pose"
-        )
+        raise DegenerateError("E-HANDEYE-AXES", f"hand-eye: {method} needs turns about two axes; of four axes use pose")
     noise, evolution = options.noise, options.evolution
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
     if method in AX_XB and not (used := poses_with_log(loop)).all():
@@ -363,9 +355,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
                 sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
     if solution.camera_gain > CAMERA_GAIN:
-        notes += (
-            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera again",
-        )
+        notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
     doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
     if doubted:
         which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())

@@ -95,9 +95,7 @@ def estimate_offset(
     """
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
-        raise InputError(
-            "E-TIME-OFFSET-FEW", f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more"
-        )
+        raise InputError("E-TIME-OFFSET-FEW", f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for an offset")
     if (within := _inside(stream, seconds)).any():  # at rest the noise of the samples would pass for motion
         noises, moved = stream.rest(), stream.travel(seconds[within], WINDOW_S)
         if not any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noises, moved, strict=True)):
@@ -113,10 +111,8 @@ def estimate_offset(
     for _ in range(ROUNDS):
         within = _inside(stream, seconds + offset)
         if within.sum() < LEAST_POSES:
-            raise InputError(
-                "E-TIME-OFFSET-RANGE",
-                f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more",
-            )
+            said = f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more"
+            raise InputError("E-TIME-OFFSET-RANGE", said)
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
         state = state or LoopState(*closed_form.robust(loop, with_scale))
@@ -145,10 +141,8 @@ def estimate_offset(
             slope = inverse[:UNKNOWNS, count] / inverse[count, count]
             at = stream.at(seconds[within] + offset)
             return TimeOffset(offset, sigma, slope, within, at, turn, travel)
-    raise ConvergenceError(
-        "E-TIME-OFFSET-UNSETTLED",
-        f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses",
-    )
+    said = f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s"
+    raise ConvergenceError("E-TIME-OFFSET-UNSETTLED", f"{said}; check times and poses")
 
 
 def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:

@@ -162,10 +162,8 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
         raise InputError("E-OPTION-RANGE", f"cross-validation: held_out {held_out}: 1 or more needed")
     k = max(1, count // 4) if held_out is None else held_out
     if count - k < LEAST_LEFT:
-        raise InputError(
-            "E-HELD-OUT-FEW",
-            f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses",
-        )
+        said = f"{k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more"
+        raise InputError("E-HELD-OUT-FEW", f"cross-validation: {said}")
     return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
 
@@ -239,12 +237,8 @@ def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) ->
     if views is None:
         return predicted(result, pairs, None)["translation_mm"]
     camera, adjusted_views = as_adjusted(result, views)
-    return np.array(
-        [
-            _beside(view, camera, pose)
-            for view, pose in zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
-        ]
-    )
+    poses = zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
+    return np.array([_beside(view, camera, pose) for view, pose in poses])
 
 
 def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
@@ -383,13 +377,8 @@ def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:
         for step in np.moveaxis(common, 2, 0)
     )
     mount, stand = (m.T @ m for m in _differences([each.solved(result.method).result for each in erring], result))
-    return replace(
-        result,
-        covariance=result.covariance + mount,
-        stand_covariance=result.stand_covariance + stand,
-        common_covariance=mount,
-        notes=(*result.notes, IN_COMMON),
-    )
+    wider = {"covariance": result.covariance + mount, "stand_covariance": result.stand_covariance + stand}
+    return replace(result, **wider, common_covariance=mount, notes=(*result.notes, IN_COMMON))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -454,11 +443,8 @@ def predict_motions(
     """
     remaining, most = len(pairs) - count, max(len(pairs) - LEAST_LEFT, 0)
     if not 1 <= count <= most:
-        raise InputError(
-            "E-OPTION-RANGE",
-            f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {most} can be held out; give "
-            "another number, or more poses",
-        )
+        said = f"of {max(len(pairs) - 1, 0)} motions, 1 to {most} can be held out; give another number, or more poses"
+        raise InputError("E-OPTION-RANGE", f"--motions-held-out {count}: {said}")
     problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions())
     result = problem[np.arange(remaining)].solved(method).result
     errors = motion_errors(result.mount_from_camera, Motions.consecutive(problem.loop)[remaining - 1 :])

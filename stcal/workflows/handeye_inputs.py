@@ -199,13 +199,9 @@ class Files:
             return HandEyeInput(source.name, pairs, setup=statements.setup)
         where, stated = told.pairs.where, statements.setup
         if stated and told.setup and stated != told.setup:
-            raise InputError(
-                "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
-            )
-        setup, left_out = stated or told.setup, told.left_out
-        return HandEyeInput(
-            where, told.pairs, left_out=left_out, understood=told.understood, setup=setup, timed=told.timed
-        )
+            raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")
+        more = {"left_out": told.left_out, "understood": told.understood, "timed": told.timed}
+        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **more)
 
     def _of_images(self) -> dict[str, Path | None]:
         """Returns the options of images, by name."""
@@ -234,9 +230,7 @@ class Files:
             ),
         ):
             if of_file and not source.exists() and self.robot is None:
-                raise InputError(
-                    "E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed"
-                )
+                raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
             if refused:
                 raise InputError("E-OPTION-NEEDS", message)
 
@@ -313,11 +307,8 @@ class _Photographs:
         names = [image.name for image in images if image.name not in late]
         row_of, missing, matching = robot.pairing(names)
         if not row_of:
-            raise InputError(
-                "E-POSES-UNMATCHED",
-                f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here; "
-                "correct them",
-            )
+            said = f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here"
+            raise InputError("E-POSES-UNMATCHED", f"{said}; correct them")
         left_out = [(each.name, each.reason) for each in skipped]
         left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
@@ -341,11 +332,8 @@ class _Photographs:
         detections = detect_boards(with_pose, self.model, self.design, (), workers, partial(progress, "board"))
         without_board = [(each.name, each.reason) for each in detections.skipped]
         if not (found := detections.views()):
-            raise InputError(
-                "E-IMAGES-NO-BOARD",
-                f"image folder {self.folder}: the board is in none of {len(with_pose)} images: "
-                f"{': '.join(without_board[0])}",
-            )
+            said = f"image folder {self.folder}: the board is in none of {len(with_pose)} images"
+            raise InputError("E-IMAGES-NO-BOARD", f"{said}: {': '.join(without_board[0])}")
         camera, rows = detections.camera, np.array([self.row_of[name] for name in found])
         views = Views(camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values()))
         pairs = pairs_of_views(self.robot.base_from_flange[rows], views, tuple(found), str(self.folder))
@@ -389,9 +377,7 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
     """
     problem = given.problem(options or HandEyeOptions())
     if given.views is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--undo-flips: only with poses; with images, the corners decide the tilt; leave it out"
-        )
+        raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
     undone = np.zeros(len(problem), bool)
     for _ in range(MOST_ROUNDS):
         result, pairs = problem.solved("pose").result, problem.pairs

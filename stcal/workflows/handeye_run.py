@@ -14,9 +14,9 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.handeye_pipeline import validated
 from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
+from stcal.handeye.handeye_pipeline import validated
 from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.report.outcome import ArmFound, Outcome
@@ -106,9 +106,8 @@ def calibrate_handeye(
         if motions is not None:
             last = predict_motions(pairs, problem.setup, result.method, given.views, problem.options, motions)
         kept = {name: getattr(given, name) for name in ("where", "pitch_mm", "left_out", "understood")}
-        outcome = replace(
-            outcome, result=result, notes=notes, motions=last, pairs=mended.pairs, views=mended.views, **kept
-        )
+        kept |= {"pairs": mended.pairs, "views": mended.views}
+        outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
         if given.arm is not None:
             outcome = with_arm(outcome, given.arm, mended, given.prior, rows, workers, partial(told, "with the arm"))
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
@@ -196,10 +195,8 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
             "the images (their names, or --image-times)",
         )
     if options.four_dof:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out",
-        )
+        said = "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out"
+        raise InputError("E-OPTION-CONFLICT", said)
     problem = given.problem(options).mended()
     pairs, views, noise = problem.pairs, problem.views, options.noise
     offset = estimate_offset(pairs, timed.stream, timed.seconds, problem.setup, noise, options.with_scale)
@@ -351,10 +348,7 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
     message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
-        raise InputError(
-            "E-PLAN-ROBOT",
-            f"{message}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
-            "poses are",
-        )
+        remedy = "give the robot's own file, in whose base and flange (no tool) the poses are"
+        raise InputError("E-PLAN-ROBOT", f"{message}, first not {beyond[0]}; {remedy}")
     notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes

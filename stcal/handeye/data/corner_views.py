@@ -126,10 +126,8 @@ def pairs_of_views(
     it.
     """
     if len(views) != len(base_from_flange):
-        raise InputError(
-            "E-POSES-COUNT",
-            f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed",
-        )
+        counts = f"{len(base_from_flange)} poses of the flange and {len(views)} views"
+        raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")
     names = names or tuple(f"pose {i}" for i in range(1, len(views) + 1))
     camera_from_board, covariance = resect(views, names)
     return HandEyePoses(base_from_flange, camera_from_board, None, covariance, names, where)
@@ -147,9 +145,7 @@ def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.n
 
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
-        raise DegenerateError(
-            "E-VIEW-CORNERS", f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out"
-        )
+        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {len(view)} corners, {LEAST_CORNERS} needed; take it out")
     starts, seen = [], camera.normalised_from_pixel(view.xy_px)
     for rows, board_from_plane in _planes(view):
         xyz = board_from_plane.inverse() @ view.xyz_board[rows]

@@ -90,9 +90,7 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
     if len(content.sides) == 1:
         frames = content.sides[0].frames
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
-        raise InputError(
-            "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
-        )
+        raise InputError("E-POSES-MIXED", f"{path}: {content.form} with {held}; give robot's as --a, camera's as --b")
     robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         raise InputError(
@@ -135,9 +133,7 @@ def read_two(
     times, wanted = (stamps_of(side.names) if side.names else None for side in sides)
     if timed and (times is None or wanted is None):
         untimed = (robot if times is None else camera).where
-        raise InputError(
-            "E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both files need them"
-        )
+        raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
         return _by_time(robot, camera, times, wanted, setup, where, tolerance_s)
     rows, how = matched(robot, camera, key)
@@ -208,10 +204,8 @@ def _by_time(
     seconds = stream.after_origin(wanted)
     taken = taken_at(stream, seconds, tolerance_s)
     if not taken.kept.any():
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
-        )
+        first = f"{camera.names[0]}, {taken.why[0]}"
+        raise InputError("E-POSES-UNMATCHED", f"{camera.where}: no pose has one of the robot: first {first}")
     rows, lines = np.flatnonzero(taken.kept), (taken.said,)
     if robot.covariance is not None:
         lines += ("covariances of the robot's poses are not used: they are of other times",)
@@ -233,7 +227,7 @@ def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> P
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
         raise InputError(
-            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible"
+            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: length {measured:.3g}, at most {FARTHEST:g}"
         )
     frames = _direction(side, role, path, statements)
     factor, unit, guessed = _unit(side, frames.name, path, statements)
@@ -301,18 +295,12 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
     if not robot.names and not camera.names:
         if len(robot) == len(camera):
             return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
-        raise InputError(
-            "E-POSES-COUNT",
-            f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
-            "of each, or names, needed",
-        )
+        counts = f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times"
+        raise InputError("E-POSES-COUNT", f"{counts}; as many of each, or names, needed")
     if not robot.names or not camera.names:
         without, other = (robot, camera) if not robot.names else (camera, robot)
-        raise InputError(
-            "E-POSES-UNNAMED",
-            f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …; name both, like "
-            f"with a column {key}",
-        )
+        said = f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …"
+        raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column {key}")
     rows = partners(robot.names, camera.names)
     if rows is None:
         raise InputError(

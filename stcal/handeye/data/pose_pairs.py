@@ -53,10 +53,8 @@ class HandEyePoses(Brief):
         require_fields(self, "poses")
         m = len(self.base_from_flange)
         if len(self.camera_from_board) != m:
-            raise InputError(
-                "E-POSES-COUNT",
-                f"{self.where}: {m} poses of the flange and {len(self.camera_from_board)} of the board; pairs needed",
-            )
+            counts = f"{m} poses of the flange and {len(self.camera_from_board)} of the board"
+            raise InputError("E-POSES-COUNT", f"{self.where}: {counts}; pairs needed")
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
                 freeze(self, name, (m, 6, 6), name)
@@ -125,9 +123,8 @@ class HandEyePoses(Brief):
             moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
             turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
             if moved == 0 and turned < 1e-12:
-                more, out = (
-                    (f", and {len(copies) - 1} more pairs", "one of each") if copies[1:] else ("", "one of them")
-                )
+                more = f", and {len(copies) - 1} more pairs" if len(copies) > 1 else ""
+                out = "one of each" if more else "one of them"
                 raise InputError("E-POSES-IDENTICAL", f"{pair}{more} are identical poses; take {out} out")
             raise InputError(
                 "E-POSES-IDENTICAL",
@@ -216,10 +213,8 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
-        raise InputError(
-            "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: {fault}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
-        )
+        needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
+        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}")
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
     common = table.common_errors(covariance, names[0] + "_")
     return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
@@ -230,11 +225,8 @@ def inverted(
 ) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
     """Returns the inverses of poses, with their covariances (m, 6, 6) and common errors (m, 6, k), where known."""
     carried = inverse_jacobian(poses)
-    return (
-        poses.inverse(),
-        None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
-        None if common is None else carried @ common,
-    )
+    covariance = None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2)
+    return poses.inverse(), covariance, None if common is None else carried @ common
 
 
 def inverse_jacobian(poses: Poses) -> np.ndarray:

@@ -54,9 +54,7 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None
     roles = [side.frames.role for side in sides if side.frames is not None]
     if len(set(roles)) < len(roles):
         both = ", ".join(side.frames.name for side in sides if side.frames is not None)
-        raise InputError(
-            "E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed, take the others out"
-        )
+        raise InputError("E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed; drop the others")
     return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
 
@@ -97,10 +95,8 @@ def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
                 values = np.column_stack([table.numbers(column) for column in present])
                 return values, Known(unit, "by the columns") if unit else None
             if present and unit and form == "{}":
-                raise InputError(
-                    "E-TABLE-COLUMN-MISSING",
-                    f"{table.where}: {', '.join(present)} alone; x, y and z in one unit needed",
-                )
+                alone = f"{table.where}: {', '.join(present)} alone"
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
     return None
 
 
@@ -171,10 +167,8 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
         return None
     content = next(reader(file) for is_of, reader in FORMATS if is_of(file))
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out",
-        )
+        said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
+        raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
     return content
 
 
@@ -197,9 +191,7 @@ def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: i
         row = of_line(line)
         if row is None or len(row) != count:
             held = "no numbers" if row is None else f"{len(row)} numbers"
-            raise InputError(
-                "E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first line needed; correct it"
-            )
+            raise InputError("E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first one needed")
         values.append(row)
     places = tuple(f"line {number}" for number, _ in file.lines)
     require_finite(np.array(values), places, file.where)
@@ -270,10 +262,8 @@ def _of_values(file: File, value: Any, form: str) -> PoseContent:
 
 def _of_yaml(file: File) -> PoseContent:
     if len(file.text.encode("utf-8")) > SETTINGS_BYTES:
-        raise InputError(
-            "E-FILE-TOO-LARGE",
-            f"{file.where}: {len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read",
-        )
+        sizes = f"{len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
+        raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
     try:
         documents = [each for each in load_documents(file.text) if each is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -294,10 +284,8 @@ def _of_npz(file: File) -> PoseContent:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
             size = sum(member.file_size for member in members)
             if size > TABLE_BYTES:
-                raise InputError(
-                    "E-FILE-TOO-LARGE",
-                    f"{file.where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read",
-                )
+                sizes = f"{size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
+                raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
             for member in members:
                 name, content = member.filename.removesuffix(".npy"), archive.read(member)
                 try:
@@ -323,15 +311,11 @@ def _array(data: bytes, where: str) -> np.ndarray | list[str]:
     except DAMAGED as error:
         raise _damaged(where, error) from error
     if stream.tell() != len(data):
-        raise InputError(
-            "E-NUMPY-UNREADABLE", f"{where}: {len(data) - stream.tell()} bytes behind its array; save it again"
-        )
+        raise InputError("E-NUMPY-UNREADABLE", f"{where}: {len(data) - stream.tell()} bytes after its array; save anew")
     if array.dtype.kind == "U":
         return [str(text) for text in array.ravel()]
     if array.dtype.kind not in "iuf" or not array.ndim or not array.size:
-        raise InputError(
-            "E-NUMPY-CONTENT", f"{where}: an array of {array.dtype}, shape {array.shape}; poses as numbers needed"
-        )
+        raise InputError("E-NUMPY-CONTENT", f"{where}: array of {array.dtype}, shape {array.shape}; numbers needed")
     return np.array(array, dtype=float)
 
 

@@ -137,9 +137,7 @@ class Said:
             if unit and unit not in LENGTHS:
                 raise InputError("E-OPTION-VALUE", f"--length-unit {unit}: unknown; {', '.join(LENGTHS)} needed")
         if len({Known(name, "").role for name in self.frames}) < len(self.frames):
-            raise InputError(
-                "E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each of robot and camera at most"
-            )
+            raise InputError("E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each side at most")
 
     def frames_of(self, role: Role) -> str | None:
         """Returns the transform that poses of this role are stated to be; None where it is not stated."""
@@ -154,9 +152,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
         i = bad[0]
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""
         row = " ".join(f"{v:g}" for v in matrices[i, 3])
-        raise InputError(
-            "E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; correct it"
-        )
+        raise InputError("E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; mend it")
     return proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3]
 
 
@@ -165,9 +161,7 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError(
-                "E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed"
-            )
+            raise InputError("E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both {kind}{name!r}; one needed")
         first[name] = place
 
 

@@ -56,16 +56,12 @@ class Stream:
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
         """Returns the stream of samples that may be in any order."""
         if len(times) < 2:
-            raise InputError(
-                "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"
-            )
+            raise InputError("E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the stream")
         order = sorted(range(len(times)), key=times.__getitem__)
         origin = times[order[0]]
         seconds = np.array([float(times[i] - origin) for i in order])
         if len(same := np.flatnonzero(np.diff(seconds) < SAME_S)):
-            raise InputError(
-                "E-TIMES-REPEATED", f"{where}: two samples of the time {times[order[same[0]]]}; take one of them out"
-            )
+            raise InputError("E-TIMES-REPEATED", f"{where}: two samples of time {times[order[same[0]]]}; take one out")
         return cls(seconds, poses[order], origin, where)
 
     def after_origin(self, times: Sequence[Decimal]) -> np.ndarray:

@@ -41,10 +41,8 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
     """Returns the poses in plain values; None where there are none."""
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
-            raise InputError(
-                "E-POSES-NOT-FOUND",
-                f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
-            )
+            said = "the result of an easy_handeye calibration; give its samples, NAME.samples"
+            raise InputError("E-POSES-NOT-FOUND", f"{where}: {said}")
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
         if content is not None:
             return content
@@ -135,9 +133,7 @@ def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | 
         return None
     bad = [place for place, each in zip(places, found, strict=True) if each is None]
     if bad:
-        raise InputError(
-            "E-POSE-VALUE", f"{where}: {bad[0]}: not a 4×4 matrix like the one before it; correct it, or take it out"
-        )
+        raise InputError("E-POSE-VALUE", f"{where}: {bad[0]}: not a 4×4 matrix like the one before; take it out")
     matrices, named = zip(*filter(None, found), strict=True)
     names = names or (named if all(named) else ())
     require_each_once(names, places[: len(names)], where)
@@ -157,9 +153,7 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
             return None
         for i, sample in enumerate(samples, 1):
             if "robot" not in sample or camera_key not in sample:
-                raise InputError(
-                    "E-POSE-INCOMPLETE", f"{where}: sample {i}: robot and {camera_key} needed; take it out"
-                )
+                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: robot, {camera_key} needed; take it out")
         lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
     else:
         return None
@@ -170,10 +164,8 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
             setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
     fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
-    frames = (
-        Known(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
-        Known("camera_from_board", "as easy_handeye writes it", False),
-    )
+    by = "as easy_handeye writes it"
+    frames = Known(FRAMES["robot"][fixed], f"{by} of {of_setup}", False), Known("camera_from_board", by, False)
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
     return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
 
@@ -181,9 +173,7 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
 def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
     """Returns the poses of a list of ROS's transforms, metres."""
     if not isinstance(values, list) or not values:
-        raise InputError(
-            "E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; take samples, and save them"
-        )
+        raise InputError("E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; save them anew")
     places, rows = tuple(f"sample {i}" for i in range(1, len(values) + 1)), []
     for value, place in zip(values, places, strict=True):
         parts = value.get("transform", value) if isinstance(value, Mapping) else {}
@@ -192,9 +182,7 @@ def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
         if isinstance(at, Mapping) and isinstance(turn, Mapping):
             row = numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
         if row is None:
-            raise InputError(
-                "E-POSE-VALUE", f"{where}: {place}: no translation x, y, z and rotation x, y, z, w; correct it"
-            )
+            raise InputError("E-POSE-VALUE", f"{where}: {place}: no translation x, y, z, rotation x, y, z, w; mend it")
         rows.append(row)
     require_finite(np.array(rows), places, where)
     rotation = of_quaternions(np.array(rows)[:, 3:], places, where)
@@ -224,18 +212,14 @@ def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
     roles = [frames.role for frames in named.values()]
     if len(set(roles)) < len(roles) or any(len(item) > 2 for item in parts.values()):
         keys = ", ".join(key for item in parts.values() for key in item)
-        raise InputError(
-            "E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file"
-        )
+        raise InputError("E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each")
     sides = []
     for name, item in parts.items():
         [first, *more] = item.values()
         side = _of_rotations(item, where, named[name]) if more else _side_of(first, where, named[name])
         if side is None:
-            raise InputError(
-                "E-POSES-NOT-FOUND",
-                f"{where}: {', '.join(item)}: no poses; 4×4 matrices, or matrices 3×3 and translations, needed",
-            )
+            needed = "4×4 matrices, or matrices 3×3 and translations, needed"
+            raise InputError("E-POSES-NOT-FOUND", f"{where}: {', '.join(item)}: no poses; {needed}")
         sides.append(side)
     if names and len(names) != len(sides[0]):
         raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
@@ -258,11 +242,8 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     turn, at = arrays[turn_key], arrays[at_key]
     count = 1 if at.size == len("xyz") else len(at)
     if at.size != 3 * count or turn.size != 9 * count:
-        raise InputError(
-            "E-POSES-SHAPE",
-            f"{where}: {turn_key} of shape {turn.shape}, {at_key} of {at.shape}; a matrix 3×3 and a translation of 3 "
-            "numbers for each pose needed",
-        )
+        shapes = f"{where}: {turn_key} of shape {turn.shape}, {at_key} of {at.shape}"
+        raise InputError("E-POSES-SHAPE", f"{shapes}; a matrix 3×3 and a translation of 3 numbers for each pose needed")
     places = tuple(f"pose {i}" for i in range(1, count + 1))
     at = at.reshape(count, 3)
     require_finite(at, places, where)
@@ -281,10 +262,8 @@ def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | 
         if (frames_of(key) is None and role_of(key) is None) or _matrix(entry) is None:
             continue
         if without := [i for i, other in enumerate(value, 1) if key not in other]:
-            raise InputError(
-                "E-POSE-INCOMPLETE",
-                f"{where}: pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out",
-            )
+            said = f"pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out"
+            raise InputError("E-POSE-INCOMPLETE", f"{where}: {said}")
         stacks[key] = [other[key] for other in value]
     if not stacks:
         return None

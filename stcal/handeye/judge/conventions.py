@@ -257,9 +257,8 @@ def _other_units(loop: Loop, by_images: bool) -> Iterator[Candidate]:
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:
     """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
-    rotations = {"the robot": loop.stand_from_mount.rotation} | (
-        {} if by_images else {"the board": loop.camera_from_board.rotation}
-    )
+    rotations = {"the robot": loop.stand_from_mount.rotation}
+    rotations |= {} if by_images else {"the board": loop.camera_from_board.rotation}
     turns = {side: Rotation.from_matrix(r @ r[0].T).magnitude().max() for side, r in rotations.items()}
     return " and ".join(side for side, turn in turns.items() if turn < RADIANS_AS_DEGREES)
 

@@ -105,9 +105,7 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
         if fault:
             turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
-            raise DegenerateError(
-                "E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about its principal axes{fault}"
-            )
+            raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
     elif observability.useless:
         slides = (
             f"; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "

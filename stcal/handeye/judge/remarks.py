@@ -297,9 +297,8 @@ def spread_text(base_from_flange: Poses, setup: Setup) -> list[str]:
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(observability.turns_rad))
     axes = int((observability.turns_rad > LEAST_TURN).sum())
     some = base_from_flange.rotation[np.unique(np.linspace(0, m - 1, min(m, MOST)).astype(int))]
-    largest = max(
-        float(Rotation.from_matrix(some[i + 1 :] @ some[i].T).magnitude().max()) for i in range(len(some) - 1)
-    )
+    turned = (some[i + 1 :] @ some[i].T for i in range(len(some) - 1))
+    largest = max(float(Rotation.from_matrix(each).magnitude().max()) for each in turned)
     box = " × ".join(f"{side:.0f}" for side in np.ptp(base_from_flange.translation, axis=0))
     lines = [
         f"motions: the flange turns about {axes} {'axis' if axes == 1 else 'axes'} ({turns} RMS about its principal "

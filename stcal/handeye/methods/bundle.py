@@ -163,10 +163,8 @@ class Corners:
     def bundle(self, values: Mapping[str, Any]) -> Bundle:
         """Returns the unknowns, those that are not solved for included."""
         arm = values["arm"].array[0] if "arm" in values else np.zeros(0)
-        flange, camera = (
-            self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, arm),
-            self.camera,
-        )
+        flange, camera = self.base_from_flange, self.camera
+        flange = flange if self.arm is None else self.arm.moved(flange, arm)
         if "robot" in values:
             off = values["robot"]
             flange = Poses(off.rotation @ flange.rotation, off.translation + flange.translation)

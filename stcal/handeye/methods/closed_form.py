@@ -36,9 +36,7 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     """
     m = len(loop)
     if m < 3:
-        raise DegenerateError(
-            "E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more"
-        )
+        raise DegenerateError("E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; turn the flange about two axes")
     candidates = [_linear(loop, np.arange(m)[None], with_scale)]
     rng = np.random.default_rng(SEED)
     if m > 3:
@@ -66,9 +64,7 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     motions = motions[motions.has_log()]
     camera_axis = (motions.alpha @ mount_axis) @ motions.beta
     if not np.linalg.norm(camera_axis) > LEAST_LENGTH:
-        raise DegenerateError(
-            "E-HANDEYE-AXES", "hand-eye: the flange turns, and the board does not turn with it in the camera"
-        )
+        raise DegenerateError("E-HANDEYE-AXES", "hand-eye: the flange turns, and the board not with it in the camera")
     turn = Rotation.align_vectors(mount_axis[None], camera_axis[None])[0]
     board = eye.translation @ turn.as_matrix().T
     along = (board @ mount_axis)[:, None] * mount_axis
@@ -170,10 +166,8 @@ def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple
 
     def rigid(rotation: np.ndarray, translation: np.ndarray) -> Rigid:
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
-            raise ConvergenceError(
-                "E-HANDEYE-METHOD-FAILS",
-                f"hand-eye: {method} returns no transform; the motions are too small or too alike for it",
-            )
+            said = f"hand-eye: {method} returns no transform; the motions are too small or too alike for it"
+            raise ConvergenceError("E-HANDEYE-METHOD-FAILS", said)
         u, _, vt = np.linalg.svd(rotation)
         return Rigid(u @ vt, unit_mm * translation.ravel())
 
@@ -185,9 +179,7 @@ def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple
                 return x, mean_pose(loop.chain(x))
             r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(*eye, *split(hand.inverse()), method=AX_ZB[method])
     except cv2.error as error:
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err}); use another method"
-        ) from error
+        raise ConvergenceError("E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err})") from error
     return rigid(r_x, t_x).inverse(), rigid(r_z, t_z).inverse()
 
 
@@ -211,9 +203,7 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
     x = smallest_largest(c, d, x)
     u, s, vt = np.linalg.svd(x[:9].reshape(3, 3, order="F"))
     if np.linalg.det(u @ vt) < 0 or s[2] < 0.1:
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; the motions are too small or too alike for it"
-        )
+        raise ConvergenceError("E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; motions are too alike")
     return Rigid(u @ vt, unit_mm * x[9:])
 
 

@@ -144,9 +144,8 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()
     parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
-    centre = np.concatenate(
-        [about[3 * i : 3 * i + 3] if bounds.centre is None else bounds.centre for i, bounds in enumerate(parts)]
-    )
+    own = (about[:3], about[3:])
+    centre = np.concatenate([a if b.centre is None else b.centre for a, b in zip(own, parts, strict=True)])
     scale = np.repeat([1.0, 1 / objective.unit_mm], 3)
     centre, half = centre * scale, np.repeat([bounds.half_width for bounds in parts], 3) * scale
     x = rng.uniform(centre - half, centre + half, (size, 6))

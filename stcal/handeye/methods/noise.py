@@ -53,9 +53,7 @@ class Noise:
         for side in ("robot", "camera"):
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):
-                raise InputError(
-                    "E-SIGMA-INCOMPLETE", f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed"
-                )
+                raise InputError("E-SIGMA-INCOMPLETE", f"noise: one σ of the {side} alone; σ_rot and σ_trans needed")
             if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
                 raise InputError(
                     "E-SIGMA-VALUE",

@@ -55,15 +55,12 @@ WORST = "check the poses that fit worst"
 class Reprojection:
     """Results of a reprojection adjustment besides X and Z.
 
-    Parameters
-    ----------
-    camera : adjusted camera, or the given one where the intrinsics were not solved for
-    camera_covariance : (q, q) covariance of the intrinsics solved for, in the order of their COLMAP model
-    base_from_flange : m true poses of the flange; as reported for outliers, and where the robot is exact
-    designed, corners : (K, 3) the board's corners as designed, and as adjusted in the true scale, mm
-    view, corner : (n,) pose and row in ``corners`` of each measured corner. Outliers have no corners.
-    residuals_px : (n, 2) projected minus measured
-    arm, arm_covariance : (k,) parameters of the arm, where they were solved for; rad, mm
+    ``camera`` : adjusted camera, or the given one where the intrinsics were not solved for; ``camera_covariance`` : (q,
+    q) covariance of the intrinsics solved for, in the order of their COLMAP model; ``base_from_flange`` : m true poses
+    of the flange; as reported for outliers, and where the robot is exact; ``designed``, ``corners`` : (K, 3) the
+    board's corners as designed, and as adjusted in the true scale, mm; ``view``, ``corner`` : (n,) pose and row in
+    ``corners`` of each measured corner. Outliers have no corners; ``residuals_px`` : (n, 2) projected minus measured;
+    ``arm``, ``arm_covariance`` : (k,) parameters of the arm, where they were solved for; rad, mm.
     """
 
     camera: Camera
@@ -235,14 +232,10 @@ def considered(wider: Corners, values: dict[str, Any], free: tuple[str, ...]) ->
     poses, eliminated = others[:UNKNOWNS], others[UNKNOWNS:]
     reduced = np.zeros((UNKNOWNS, len(normal)))
     reduced[:, poses] = np.eye(UNKNOWNS)
-    reduced[:, eliminated] = -normal[np.ix_(poses, eliminated)] @ generalised_inverse(
-        normal[np.ix_(eliminated, eliminated)]
-    )
-    return CameraError(
-        slope=reduced @ normal[:, camera],
-        moment=covariance[np.ix_(camera, camera)] + np.outer(error, error),
-        noise=reduced @ scattered @ reduced.T,
-    )
+    inverse = generalised_inverse(normal[np.ix_(eliminated, eliminated)])
+    reduced[:, eliminated] = -normal[np.ix_(poses, eliminated)] @ inverse
+    second_moment = covariance[np.ix_(camera, camera)] + np.outer(error, error)
+    return CameraError(reduced @ normal[:, camera], second_moment, reduced @ scattered @ reduced.T)
 
 
 def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior) -> CameraError:

@@ -162,9 +162,7 @@ class HandEyeFile(ResultFile):
         "`translation_mm` at the board's origin, by which the chain through this pose misses `Z`; with method "
         "`reprojection` `corner_rms_px`"
     )
-    outliers: list[str] = Field(
-        description="names of poses that contradict the others and were left out of the solution"
-    )
+    outliers: list[str] = Field(description="names of poses that contradict the others and were left out")
     left_out: list[NamedReason] = Field(description="`name`, `reason` of images and rows that did not take part")
     held_out: HeldOutMeans | None = Field(
         description="`splits`, `poses` in each, and means: `rotation_rad`, `translation_mm` of the board's origin; "
@@ -200,9 +198,7 @@ class HandEyeFile(ResultFile):
         "`sigma_mm` of the worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
-    understood: list[str] = Field(
-        [], description="only of files of other programs: what each was taken for, a sentence each"
-    )
+    understood: list[str] = Field([], description="only of files of other programs: what each was taken for")
     splits: SplitErrors | None = Field(
         None,
         description="only in `--json`: `rows` of `poses` that each split held out, and the errors of each: "

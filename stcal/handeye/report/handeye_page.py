@@ -178,15 +178,10 @@ def _tried(choice: ChosenWay | None) -> list[Block]:
     """Returns a table with a row per way of solving that was tried."""
     if choice is None:
         return []
-    rows = [
-        [
-            each.candidate.name,
-            number(each.mean_mm, 3),
-            str(len(each.error_mm)),
-            "taken" if each.candidate == choice.chosen else each.reason,
-        ]
-        for each in choice.tried
-    ]
+    rows = []
+    for each in choice.tried:
+        how = "taken" if each.candidate == choice.chosen else each.reason
+        rows.append([each.candidate.name, number(each.mean_mm, 3), str(len(each.error_mm)), how])
     return [
         Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
         page_only(
@@ -255,10 +250,8 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
         return []
     names = [*(" → ".join(pair) for pair in motions.names), "mean"]
     errors = np.column_stack([motions.translation_mm, np.degrees(motions.rotation_rad)])
-    rows = [
-        [name, number(shift, 3), number(turn, 4)]
-        for name, (shift, turn) in zip(names, [*errors, errors.mean(0)], strict=True)
-    ]
+    errors = [*errors, errors.mean(0)]
+    rows = [[name, number(mm, 3), number(deg, 4)] for name, (mm, deg) in zip(names, errors, strict=True)]
     return [
         f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}",
         Table(["<motion held out", "mm", "°"], rows, css="text"),
@@ -404,9 +397,8 @@ def pose_bars(result: HandEye) -> Drawing:
         axes.frame("pose, in order", label, "y", count_ticks(1, len(values)))
         for colour, rows_of in ((GOOD, ~result.outliers), (BAD, result.outliers)):
             shown = np.flatnonzero(rows_of & np.isfinite(values))
-            axes.lines(
-                [((i + 0.6, i + 0.6, i + 1.4, i + 1.4), (0, values[i], values[i], 0)) for i in shown], fill=colour
-            )
+            bars = [((i + 0.6, i + 0.6, i + 1.4, i + 1.4), (0, values[i], values[i], 0)) for i in shown]
+            axes.lines(bars, fill=colour)
     return drawing
 
 

@@ -38,22 +38,15 @@ class ArmFound:
 class Outcome:
     """A calibration with everything that its report shows.
 
-    Parameters
-    ----------
-    where : names of the files that were solved
-    result : HandEye
-    held_out : errors of the result's method on held-out poses
-    compared : results of every method, if a comparison was asked for
-    options : by which the result was solved
-    pitch_mm : pitch of dots or squares, as the board's file states it
-    left_out : images and rows that did not take part, and why
-    notes : notes in addition to those of the result
-    motions : errors of the last motions, held out
-    choice : the candidates that were tried, if no method was named
-    pairs, views : the poses that were solved, and their corners if there were images; a symmetric board's as numbered
-    understood : how files of other programs were interpreted
-    arm : the arm's parameters, if they were solved for
-    time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
+    ``where`` : names of the files that were solved; ``result`` : HandEye; ``held_out`` : errors of the result's method
+    on held-out poses; ``compared`` : results of every method, if a comparison was asked for; ``options`` : by which the
+    result was solved; ``pitch_mm`` : pitch of dots or squares, as the board's file states it; ``left_out`` : images and
+    rows that did not take part, and why; ``notes`` : notes in addition to those of the result; ``motions`` : errors of
+    the last motions, held out; ``choice`` : the candidates that were tried, if no method was named; ``pairs``,
+    ``views`` : the poses that were solved, and their corners if there were images; a symmetric board's as numbered;
+    ``understood`` : how files of other programs were interpreted; ``arm`` : the arm's parameters, if they were solved
+    for; ``time_offset`` : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain
+    its σ.
     """
 
     where: str
@@ -142,15 +135,8 @@ NOTHING_MM = 1e-6
 
 def judged(outcome: Outcome) -> Verdict:
     """Returns the verdict on a calibration."""
-    tests = [
-        _of_residuals(outcome),
-        _of_prediction(outcome),
-        _of_share(outcome),
-        _of_common_errors(outcome),
-        _of_motions(outcome),
-        _of_size(outcome),
-        _of_outliers(outcome),
-    ]
+    kinds = (_of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers)
+    tests = [judge(outcome) for judge in kinds]
     for note in outcome.all_notes():  # the text behind a note's colon is the remedy
         if not isinstance(note, Aside):
             said, _, remedy = note.partition(": ")
@@ -167,17 +153,15 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
     away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
+    value = f"{np.degrees(turn):.2g}°, {shift:.3g} mm"
     said = (
-        f"the poses miss one another by {np.degrees(turn):.2g}° and {shift:.3g} mm (RMS), {shift / away:.0%} of the "
-        f"board's distance of {away:.0f} mm"
+        f"the poses miss one another by {value.replace(',', ' and')} (RMS), {shift / away:.0%} of the board's distance "
     )
+    said += f"of {away:.0f} mm"
     limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
-    remedy = (
-        "pair each pose of the board with that of the flange at the same moment, and check units, directions and the "
-        "camera file"
-    )
+    remedy = "pair each pose of the board with that of the flange then, and check units, directions and the camera file"
     remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
-    return Finding("Residuals", BAD, said, f"{np.degrees(turn):.2g}°, {shift:.3g} mm", limit, remedy)
+    return Finding("Residuals", BAD, said, value, limit, remedy)
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
@@ -259,9 +243,8 @@ def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) ->
     if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
         return None
     place = pairs.camera_from_board.translation[~result.outliers] * result.scale
-    jacobian = np.concatenate(
-        [-skew(place @ result.mount_from_camera.rotation.T), np.tile(np.eye(3), (used, 1, 1))], axis=2
-    )
+    by_turn = -skew(place @ result.mount_from_camera.rotation.T)
+    jacobian = np.concatenate([by_turn, np.tile(np.eye(3), (used, 1, 1))], axis=2)
     variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
     return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))
