@@ -44,13 +44,12 @@ class PoseFiles:
     ] = None
     setup: Annotated[
         Literal["eye-in-hand", "eye-to-hand"] | None,
-        "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file "
-        "decides; if it does not say, eye-in-hand.",
+        "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; if not given, as in the file.",
     ] = None
     rotation: Annotated[
         list[str] | None,
-        "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
-        "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
+        "Read angles in this convention, if the file names none: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
+        "(fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
     ] = None
     length_unit: Annotated[
         list[str] | None,
@@ -241,19 +240,9 @@ def handeye(
         if undo_flips:
             inputs, undone = without_flips(inputs, options)
             say(undone)
-        outcome = calibrate_handeye(
-            inputs,
-            method,
-            options,
-            refine_camera=refine_camera,
-            time_offset=time_offset,
-            repeats=splits,
-            held_out=held_out,
-            seed=seed,
-            motions=motions_held_out,
-            workers=files.workers,
-            progress=progress,
-        )
+        validation = {"repeats": splits, "held_out": held_out, "seed": seed, "motions": motions_held_out}
+        asked = {"refine_camera": refine_camera, "time_offset": time_offset, "workers": files.workers}
+        outcome = calibrate_handeye(inputs, method, options, **asked, **validation, progress=progress)
     result = outcome.result
     document = outcome_report(outcome)
     say(document.text())

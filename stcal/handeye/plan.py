@@ -246,12 +246,9 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
         "turn: relative to the nearest pose taken; rx, ry, rz: rotation vector. σ include only independent errors of "
         f"the poses. Collisions are not checked, only {last}",
     ]
-    return Document(
-        "Poses to take next",
-        f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
-        "point at the board with each",
-        [Section("Poses", blocks, terminal=True)],
-    )
+    about = f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
+    about += "point at the board with each"
+    return Document("Poses to take next", about, [Section("Poses", blocks, terminal=True)])
 
 
 @require_arguments

@@ -260,24 +260,34 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if method == "de":
             notes = (*notes, Aside(evolution.in_words(unit_mm)))
         z = closed_form.mean_pose(loop.chain(x))
-    return _result(task, method, (x, z), task.loop.residuals(x, z), np.zeros(len(pairs), bool), notes)
+    return _result(task, method, (x, z), task.loop.residuals(x, z), notes)
 
 
 def _result(
-    task: _Task,
-    method: str,
-    found: tuple[Rigid, Rigid],
-    residuals: np.ndarray,
-    outliers: np.ndarray,
-    notes: tuple[str, ...],
-    **more: Any,
+    task: _Task, method: str, found: tuple[Rigid, Rigid], residuals: np.ndarray, notes: tuple[str, ...], **more: Any
 ) -> HandEye:
     """Returns the result of X and Z ``found``; ``more`` : further fields, with their covariance (12, 12) or more."""
     covariance, names = more.pop("covariance", None), task.problem.pairs.names
+    outliers = more.pop("outliers", np.zeros(len(names), bool))
     if covariance is not None:
         more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
     more |= {"observability": task.seen, "notes": notes}
     return HandEye(method, task.problem.setup, *found, residuals, names, outliers, **more)
+
+
+def _adjusted(
+    task: _Task,
+    method: str,
+    solution: PoseSolution | AdjustedCorners,
+    found: tuple[Rigid, Rigid],
+    residuals: np.ndarray,
+    notes: tuple[str, ...],
+    **more: Any,
+) -> Solved:
+    """Returns the result of a method that adjusts poses or corners."""
+    notes = notes if solution.settled else (*notes, UNSETTLED)
+    more |= {"scale": solution.state.scale, "outliers": solution.outliers}
+    return Solved(task, _result(task, method, found, residuals, notes, **more), solution)
 
 
 def _by_poses(task: _Task) -> Solved:
@@ -313,16 +323,9 @@ def _by_poses(task: _Task) -> Solved:
         error = of_poses(loop, solution, problem.views, options.camera)
         covariance = covariance + error.covariance(inverse) - inverse
     stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-    more = {
-        "covariance": covariance,
-        "scale": state.scale,
-        "sigma_scale": sigma_scale,
-        "sigma": {name: value for name, value in stated.items() if value} | solution.sigma,
-        "estimated": tuple(solution.sigma),
-        "common_covariance": common,
-    }
-    notes = notes if solution.settled else (*notes, UNSETTLED)
-    return Solved(task, _result(task, "pose", (x, z), solution.residuals, solution.outliers, notes, **more), solution)
+    sigma = {name: value for name, value in stated.items() if value} | solution.sigma
+    more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma), "common_covariance": common}
+    return _adjusted(task, "pose", solution, (x, z), solution.residuals, notes, covariance=covariance, **more)
 
 
 def _by_views(task: _Task, views: Views) -> Solved:
@@ -334,7 +337,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         return adjust_views(loop, flange, views, first, noise, intrinsics, scaled, options.camera, options.arm)
 
     solution, _, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, sigma_scale = solution.state, ~solution.used, solution.sigma_scale
+    state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
     if sigma_scale is not None:
         require_scale(state.scale, sigma_scale, task.loop, pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
@@ -360,16 +363,9 @@ def _by_views(task: _Task, views: Views) -> Solved:
     if doubted:
         which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
         notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-    more = {
-        "covariance": covariance,
-        "scale": state.scale,
-        "sigma_scale": sigma_scale,
-        "sigma": solution.sigma,
-        "estimated": solution.estimated,
-        "reprojection": solution.found,
-    }
-    notes = notes if solution.settled else (*notes, UNSETTLED)
-    return Solved(task, _result(task, "reprojection", (x, z), residuals, outliers, notes, **more), solution)
+    more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
+    more |= {"covariance": covariance, "reprojection": solution.found}
+    return _adjusted(task, "reprojection", solution, (x, z), residuals, notes, **more)
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:

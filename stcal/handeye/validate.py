@@ -287,13 +287,10 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     (turn, shift), (other_turn, other_shift) = (list(each.values()) for each in (first, other))
     if not (turn * shift > SETUP_BETTER * other_turn * other_shift and turn > other_turn and shift > other_shift):
         return ()
-    return (
-        Grave(
-            f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
-            f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}: give --setup {opposite} if it is "
-            "that"
-        ),
-    )
+    as_stated = f"{np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}"
+    as_other = f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}"
+    said = f"poses held out are missed by {as_stated}, by {as_other}"
+    return (Grave(f"{said}: give --setup {opposite} if it is that"),)
 
 
 @require_arguments

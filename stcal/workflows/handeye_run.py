@@ -189,11 +189,8 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
     """
     timed = given.timed
     if timed is None:
-        raise InputError(
-            "E-POSES-UNTIMED",
-            f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s, or TUM) and of "
-            "the images (their names, or --image-times)",
-        )
+        said = f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s"
+        raise InputError("E-POSES-UNTIMED", f"{said}, or TUM) and of the images (their names, or --image-times)")
     if options.four_dof:
         said = "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out"
         raise InputError("E-OPTION-CONFLICT", said)

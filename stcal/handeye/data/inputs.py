@@ -93,11 +93,8 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
         raise InputError("E-POSES-MIXED", f"{path}: {content.form} with {held}; give robot's as --a, camera's as --b")
     robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
-        raise InputError(
-            "E-POSES-UNITS",
-            f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}; "
-            "write both in one unit, or to two files for --a and --b",
-        )
+        said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
     return ToldPairs.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
 
 
@@ -272,11 +269,8 @@ def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[floa
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
         near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
-        raise InputError(
-            "E-POSES-UNITS",
-            f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units; write all in "
-            "the same unit and give --length-unit mm or m",
-        )
+        said = f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units"
+        raise InputError("E-POSES-UNITS", f"{said}; write all in the same unit and give --length-unit mm or m")
     if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
         raise InputError(
             "E-POSES-UNITS",
@@ -303,11 +297,8 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
         raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column {key}")
     rows = partners(robot.names, camera.names)
     if rows is None:
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one, "
-            f"{camera.names[0]} … in the other; correct them",
-        )
+        said = f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one"
+        raise InputError("E-POSES-UNMATCHED", f"{said}, {camera.names[0]} … in the other; correct them")
     return rows
 
 

@@ -224,9 +224,15 @@ def inverted(
     poses: Poses, covariance: np.ndarray | None, common: np.ndarray | None
 ) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
     """Returns the inverses of poses, with their covariances (m, 6, 6) and common errors (m, 6, k), where known."""
-    carried = inverse_jacobian(poses)
-    covariance = None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2)
-    return poses.inverse(), covariance, None if common is None else carried @ common
+    return poses.inverse(), *carried(inverse_jacobian(poses), covariance, common)
+
+
+def carried(
+    jacobian: np.ndarray, covariance: np.ndarray | None, common: np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Returns covariances (m, 6, 6) and common errors (m, 6, k), where known, carried by derivatives (m, 6, 6)."""
+    moved = None if covariance is None else jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return moved, None if common is None else jacobian @ common
 
 
 def inverse_jacobian(poses: Poses) -> np.ndarray:

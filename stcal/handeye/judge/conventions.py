@@ -16,7 +16,7 @@ from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, carried
 from stcal.handeye.data.record import FRAMES
 from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.handeye.methods import closed_form
@@ -134,9 +134,7 @@ ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
 by the names that --rotation has for them; the most frequent first."""
 
 
-def _readings(
-    pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, rotations_agree: bool
-) -> Iterator[Candidate]:
+def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, turns_agree: bool) -> Iterator[Candidate]:
     """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
     yield from _variants(loop, setup, by_images)
     for side, role in SIDES[: 1 if by_images else 2]:
@@ -145,11 +143,11 @@ def _readings(
             words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
             changed = partial(lambda *of: _with_stated(loop, of[0], _with_angles(*of[1:])), side, read, one, other)
             yield Candidate(words, changed, 1)
-        for names, places in other_axes(read.translation) if rotations_agree else ():
+        for names, places in other_axes(read.translation) if turns_agree else ():
             words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
             changed = partial(_with_stated, loop, side, Poses(read.rotation, places))
             yield Candidate(words, changed, 1)
-    if not rotations_agree:
+    if not turns_agree:
         opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
         other_loop, words = Loop.of(pairs, opposite), f"with --setup {opposite}"
         yield Candidate(words, lambda: other_loop, 2)
@@ -320,15 +318,13 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     common_inverse = every[int(np.bincount(best).argmax())].inverse()
     best = np.array([nearest(every[k] @ common_inverse) for k in best])
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
-    covariance, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
-    carried = np.tile(np.eye(6), (len(poses), 1, 1))  # errors of camera_from_board when its origin moves on the board
-    carried[:, 3:, :3] = -skew(poses.translation - as_numbered.translation)
-    repaired = replace(
-        pairs,
-        camera_from_board=poses,
-        camera_from_board_covariance=None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
-        camera_from_board_common=None if common is None else carried @ common,
-    )
+    jacobian = np.tile(
+        np.eye(6), (len(poses), 1, 1)
+    )  # by errors of camera_from_board when its origin moves on the board
+    jacobian[:, 3:, :3] = -skew(poses.translation - as_numbered.translation)
+    errors = carried(jacobian, pairs.camera_from_board_covariance, pairs.camera_from_board_common)
+    names = ("camera_from_board", "camera_from_board_covariance", "camera_from_board_common")
+    repaired = replace(pairs, **dict(zip(names, (poses, *errors), strict=True)))
     if views is not None:
         turned = (view.turned(every[k].inverse()) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))

@@ -126,11 +126,8 @@ def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
     """Refuse a scale that is implausible or that the motions leave open; the DegenerateError says how far to move."""
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
-            raise DegenerateError(
-                "E-HANDEYE-BOARD-SCALE",
-                f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}; correct the unit "
-                "of its size, or of the poses",
-            )
+            said = f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}"
+            raise DegenerateError("E-HANDEYE-BOARD-SCALE", f"{said}; correct the unit of its size, or of the poses")
         return
     place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
     moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))

@@ -55,11 +55,8 @@ class Noise:
             if (pair[0] is None) != (pair[1] is None):
                 raise InputError("E-SIGMA-INCOMPLETE", f"noise: one σ of the {side} alone; σ_rot and σ_trans needed")
             if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
-                raise InputError(
-                    "E-SIGMA-VALUE",
-                    f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm; 0 to "
-                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible",
-                )
+                said = f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm"
+                raise InputError("E-SIGMA-VALUE", f"{said}; 0 to {np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible")
         for name, least in (("corner_px", 1e-9), ("board_mm", 0.0)):
             value = getattr(self, name)
             if value is not None and not (least <= value <= MOST_MM):

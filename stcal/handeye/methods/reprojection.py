@@ -323,6 +323,11 @@ class AdjustedCorners:
     found: Reprojection
     settled: bool
 
+    @property
+    def outliers(self) -> np.ndarray:
+        """The poses (m,) that were not used."""
+        return ~self.used
+
     def normal(self) -> np.ndarray:
         """Returns the normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
         normal, k = self.solution.normal, len(self.covariance)

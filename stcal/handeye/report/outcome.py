@@ -159,7 +159,7 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
     )
     said += f"of {away:.0f} mm"
     limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
-    remedy = "pair each pose of the board with that of the flange then, and check units, directions and the camera file"
+    remedy = "pair each pose of the board with that of the flange at that time, and check units, directions and camera"
     remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
     return Finding("Residuals", BAD, said, value, limit, remedy)
 
