@@ -33,8 +33,7 @@ class PoseFiles:
     ] = None
     poses: Annotated[
         Path | None,
-        "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices (JSON, npz, npy) or a "
-        "TUM trajectory.",
+        "Read the robot's poses here: image, base_from_flange_… (CSV), 4×4 matrices (JSON, npz, npy) or a TUM file.",
     ] = None
     camera: Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."] = None
     board: Annotated[
@@ -57,8 +56,8 @@ class PoseFiles:
     ] = None
     poses_are: Annotated[
         list[str] | None,
-        "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
-        "camera_from_board or board_from_camera; once for each side.",
+        "Take poses in this direction, if the file names none, once a side: base_from_flange or flange_from_base; "
+        "camera_from_board or board_from_camera.",
     ] = None
     first: shared.FirstTable = None
     second: shared.SecondTable = None

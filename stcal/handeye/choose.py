@@ -210,11 +210,8 @@ def choose(
     for out in rows:
         with naming_held_out(problem, out):
             problem.without(out).require_observable()
-    candidates = [
-        candidate
-        for candidate in (BY_POSES if problem.views is None else BY_VIEWS)
-        if (prior is not None or not candidate.camera) and not (problem.options.four_dof and candidate in CLOSED_FORMS)
-    ]
+    every, four_dof = BY_POSES if problem.views is None else BY_VIEWS, problem.options.four_dof
+    candidates = [way for way in every if (prior or not way.camera) and not (four_dof and way in CLOSED_FORMS)]
     jobs = [(candidate.of(problem, prior), candidate, rows) for candidate in candidates]
     finished: dict[Way, Tried | StcalError] = {}
     for i, found in run_parallel(_try, jobs, 1 if problem.views is None else workers):
@@ -277,10 +274,8 @@ def _widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye
 def _sentence(tried: tuple[Tried, ...], chosen: Tried, result: HandEye, where: str) -> str:
     """Returns the choice, its gain, and what it says about camera file, board and robot, in one sentence."""
     way, plain = chosen.candidate, tried[0]
-    parts = [
-        f"{len(tried)} ways of solving were compared by poses held out; the best, {way.in_words()}, errs by "
-        f"{chosen.mean_mm:.3g} mm {where}"
-    ]
+    first = f"{len(tried)} ways of solving were compared by poses held out; the best, {way.in_words()}, errs by "
+    parts = [f"{first}{chosen.mean_mm:.3g} mm {where}"]
     if plain.candidate != way:
         parts[0] += f", {plain.candidate.in_words()} by {plain.mean_mm:.3g} mm" if plain.error_mm.size else ""
     filed_mm = [each.mean_mm for each in tried if way.camera and not each.candidate.camera and each.error_mm.size]

@@ -143,10 +143,8 @@ def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
     """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
     the poses, or those from the σ of the result."""
     sigma = result.sigma
-    robot, camera = (
-        np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
-        for side in ("robot", "camera")
-    )
+    pairs = ([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")] for side in ("robot", "camera"))
+    robot, camera = (np.diag(np.square(np.repeat(pair, 3))) for pair in pairs)
     if loop.robot_covariance is not None and "robot_rad" not in sigma:
         robot = loop.robot_covariance.mean(0)
     if loop.camera_covariance is not None:
@@ -219,8 +217,7 @@ class HandEyePlanFile(ResultFile):
     method: str = Field(description="that solved for the poses taken")
     taken: list[str] = Field(description="names of the poses taken that the solution rests on")
     sigma_mm: Vector = Field(
-        description="largest σ, in any direction, of a point at the board: now, and with each of the poses and those "
-        "before"
+        description="largest σ, in any direction, of a point at the board: now, and after each of the poses"
     )
     base_from_flange: list[Pose] = Field(description="poses to take, in order")
     camera_from_board: list[Pose] = Field(description="how the board is seen there")

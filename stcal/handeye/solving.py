@@ -396,10 +396,8 @@ def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, 
         contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
     if not contradicted:
         return solution, noise, ()
-    note = (
-        f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
-        f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
-    )
+    note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
+    note += f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
     return free, unknown, (note,)
 
 
@@ -426,8 +424,6 @@ def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
     x, z = closed_form.slid(x, z, axis, task.loop)
     held = normal.copy()
     held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
-    note = (
-        f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which the "
-        f"flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
-    )
+    note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which the "
+    note += f"flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
     return x, z, generalised_inverse(held), (*task.problem.notes, note)

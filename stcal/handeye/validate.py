@@ -261,10 +261,9 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
     if views is not None:
         camera, adjusted_views = as_adjusted(result, views)
         by_view, _ = resect(Views(camera, tuple(adjusted_views)), pairs.names)
-        pose_mm = [
-            np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
-            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
-        ]
+        chains = zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
+        off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
+        pose_mm = [np.linalg.norm(each, axis=1).mean() for each in off]
         at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
         loop, scale = replace(loop, camera_from_board=by_view), 1.0
     turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
@@ -369,11 +368,9 @@ def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:
     common, seen = problem.pairs.camera_from_board_common, problem.pairs.camera_from_board
     if common is None:
         return result
-    erring = (
-        replace(problem, pairs=replace(problem.pairs, camera_from_board=seen.moved(step.copy())), views=None)
-        for step in np.moveaxis(common, 2, 0)
-    )
-    mount, stand = (m.T @ m for m in _differences([each.solved(result.method).result for each in erring], result))
+    erring = (replace(problem.pairs, camera_from_board=seen.moved(s.copy())) for s in np.moveaxis(common, 2, 0))
+    moved = [replace(problem, pairs=each, views=None).solved(result.method).result for each in erring]
+    mount, stand = (m.T @ m for m in _differences(moved, result))
     wider = {"covariance": result.covariance + mount, "stand_covariance": result.stand_covariance + stand}
     return replace(result, **wider, common_covariance=mount, notes=(*result.notes, IN_COMMON))
 

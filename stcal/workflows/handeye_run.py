@@ -157,10 +157,8 @@ def with_arm(
     if held_out is not None and outcome.held_out is not None:
         now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:
-            notes += (
-                f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
-                "them): leave --with-kinematics out, or take more poses",
-            )
+            gain = f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
+            notes += (f"{gain}them): leave --with-kinematics out, or take more poses",)
     return replace(outcome, result=result, held_out=held_out, options=problem.options, notes=notes, arm=found)
 
 
@@ -224,9 +222,8 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
         plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
-        before, after = (
-            HandEyeProblem(each, setup, None, plain).solved("pose").result for each in (pairs[lag.kept], shifted)
-        )
+        problems = (HandEyeProblem(each, setup, None, plain) for each in (pairs[lag.kept], shifted))
+        before, after = (each.solved("pose").result for each in problems)
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]

@@ -320,9 +320,8 @@ def _array(data: bytes, where: str) -> np.ndarray | list[str]:
 
 
 def _damaged(where: str, error: Exception) -> InputError:
-    return InputError(
-        "E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({' '.join(str(error).split())[:80]}); save it again"
-    )
+    said = " ".join(str(error).split())[:80]
+    return InputError("E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({said}); save it again")
 
 
 FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], PoseContent | None]], ...] = (

@@ -93,18 +93,14 @@ def check_conventions(
         if np.divide(_typical(loop, guess, True), spread).max() > LOST:
             remedy = "pair each pose of the board with that of the flange at the same moment"
             if radians := _as_of_radians(loop, by_images):
-                remedy = (
-                    f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that "
-                    f"ends in -rad; if not, {remedy}"
-                )
+                columns = f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that"
+                remedy = f"{columns} ends in -rad; if not, {remedy}"
             elif turn <= WELL[0]:
-                remedy = (
-                    "as rotations agree, rows and conventions of rotation are right: check units, signs and order of "
-                    "the columns of positions"
-                )
+                remedy = "as rotations agree, rows and conventions of rotation are right: check units, signs and "
+                remedy += "order of the columns of positions"
             else:
                 remedy += (
-                    f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
+                    ", and check the camera file" if by_images else ", and look for another convention of rotations"
                 )
             what = "positions" if turn <= WELL[0] else "poses"
             raise InputError(
@@ -205,10 +201,9 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    yield Candidate(
-        f"with one side mirrored: if {states} left-handed poses, {remedy}",
-        lambda: replace(loop, camera_from_board=Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)),
-    )
+    seen = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
+    mirrored_board = partial(replace, loop, camera_from_board=seen)
+    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", mirrored_board)
     for which, late, robot_rows, board_rows in (
         ("below", "robot's", slice(1, None), slice(-1)),
         ("above", "board's", slice(-1), slice(1, None)),
@@ -230,9 +225,8 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
             continue
         yield Candidate(f"with the robot's {quaternions}, {own[0]}", partial(replace, by_robot))
         yield Candidate(f"with the board's {quaternions}, {own[1]}", partial(replace, loop, camera_from_board=board))
-        yield Candidate(
-            f"with all {quaternions}, {reading.remedy}", partial(replace, by_robot, camera_from_board=board)
-        )
+        both = partial(replace, by_robot, camera_from_board=board)
+        yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
 
 
 def _other_units(loop: Loop, by_images: bool) -> Iterator[Candidate]:

@@ -107,10 +107,8 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
             raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
     elif observability.useless:
-        slides = (
-            f"; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
-            f"{FRAMES[setup].camera} along that axis is determined"
-        )
+        slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
+        slides += f"{FRAMES[setup].camera} along that axis is determined"
         raise DegenerateError(
             "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"
         )

@@ -69,9 +69,8 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     board = eye.translation @ turn.as_matrix().T
     along = (board @ mount_axis)[:, None] * mount_axis
     across = np.stack([board - along, np.cross(mount_axis, board)], axis=2)
-    rows = np.concatenate(
-        [hand.rotation @ across, hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2
-    ).reshape(-1, 8)
+    of_stand = np.tile(-np.eye(3), (len(loop), 1, 1))
+    rows = np.concatenate([hand.rotation @ across, hand.rotation, of_stand], axis=2).reshape(-1, 8)
     right = -hand.translation - np.einsum("mab,mb->ma", hand.rotation, along)
     cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
     length = float(np.hypot(cosine, sine))
@@ -240,15 +239,9 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.column_stack([-2 * (hessian @ y[:-1] - pull), np.ones(len(c))])
 
     ahead = np.eye(13)[-1]
-    solution = minimize(
-        lambda y: y[-1],
-        np.append(x, 1.0),
-        jac=lambda _: ahead,
-        method="SLSQP",
-        constraints={"type": "ineq", "fun": below, "jac": below_slope},
-        options={"maxiter": 500, "ftol": 1e-14},
-    )
-    x = solution.x[:-1]
+    limits, options = {"type": "ineq", "fun": below, "jac": below_slope}, {"maxiter": 500, "ftol": 1e-14}
+    start, objective = np.append(x, 1.0), lambda y: y[-1]
+    x = minimize(objective, start, jac=lambda _: ahead, method="SLSQP", constraints=limits, options=options).x[:-1]
     errors = squared(x).sum(1)
     # The minimum of a weighted mean of the squared errors is below that of the largest: multipliers give the best mean.
     active = errors > (1 - 1e-2) * errors.max()

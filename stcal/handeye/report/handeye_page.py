@@ -252,10 +252,8 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
     errors = np.column_stack([motions.translation_mm, np.degrees(motions.rotation_rad)])
     errors = [*errors, errors.mean(0)]
     rows = [[name, number(mm, 3), number(deg, 4)] for name, (mm, deg) in zip(names, errors, strict=True)]
-    return [
-        f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}",
-        Table(["<motion held out", "mm", "°"], rows, css="text"),
-    ]
+    said = f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}"
+    return [said, Table(["<motion held out", "mm", "°"], rows, css="text")]
 
 
 def _coverage(outcome: Outcome) -> list[Block]:
@@ -290,10 +288,8 @@ def _turns(outcome: Outcome) -> list[Block]:
     seen = outcome.result.observability
     if seen is None:
         return []
-    rows = [
-        [str(i), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
-        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True), 1)
-    ]
+    turns = enumerate(zip(seen.axes, np.degrees(seen.turns_rad), strict=True), 1)
+    rows = [[str(i), *(number(v, 3) for v in axis), number(turn, 2)] for i, (axis, turn) in turns]
     return [
         Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
         "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "

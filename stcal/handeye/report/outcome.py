@@ -107,11 +107,9 @@ class Outcome:
         if found is None or found.camera_covariance is None:
             return None
         parameters, sigma = found.camera.parameters(), np.sqrt(np.diag(found.camera_covariance))
-        return {
-            "model": self.colmap_model,
-            "parameters": dict(zip(PARAMETER_NAMES, parameters, strict=True)),
-            "sigma": dict(zip(parameter_names(self.colmap_model), sigma, strict=True)),
-        }
+        values = dict(zip(PARAMETER_NAMES, parameters, strict=True))
+        sigmas = dict(zip(parameter_names(self.colmap_model), sigma, strict=True))
+        return {"model": self.colmap_model, "parameters": values, "sigma": sigmas}
 
 
 SUSPICIOUS, FAILED = 1e-3, 1e-5
@@ -154,10 +152,8 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
     value = f"{np.degrees(turn):.2g}°, {shift:.3g} mm"
-    said = (
-        f"the poses miss one another by {value.replace(',', ' and')} (RMS), {shift / away:.0%} of the board's distance "
-    )
-    said += f"of {away:.0f} mm"
+    said = f"the poses miss one another by {value.replace(',', ' and')} (RMS), {shift / away:.0%} of the board's "
+    said += f"distance of {away:.0f} mm"
     limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
     remedy = "pair each pose of the board with that of the flange at that time, and check units, directions and camera"
     remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
@@ -203,10 +199,8 @@ def _of_share(outcome: Outcome) -> Finding | None:
     share_of_transform = sigma**2 / (sigma**2 + shift**2)
     word = _word(share_of_transform, HALF, MOST)
     alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
-    said = (
-        f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
-        f"away), the error of a single pose {shift:.2g} mm (RMS)"
-    )
+    said = f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was "
+    said += f"({distance:.0f} mm away), the error of a single pose {shift:.2g} mm (RMS)"
     remedy = "take more poses, and turn the flange more, about two axes"
     return _graded("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
 
@@ -224,10 +218,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
         return None
     distance, sigma, shift = share
     word: Word = CARE if sigma > shift else GOOD
-    said = (
-        f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
-        f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
-    )
+    said = f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
+    said += f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
     remedy = "calibrate the camera better, or solve from the images: more poses do not help"
     return _graded(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
@@ -261,10 +253,8 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     title, value, limit = "Motions of the flange", f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}"
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
-        remedy = (
-            f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
-            f"robot with four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
-        )
+        remedy = f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which "
+        remedy += "a robot with four axes cannot show; or turn the flange about another axis too, without --four-dof"
         return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
