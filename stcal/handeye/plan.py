@@ -29,8 +29,7 @@ MOST_TILT = np.radians(40)
 MARGIN = 0.1
 """Margin that the board's outermost points keep from the image border, as a share of the image's sides."""
 ABOUT = 0.25
-"""Distance from the board's mean place to the other points at which σ is judged, in distances of the board from the
-camera."""
+"""Distance from the board's mean place to the other points at which σ is judged, as a share of its distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

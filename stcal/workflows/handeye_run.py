@@ -163,17 +163,13 @@ def with_arm(
 
 
 HINT_T, SURE_SIGMAS = 3.0, 4.0
-"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is reported: one
-sound set in 16,000 is beyond the latter."""
+"""Student's t from which an offset is solved for, and number of its σ from which it is reported (1 in 16,000)."""
 FALLS = 0.98
-"""Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
-does no harm."""
+"""Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
 HARMFUL = 1.0
-"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong; without σ it
-is always."""
+"""Change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always."""
 ROW_S = 0.05
-"""Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
-rows."""
+"""Time assumed between smooth rows without times: a scan of ±1 s then covers ±20 rows."""
 SMOOTH, LEAST_ROWS = 0.2, 20
 """Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
 their order counts as that of a motion; and least number of such poses."""

@@ -181,8 +181,7 @@ _FORMS = (
     (re.compile(rf"(?:{_LEFT})_?t_?(?:{_RIGHT})"), "ab", False),
     (re.compile(rf"t_(?:{_LEFT})_(?:{_RIGHT})"), "ab", False),
 )
-"""Forms of names of transforms; which of the two frames is the first of ``a_from_b``; and whether no other reading is
-possible."""
+"""Forms of names of transforms; which frame is the first of ``a_from_b``; whether no other reading is possible."""
 _PART = re.compile(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
 """Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
 ROLES_BY_NAME: dict[Role, re.Pattern] = {

@@ -29,8 +29,7 @@ STEP = 1e-3
 WINDOW = 4
 """Number of samples of a cubic."""
 LOO_NOISE = float(np.sqrt(1 + 34 / 36))
-"""Scatter of a sample about the cubic through its four neighbours, in σ of one sample; it holds the noise of all
-five."""
+"""Scatter of a sample about the cubic through its four neighbours, in σ of one sample, with the noise of all five."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

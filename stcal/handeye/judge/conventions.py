@@ -25,15 +25,13 @@ from stcal.io.poses.rotations import INVERTED as CONJUGATED
 from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
 
 FAR_BETTER, BETTER = 30.0, 3.0
-"""Factors by which a variant must reduce the product of the median residuals in rotation and translation, and the
-median residual in translation, before the poses are refused."""
+"""Factors by which a refused reading exceeds a variant in the product of both median residuals, and in translation."""
 DOUBTFUL = 1.5
 """Factor by which the other setup must reduce the same product before a note says that it fits better."""
 WELL = np.radians(0.5), 5.0
 """Median residuals (rad, mm) up to which poses are not suspected."""
 LOST = 0.25
-"""Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
-nothing in common."""
+"""Share of the spread of the poses left unexplained, above which those of robot and camera have nothing in common."""
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])

@@ -28,8 +28,7 @@ LEAST_TURN = np.radians(5)
 """Smallest RMS rotation of a robot of four axes."""
 LEAST_POSES = 3
 MOST_PAIRS = 100_000
-"""Number of pairs of poses from which the principal axes are computed. More than 450 poses have more pairs; these are
-then drawn at random."""
+"""Number of pairs of poses from which the principal axes are computed, drawn at random from 450 poses on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -114,8 +114,7 @@ SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
 """Probability that a move along the order of sound poses is named, and least share of the squares that it explains;
 the same where each pose is at a place of its own, so that errors common to a place are no move."""
 STILL = 0.005
-"""Share of the usual turn, and of the usual way, between two poses, below both of which a side did not move: a robot's
-feedback at rest repeats to micrometres."""
+"""Share of the usual turn and way between two poses, below both of which a side did not move."""
 FEW = 200
 """Largest number of poses of which all pairs are compared for what is usual."""
 HALL_MM = 5e4
@@ -256,8 +255,7 @@ def of_distance(loop: Loop) -> tuple[str, ...]:
 
 
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
-"""Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
-stated; brackets are shorter."""
+"""Distances of a camera from its flange that are doubted, and called wrong unless the setup is stated."""
 LONG_MM, NEARER = 250.0, 0.5
 """Distance of a camera from the flange, and share of it within which the board lies of the base's origin, from which
 on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""

@@ -26,8 +26,7 @@ GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """Residuals (rotation; translation as share of the distance) above which a pose is wrong from the start. No error of
 the camera file, which is solved for here, makes so much."""
 UNKNOWN_LENS = intrinsic_basis("OPENCV"), 1e-12 * np.eye(intrinsic_basis("OPENCV").shape[1])
-"""Basis of the intrinsics in which errors of the camera file are looked for, and an information that holds them back by
-nothing, px⁻²."""
+"""Basis of the intrinsics in which errors of the camera file are looked for, and their negligible information, px⁻²."""
 CAMERA_GAIN = 5.0
 """Gain in cost per intrinsic above which intrinsics are wrong. Eight right ones gain 8 ± 4 together, 1 ± 0.5 each."""
 SAME_DIGITS = 6
@@ -41,11 +40,9 @@ ROUNDS, SETTLED = 50, 1e-3
 ADJUST_ROUNDS, ROUGHLY = 20, 1e-6
 """Rounds of σ, and relative fall of the cost below which the minimisation within a round ends."""
 ARM_ROUNDS, SETTLED_MM = 10, 1e-3
-"""Rounds of linear steps of an arm, and largest motion of a flange in one of them, in mm, after which only squares of
-the motion are neglected."""
+"""Rounds of linear steps of an arm, and largest motion of a flange, in mm, whose square is negligible."""
 INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
-"""Number of steps from the solution of all poses to one without some of them, and their damping, which only keeps
-directions that nothing determines."""
+"""Steps from the solution of all poses to one without some, and their damping, for directions that nothing determines."""
 SEEN = 1e-3
 """Share of the robot's variance below which the corners tell nothing about the robot's error."""
 WORST = "check the poses that fit worst"

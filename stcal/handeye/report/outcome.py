@@ -125,8 +125,7 @@ WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 """Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
 that were never calibrated and poses of single tags stay below half of these."""
 OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
-"""Deviation of a board from its stated size, and in σ, beyond which it is told: a printer is off by that
-much, a pitch that was measured is not."""
+"""Deviation of a board's size, and in σ, beyond which it is told: printers err by that, measured pitches do not."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
