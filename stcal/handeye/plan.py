@@ -282,6 +282,5 @@ def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarr
         sigma_mm=planned.sigma_mm,
         turn_rad=planned.turn_rad,
         joints=joints,
-        base_from_flange=list(planned.base_from_flange),
-        camera_from_board=list(planned.camera_from_board),
+        **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
     )

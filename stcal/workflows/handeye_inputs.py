@@ -210,27 +210,20 @@ class Files:
     def _require_no_images(self) -> None:
         """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
         source = self.source
-        of_file, of_pairs, of_table = (isinstance(source, kind) for kind in (Path, ToldPairs, Table))
-        place = source.pairs.where if of_pairs else source.where if of_table else source
+        place, held = source, "is a file of poses"
+        if not isinstance(source, Path):
+            place, held = source.pairs.where if isinstance(source, ToldPairs) else source.where, "are poses"
+        elif self.robot is None and not source.exists():
+            raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
         extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
-        for refused, message in (
-            (self.robot is not None, "--with-kinematics: only with a folder of images, which show the arm's errors"),
-            (
-                extra,
-                f"{extra}: only with a folder of images; {place} {'is a file of poses' if of_file else 'are poses'}",
-            ),
-            (
-                self.timing.image_times is not None,
-                "--image-times: only with a folder of images; poses have their times beside them",
-            ),
-            (
-                self.timing.offset and not (of_pairs and source.timed is not None),
-                f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
-                "and --poses, each with times",
-            ),
-        ):
-            if of_file and not source.exists() and self.robot is None:
-                raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
+        timed = isinstance(source, ToldPairs) and source.timed is not None
+        times = f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
+        for message, refused in {
+            "--with-kinematics: only with a folder of images, which show the arm's errors": self.robot is not None,
+            f"{extra}: only with a folder of images; {place} {held}": bool(extra),
+            "--image-times: only with a folder of images; poses have their times beside them": self.timing.image_times,
+            f"{times}and --poses, each with times": self.timing.offset and not timed,
+        }.items():
             if refused:
                 raise InputError("E-OPTION-NEEDS", message)
 

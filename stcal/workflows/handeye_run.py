@@ -153,7 +153,8 @@ def with_arm(
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
     values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
-    found = ArmFound(arm.robot.name, *(dict(zip(arm.names(), each, strict=True)) for each in values), outcome.held_out)
+    parameters, sigma = (dict(zip(arm.names(), each, strict=True)) for each in values)
+    found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
     if held_out is not None and outcome.held_out is not None:
         now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:

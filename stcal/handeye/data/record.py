@@ -116,7 +116,9 @@ class Said:
             if place in values:
                 raise InputError("E-OPTION-REPEATED", f"{typed}: given twice; one for each of robot and camera")
             values[place] = name
-        own = tuple((role, *key[1:], name) for role in ROLES for key, name in values.items() if key[0] == role)
+        own: tuple[tuple[Role, str, str], ...] = tuple(
+            (role, option, name) for role in ROLES for (of, option), name in values.items() if of == role
+        )
         return cls(values.get(("", "rotation")), values.get(("", "length_unit")), tuple(frames), setup, own)
 
     def of(self, role: Role) -> "Said":

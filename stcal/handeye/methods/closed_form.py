@@ -16,7 +16,7 @@ from stcal.io.device import quiet_opencv
 SUBSETS = 200
 """Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
 LEAST_LENGTH = 0.1
-"""Least ratio of the length of the camera's paths to the flange's: 1 but for the board's size, 0 where neither moves."""
+"""Least ratio of the lengths of camera's and flange's paths: 1 but for the board's size, 0 where neither moves."""
 LEAST_SCALE = 1e-6
 """Smallest scale of the board; lengths in metres give 0.001."""
 SEED = 0

@@ -42,7 +42,7 @@ ADJUST_ROUNDS, ROUGHLY = 20, 1e-6
 ARM_ROUNDS, SETTLED_MM = 10, 1e-3
 """Rounds of linear steps of an arm, and largest motion of a flange, in mm, whose square is negligible."""
 INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
-"""Steps from the solution of all poses to one without some, and their damping, for directions that nothing determines."""
+"""Steps from the solution of all poses to one without some; damping of directions that nothing determines."""
 SEEN = 1e-3
 """Share of the robot's variance below which the corners tell nothing about the robot's error."""
 WORST = "check the poses that fit worst"

@@ -42,11 +42,11 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
     Raises InputError: a name is invalid, or the names are not all different.
     """
-    mount, first, *optical = frame_names(result.setup, parent, child, camera_frame)
-    if not optical:
+    mount, first, *below = frame_names(result.setup, parent, child, camera_frame)
+    if not below:
         return [Static(mount, first, result.mount_from_camera)]
     mount_from_link = result.mount_from_camera @ LINK_FROM_OPTICAL.inverse()
-    return [Static(mount, first, mount_from_link), Static(first, *optical, LINK_FROM_OPTICAL)]
+    return [Static(mount, first, mount_from_link), Static(first, below[0], LINK_FROM_OPTICAL)]
 
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
