@@ -57,9 +57,9 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
         return None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if isinstance(value, list) and isinstance(value[0], Mapping):
-        if (content := _of_pairs(value, form, where)) is not None:
-            return content
+    listed = isinstance(value, list) and isinstance(value[0], Mapping)
+    if (content := _of_pairs(list(value), form, where) if listed else None) is not None:
+        return content
     side = _side_of(value, where)
     return None if side is None else PoseContent(form, (side,))
 
