@@ -201,7 +201,7 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "code", "parts"),
     [
-        (["0.png", "0.png"], INPUT, ["line 2 and line 3: both are of image '0.png'"]),
+        (["0.png", "0.png"], INPUT, ["line 2 and line 3 are both image '0.png'"]),
         (["a.png", "b.png"], INPUT, ["no row is of an image in"]),
         (["0.png", "1.png"], COMPUTATION, ["2 poses, 3 needed", "left out before, first 2.png: no row in poses.csv"]),
     ],

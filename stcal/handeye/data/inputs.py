@@ -90,7 +90,8 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
     if len(content.sides) == 1:
         frames = content.sides[0].frames
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
-        raise InputError("E-POSES-MIXED", f"{path}: {content.form} with {held}; give robot's as --a, camera's as --b")
+        said = f"{path}: {content.form} with {held}"
+        raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
     robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"

@@ -163,7 +163,9 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError("E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both {kind}{name!r}; one needed")
+            raise InputError(
+                "E-POSE-REPEATED", f"{where}: {first[name]} and {place} are both {kind}{name!r}; one needed"
+            )
         first[name] = place
 
 

@@ -153,7 +153,8 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
             return None
         for i, sample in enumerate(samples, 1):
             if "robot" not in sample or camera_key not in sample:
-                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: robot, {camera_key} needed; take it out")
+                needed = f"robot and {camera_key} needed; take it out"
+                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: {needed}")
         lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
     else:
         return None
@@ -182,7 +183,8 @@ def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
         if isinstance(at, Mapping) and isinstance(turn, Mapping):
             row = numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
         if row is None:
-            raise InputError("E-POSE-VALUE", f"{where}: {place}: no translation x, y, z, rotation x, y, z, w; mend it")
+            said = "no translation x, y, z and rotation x, y, z, w; correct it"
+            raise InputError("E-POSE-VALUE", f"{where}: {place}: {said}")
         rows.append(row)
     require_finite(np.array(rows), places, where)
     rotation = of_quaternions(np.array(rows)[:, 3:], places, where)
