@@ -53,7 +53,8 @@ class Noise:
         for side in ("robot", "camera"):
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):
-                raise InputError("E-SIGMA-INCOMPLETE", f"noise: one σ of the {side} alone; σ_rot and σ_trans needed")
+                said = f"noise: one of σ_rot and σ_trans of the {side} is given"
+                raise InputError("E-SIGMA-INCOMPLETE", f"{said}; both or none needed")
             if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
                 said = f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm"
                 raise InputError("E-SIGMA-VALUE", f"{said}; 0 to {np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible")
