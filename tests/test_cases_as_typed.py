@@ -68,7 +68,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "chess_stretched_5_views": (Typed(says=("printed 0.508 % longer across its rows than along",)),),
     "colmap_300_cameras": (Typed(values=camera(1503, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)),),
     "ehe_eye_on_base_forgotten": (
-        Typed(says=("do not use: the camera is 1426 mm off the flange", "give --setup eye-to-hand")),
+        Typed(says=("No: the camera is 1426 mm off the flange", "give --setup eye-to-hand")),
     ),
     "elastic_file_differs": (
         Typed(says=("identified, the same rows            2.9963   3.3354",)),
@@ -86,8 +86,8 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "drawing_y_down": (
         Typed(COMPUTATION, says=("if these are its files, the drawing is mirrored: change the sign of y_mm",)),
     ),
-    "he_drift_1.7mm": (Typed(says=("with care", "the board drifts from the first pose to the last, by 1.6 mm")),),
-    "he_franka_column_major": (Typed(says=("verdict: good",)),),
+    "he_drift_1.7mm": (Typed(says=("With care", "the board drifts from the first pose to the last, by 1.6 mm")),),
+    "he_franka_column_major": (Typed(says=("May I use it? Yes",)),),
     "he_mobile_planar_4dof": (Typed(says=("flange_from_camera is not known along (0, 0, 1)",), never=("scatter",)),),
     "he_scara_4dof_noise": (Typed(says=("flange_from_camera is not known along (0, 0, 1)",), never=("scatter",)),),
     "he_tcp_set_halfway": (
@@ -96,7 +96,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "isoluminant_circles": (Typed(says=("Part: 2 of 5 faces", "17 checks passed")),),
     "keem_cube_folds": (Typed(says=("held near none", "Part, with care: 2 of 5 faces")),),
     "kitti": (Typed(INPUT, "E-CAMERA-CONTENT", ("COLMAP, OpenCV, ROS", "camera_matrix")),),
-    "kuka_semicolon_comma": (Typed(says=("use with care", "pose 2 contradicts the others")),),
+    "kuka_semicolon_comma": (Typed(says=("With care", "pose 2 contradicts the others")),),
     "loc_apriltag_ros_yaml": (Typed(COMPUTATION, says=(*HALF_A_TURN, "upright: true"), never=("accept ",)),),
     "loc_bundle": (Typed(says=("2 scenes, 2 accepted",)),),
     "loc_layout_y_up": (
@@ -169,12 +169,12 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         Typed(COMPUTATION, says=("e1.png shows 4 of its tags mirrored; use the files that the camera",)),
     ),
     "tum_lag_20ms_no_option": (
-        Typed(says=("do not use", "clock is 20 ± 0.1 ms behind the camera's", "solve with --time-offset")),
+        Typed(says=("No: ", "clock is 20 ± 0.1 ms behind the camera's", "solve with --time-offset")),
     ),
     "twelve_numbers_noheader": (
         Typed(INPUT, "E-POSES-NOT-FOUND", ("rows of 12 numbers without a header", "a table with named columns")),
     ),
-    "ur_pendant": (Typed(says=("use with care", "pose 2 contradicts the others")),),
+    "ur_pendant": (Typed(says=("With care", "pose 2 contradicts the others")),),
     "video_rotation_180": (Typed(says=("Part: 2 of 5 faces", "18 checks passed")),),
     "wal": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("db.db-wal", "copy both")),),
     "yaml_directive_comment": (
@@ -365,7 +365,7 @@ def test_flips_are_undone_as_the_verdict_says(typed, shared_case, tmp_path):
         int(i) + 1 for i in re.findall(r"\d+", (shared_case("aruco_flips_30pc") / "truth").read_text().split("[")[-2])
     ]
     assert f"6 of 20 poses: {', '.join(f'pose {i}' for i in rows)}" in outcome[1] + outcome[2]
-    assert "verdict: good" in outcome[1]
+    assert "May I use it? Yes" in outcome[1]
     found = np.array(json.loads((tmp_path / "h.json").read_text())["flange_from_camera"])
     assert apart(truth(shared_case("aruco_flips_30pc")), found)[1] < 1.0
 

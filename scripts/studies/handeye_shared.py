@@ -10,7 +10,6 @@ dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch
 import argparse
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,12 @@ import yaml
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.file import HandEyeFile
-from stcal.handeye.report.page import outcome_report
+from stcal.handeye.report.handeye_file import HandEyeFile
+from stcal.handeye.report.handeye_page import outcome_report
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye_inputs import read_handeye
-from stcal.workflows.handeye_run import ALL, Splits, calibrate
+from stcal.workflows.handeye_run import ALL, calibrate_handeye
 
 CHARUCO = """type = "charuco"
 rows = 7
@@ -48,11 +47,11 @@ radius_mm = 10.0
 # The two camera files of the data set differ by 8 and 14 px, and have no distortion.
 DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
 SHOWN = ("reprojection", "pose", "shah", "park-martin", "tsai-lenz", "daniilidis", "zhao")
-SPLITS, DEFAULT = Splits(15, held_out=5), Splits()
+SPLITS, DEFAULT = {"held_out": 5}, {}
 
 
 def charuco(
-    data: Path, scratch: Path, splits: Splits = SPLITS, method: str | None = None, adjusted: dict | None = None
+    data: Path, scratch: Path, splits: dict = SPLITS, method: str | None = None, adjusted: dict | None = None
 ) -> tuple[dict, str]:
     """What ``stcal handeye`` writes of charuco_handeye, and what it prints.
 
@@ -69,7 +68,7 @@ def charuco(
     return _handeye(folder, scratch, file, board, "eye-to-hand", method, splits, adjusted is None)
 
 
-def dots(data: Path, scratch: Path, splits: Splits = DEFAULT) -> tuple[dict, str]:
+def dots(data: Path, scratch: Path, splits: dict = DEFAULT) -> tuple[dict, str]:
     """The same on dotgrid_handeye."""
     folder = data / "dotgrid_handeye"
     camera = read_camera(folder / "camera_intr_calibrated.yaml").sized(640, 480)
@@ -101,16 +100,16 @@ def _handeye(
     board: str,
     setup: str,
     method: str | None,
-    splits: Splits,
+    splits: dict,
     adjust: bool,
 ) -> tuple[dict, str]:
     """One data set; ``adjust`` : camera and size of the board too."""
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
     poses = robot_table(folder / "poses", scratch / "poses.csv")
-    given = read_handeye(folder / "images", poses, camera, scratch / "board.toml", workers=splits.workers)
-    options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
-    outcome = calibrate(given, setup, method, options, splits)
+    files, workers = (folder / "images", poses, camera, scratch / "board.toml"), splits.get("workers")
+    given = read_handeye(*files, setup=setup, workers=workers)
+    outcome = calibrate_handeye(given, method, HandEyeOptions(with_scale=adjust), refine_camera=adjust, **splits)
     return HandEyeFile.of(outcome, whole=True).content(), outcome_report(outcome).text()
 
 
@@ -153,7 +152,7 @@ def main() -> None:
         print(f"\ncharuco_handeye, camera and board as adjusted\n\n{text[text.index('Methods') :]}")
         _compare(found)
         _side_by_side({"camera and board as filed": as_filed, "camera and board as adjusted": found})
-        many, _ = charuco(data, Path(scratch) / "many", replace(SPLITS, repeats=60))
+        many, _ = charuco(data, Path(scratch) / "many", SPLITS | {"repeats": 60})
         print(f"reprojection over 60 splits, all adjusted: mean {by_split(many).mean():.3f} mm")
         found, text = dots(data, Path(scratch) / "dots")
         print(f"\ndotgrid_handeye\n\n{text}")

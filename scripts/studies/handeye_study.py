@@ -20,11 +20,11 @@ from scripts.runner import options_of
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
-from stcal.handeye.data.pairs import SETUPS, Loop
-from stcal.handeye.data.views import Views, pairs_of_views
+from stcal.handeye.data.corner_views import Views, pairs_of_views
+from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from stcal.io.cameras.model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of

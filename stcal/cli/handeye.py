@@ -33,8 +33,7 @@ class PoseFiles:
     ] = None
     poses: Annotated[
         Path | None,
-        "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices (JSON, npz, npy) or a "
-        "TUM trajectory.",
+        "Read the robot's poses here: image, base_from_flange_… (CSV), 4×4 matrices (JSON, npz, npy) or a TUM file.",
     ] = None
     camera: Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."] = None
     board: Annotated[
@@ -44,13 +43,12 @@ class PoseFiles:
     ] = None
     setup: Annotated[
         Literal["eye-in-hand", "eye-to-hand"] | None,
-        "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file "
-        "decides; if it does not say, eye-in-hand.",
+        "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; if not given, as in the file.",
     ] = None
     rotation: Annotated[
         list[str] | None,
-        "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
-        "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
+        "Read angles in this convention, if the file names none: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
+        "(fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
     ] = None
     length_unit: Annotated[
         list[str] | None,
@@ -58,8 +56,8 @@ class PoseFiles:
     ] = None
     poses_are: Annotated[
         list[str] | None,
-        "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
-        "camera_from_board or board_from_camera; once for each side.",
+        "Take poses in this direction, if the file names none, once a side: base_from_flange or flange_from_base; "
+        "camera_from_board or board_from_camera.",
     ] = None
     first: shared.FirstTable = None
     second: shared.SecondTable = None
@@ -84,6 +82,7 @@ class PoseFiles:
 POSE_FILES = PoseFiles()
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
+SIGMA, MANY = Opt(min=0), Opt(min=1, max=100_000)
 
 
 def handeye(
@@ -95,60 +94,38 @@ def handeye(
         "in their files and solved for; the one that predicts held-out poses best is used.",
     ] = None,
     sigma_robot_mm: Annotated[
-        float | None, "Set σ of the flange's position, mm; needs --sigma-robot-deg.", Opt(min=0)
+        float | None, "Set σ of the flange's position, mm; with --sigma-robot-deg.", SIGMA
     ] = None,
-    sigma_robot_deg: Annotated[
-        float | None, "Set σ of the flange's rotation; estimated if not given.", Opt(min=0)
-    ] = None,
-    sigma_camera_mm: Annotated[
-        float | None, "Set σ of the board's position, mm; needs --sigma-camera-deg.", Opt(min=0)
-    ] = None,
-    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", Opt(min=0)] = None,
-    sigma_px: Annotated[
-        float | None, "Set the σ of a corner, px; for dots and tags, as a factor of their own σ.", Opt(min=1e-9)
-    ] = None,
-    sigma_board_mm: Annotated[
-        float | None, "Set the σ of a corner's position on the board, mm; 0 if exact.", Opt(min=0)
-    ] = None,
-    refine_camera: Annotated[
-        bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
-    ] = False,
+    sigma_robot_deg: Annotated[float | None, "Set σ of the flange's rotation; estimated if not given.", SIGMA] = None,
+    sigma_camera_mm: Annotated[float | None, "Set σ of the board's position; with --sigma-camera-deg.", SIGMA] = None,
+    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", SIGMA] = None,
+    sigma_px: Annotated[float | None, "Set σ of a corner, px; of dots and tags, a factor.", Opt(min=1e-9)] = None,
+    sigma_board_mm: Annotated[float | None, "Set σ of a corner's position on the board; 0 if exact.", SIGMA] = None,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones and weighted by their σ."] = False,
     with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     with_kinematics: Annotated[
         Path | None,
-        "Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
-        "columns q1_deg … of --poses.",
+        "Adjust this robot (TOML) and the intrinsics too, from images and joint values: columns q1_deg … of --poses.",
     ] = None,
-    robot_out: Annotated[
-        Path | None, "Write the robot of --with-kinematics to this file, as adjusted (TOML).", WRITES
-    ] = None,
+    robot_out: Annotated[Path | None, "Write the adjusted robot of --with-kinematics to this file.", WRITES] = None,
     undo_flips: Annotated[
         bool,
         "Replace a pose of a flat target by its second solution, tilted the other way, if only that one agrees with "
         "the other poses; not with images.",
     ] = False,
     four_dof: Annotated[bool, "Solve only for what a flange determines that turns about one axis (SCARA)."] = False,
-    held_out: Annotated[
-        int | None, "Hold out this many poses in each split; a quarter of them if not given.", Opt(min=1, max=100_000)
-    ] = None,
+    held_out: Annotated[int | None, "Hold out this many poses in each split; a quarter if not given.", MANY] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
     seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
-    time_offset: Annotated[
-        bool, "Find the offset between the clocks of robot and camera from poses with times, and apply it."
-    ] = False,
+    time_offset: Annotated[bool, "Find the offset between the clocks of robot and camera, and apply it."] = False,
     image_times: Annotated[
         Path | None, "Read the times of the images from this file: image, time_s (CSV); if not given, from their names."
     ] = None,
     time_tolerance: Annotated[
-        float,
-        "Take the robot's nearest pose within this time, s, if none can be interpolated.",
-        Opt(min=0, max=3600),
+        float, "Take the robot's nearest pose within this time, s, if none can be interpolated.", Opt(min=0, max=3600)
     ] = 0.02,
     motions_held_out: Annotated[
-        int | None,
-        "Hold out this many motions at the end, and predict them from the motions before, as the paper on "
-        "differential evolution does with 6 of 24.",
-        Opt(min=1, max=100_000),
+        int | None, "Hold out this many motions at the end, and predict them from the motions before.", MANY
     ] = None,
     out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
     ros: Annotated[Path | None, "Write a static transform of ROS to this file (YAML, metres).", WRITES] = None,
@@ -156,20 +133,16 @@ def handeye(
     opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        "Write the transform to this file; repeat it for more files. Forms: ros2, moveit, moveit2, easy-handeye, "
-        "easy-handeye2.",
+        "Write the transform to this file; may be repeated. Forms: ros2, moveit, moveit2, easy-handeye, easy-handeye2.",
         Opt(metavar="FORM=FILE"),
     ] = None,
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
     child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
         Literal["optical", "link"],
-        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical frame "
-        "below it.",
+        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with that frame below it.",
     ] = "optical",
-    camera_out: Annotated[
-        Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
-    ] = None,
+    camera_out: Annotated[Path | None, "Write the adjusted camera with σ to this file (cameras.txt).", WRITES] = None,
     de_bounds_deg: Annotated[
         str | None,
         "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
@@ -187,10 +160,10 @@ def handeye(
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
-    from stcal.handeye.report import export as forms
-    from stcal.handeye.report.file import HandEyeFile
+    from stcal.handeye.report import transform_export as forms
+    from stcal.handeye.report.handeye_file import HandEyeFile
+    from stcal.handeye.report.handeye_page import outcome_report
     from stcal.handeye.report.outcome import judged
-    from stcal.handeye.report.page import outcome_report
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
@@ -204,78 +177,55 @@ def handeye(
     timing = Timing(time_tolerance, image_times, time_offset)
     exports = shared.exports_of(export or [], forms.FORMS)
     given, folder = files.given(timing), files.source is not None and files.source.is_dir()
-    needs, wrong_method, conflict = "E-OPTION-NEEDS", "E-OPTION-METHOD", "E-OPTION-CONFLICT"
-    for refused, code, message in (
-        (
-            camera_out and not (refine_camera or with_kinematics),
-            needs,
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
-        ),
-        (
-            refine_camera and not folder,
-            needs,
-            "--refine-camera: only with images; poses do not determine the intrinsics",
-        ),
-        (
-            camera_out and method not in (None, ALL, "reprojection"),
-            wrong_method,
-            f"--camera-out: {method} does not adjust the camera; leave --method out",
-        ),
-        (
-            method not in (None, ALL, *METHODS),
-            wrong_method,
-            f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed",
-        ),
-        (
-            robot_out and not with_kinematics,
-            needs,
-            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file",
-        ),
-        (
-            with_kinematics and not folder,
-            needs,
-            "--with-kinematics: only with a folder of images, which show the arm's errors",
-        ),
-        (
-            with_kinematics and method not in (None, "reprojection"),
-            wrong_method,
-            f"--with-kinematics: {method} does not solve for the arm; leave --method out",
-        ),
-        (
-            with_kinematics and four_dof,
-            conflict,
-            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
-        ),
-        (
-            (parent or child or camera_frame != "optical") and not (ros or urdf or exports),
-            needs,
-            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
-        ),
-        (
-            not folder and (sigma_px is not None or sigma_board_mm is not None),
-            needs,
-            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg",
-        ),
-        (
-            folder and sigma_camera_mm is not None,
-            needs,
-            "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px",
-        ),
-        (
-            (de_bounds_deg or de_bounds_mm) and method not in (ALL, "de", "de-polished"),
-            needs,
-            f"--de-bounds-…: only with --method de, de-polished or {ALL}",
-        ),
-    ):
-        if refused:
-            raise InputError(code, message)
+    by_corners = "only with a folder of images, which show the arm's errors"
+    for code, refusals in {
+        "E-OPTION-NEEDS": {
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given": (
+                camera_out and not (refine_camera or with_kinematics)
+            ),
+            "--refine-camera: only with images; poses do not determine the intrinsics": refine_camera and not folder,
+            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file": (
+                robot_out and not with_kinematics
+            ),
+            f"--with-kinematics: {by_corners}": with_kinematics and not folder,
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name": (
+                (parent or child or camera_frame != "optical") and not (ros or urdf or exports)
+            ),
+            "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg": (
+                not folder and (sigma_px is not None or sigma_board_mm is not None)
+            ),
+            "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px": (
+                folder and sigma_camera_mm is not None
+            ),
+            f"--de-bounds-…: only with --method de, de-polished or {ALL}": (
+                (de_bounds_deg or de_bounds_mm) and method not in (ALL, "de", "de-polished")
+            ),
+        },
+        "E-OPTION-METHOD": {
+            f"--camera-out: {method} does not adjust the camera; leave --method out": (
+                camera_out and method not in (None, ALL, "reprojection")
+            ),
+            f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed": (
+                method not in (None, ALL, *METHODS)
+            ),
+            f"--with-kinematics: {method} does not solve for the arm; leave --method out": (
+                with_kinematics and method not in (None, "reprojection")
+            ),
+        },
+        "E-OPTION-CONFLICT": {
+            "--with-kinematics, --four-dof: give one of them; turns about one axis do not determine the kinematics": (
+                with_kinematics and four_dof
+            ),
+        },
+    }.items():
+        for message, refused in refusals.items():
+            if refused:
+                raise InputError(code, message)
     forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
     if with_kinematics:
         given = replace(given, robot=load_robot(with_kinematics))
-    shift, turn = (
-        _bounds("--de-bounds-mm", de_bounds_mm, 1.0),
-        _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
-    )
+    shift = _bounds("--de-bounds-mm", de_bounds_mm, 1.0)
+    turn = _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1))
     evolved = EvolutionOptions(bounds_mm=shift) if turn is None else EvolutionOptions(bounds_rad=turn, bounds_mm=shift)
     if dry_run:
         say("\n".join(given.dry_run()))
@@ -284,25 +234,14 @@ def handeye(
         inputs = given.read(files.workers, progress)
         for line in inputs.understood:
             say(line)
-        options = HandEyeOptions(
-            noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolved
-        )
+        prior = inputs.prior if refine_camera else None
+        options = HandEyeOptions(noise, prior, with_scale, inputs.symmetries, four_dof, evolved)
         if undo_flips:
             inputs, undone = without_flips(inputs, options)
             say(undone)
-        outcome = calibrate_handeye(
-            inputs,
-            method,
-            options,
-            refine_camera=refine_camera,
-            time_offset=time_offset,
-            repeats=splits,
-            held_out=held_out,
-            seed=seed,
-            motions=motions_held_out,
-            workers=files.workers,
-            progress=progress,
-        )
+        validation = {"repeats": splits, "held_out": held_out, "seed": seed, "motions": motions_held_out}
+        asked = {"refine_camera": refine_camera, "time_offset": time_offset, "workers": files.workers}
+        outcome = calibrate_handeye(inputs, method, options, **asked, **validation, progress=progress)
     result = outcome.result
     document = outcome_report(outcome)
     say(document.text())
@@ -326,8 +265,8 @@ def handeye(
     write_if(report, document.page)
     if camera_out:
         if (adjusted := result.reprojection) is None:
-            method = result.method
-            raise InputError(wrong_method, f"--camera-out: {method} does not adjust the camera; leave --method out")
+            by = result.method
+            raise InputError("E-OPTION-METHOD", f"--camera-out: {by} does not adjust the camera; leave --method out")
         camera_out.parent.mkdir(parents=True, exist_ok=True)
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")
@@ -336,7 +275,8 @@ def handeye(
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
-    shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
+    found = judged(outcome)
+    shared.require_passed(strict, found.failed(), report, found.doubt())
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":

@@ -1,7 +1,7 @@
 """Default way of solving, where the user names none: the one with the smallest errors on held-out poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -10,17 +10,14 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import HandEyePoses, Setup
-from stcal.handeye.data.views import Views
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions, solved
+from stcal.handeye.solving import HandEyeProblem
 from stcal.handeye.validate import (
     HeldOutPoses,
     deciding_error,
-    predicted,
-    repaired,
-    require_solvable_without,
+    errors_of,
+    naming_held_out,
     with_common_errors,
     with_jackknife,
 )
@@ -48,7 +45,7 @@ CONTRADICT = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class Way:
     """A way of solving: the ``method``, and whether intrinsics (``camera``) and the board's ``scale`` are unknowns."""
 
     method: str
@@ -65,252 +62,201 @@ class Candidate:
         unknowns = [*["the intrinsics"] * self.camera, *["the board's size"] * self.scale]
         return f"{self.method} with {' and '.join(unknowns)} solved for" if unknowns else f"{self.method} as filed"
 
-    def options(self, options: HandEyeOptions, prior: CameraPrior | None) -> HandEyeOptions:
-        """Returns the options of this candidate. ``prior`` holds the intrinsics where they are solved for."""
-        return replace(options, intrinsics=prior if self.camera else None, with_scale=self.scale)
+    def of(self, problem: HandEyeProblem, prior: CameraPrior | None) -> HandEyeProblem:
+        """Returns the problem with the unknowns of this candidate. ``prior`` : of the intrinsics."""
+        options = replace(problem.options, intrinsics=prior if self.camera else None, with_scale=self.scale)
+        return replace(problem, options=options)
 
 
-CLOSED_FORMS = tuple(Candidate(method) for method in (*AX_ZB, *AX_XB))
+CLOSED_FORMS = tuple(Way(method) for method in (*AX_ZB, *AX_XB))
 """They weigh nothing, so that nothing is wrong with their weights: with few poor images they may be the best."""
-BY_POSES = (Candidate("pose"), Candidate("pose", scale=True), *CLOSED_FORMS)
+BY_POSES = (Way("pose"), Way("pose", scale=True), *CLOSED_FORMS)
 BY_VIEWS = (
-    Candidate("reprojection"),
-    Candidate("pose"),
-    Candidate("reprojection", camera=True),
-    Candidate("reprojection", scale=True),
-    Candidate("pose", scale=True),
-    Candidate("reprojection", camera=True, scale=True),
+    Way("reprojection"),
+    Way("pose"),
+    Way("reprojection", camera=True),
+    Way("reprojection", scale=True),
+    Way("pose", scale=True),
+    Way("reprojection", camera=True, scale=True),
     *CLOSED_FORMS,
 )
 """Candidates that are tried with corners; those that trust the files come first."""
 
 
-NO_ERRORS = np.zeros((0, 0))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Tried:
-    """A candidate and its errors: ``error_mm`` : (s, k) on held-out poses, (0, 0) if it fails, and then ``reason``."""
+    """A way of solving that was tried.
 
-    candidate: Candidate
-    error_mm: np.ndarray
+    ``error_mm`` : (s, k) its errors on held-out poses, (0, 0) if it fails, and then ``reason``; ``result`` : from all
+    poses; ``partial`` : results without the poses of each split; ``shown`` : whether all poses contradict each file
+    whose content is solved for; ``shown_without`` : (s,) whether the poses besides those of each split do.
+    """
+
+    candidate: Way
+    error_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     reason: str = ""
+    result: HandEye | None = None
+    partial: tuple[HandEye, ...] = ()
+    shown: bool = False
+    shown_without: tuple[bool, ...] = ()
 
     @property
     def mean_mm(self) -> float:
         """Mean of all errors, or NaN if there are none."""
         return float(self.error_mm.mean()) if self.error_mm.size else float("nan")
 
+    @property
+    def closed(self) -> bool:
+        """True for a closed form."""
+        return self.candidate in CLOSED_FORMS
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class ChosenWay:
     """The candidates that were tried, and the one that was chosen.
 
-    Parameters
-    ----------
-    tried : all candidates, those that trust the files first
-    chosen : the candidate that was chosen
-    result : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more
-        than the σ allow.
-    held_out : errors of the choice as a whole: in each split, of the candidate that the errors on all other poses
-        choose
-    sentence : the choice, what it gains, and what it says about camera file, board and robot
-    notes : notes on answers that contradict each other
+    ``tried`` : all candidates, those that trust the files first; ``chosen`` : the candidate that was chosen; ``result``
+    : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more than the
+    σ allow; ``held_out`` : errors of the choice as a whole: in each split, of the candidate that the errors on all
+    other poses choose; ``sentence`` : the choice, what it gains, and what it says about camera file, board and robot;
+    ``notes`` : notes on answers that contradict each other.
     """
 
     tried: tuple[Tried, ...]
-    chosen: Candidate
+    chosen: Way
     result: HandEye
     held_out: HeldOutPoses
     sentence: str
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Outcome:
-    """``result`` of a candidate from all poses, its ``partial`` results without the poses of each split, and their
-    errors on these, ``error_mm`` (s, k). ``shown`` : whether all poses contradict each file whose content is solved
-    for; ``shown_without`` : (s,) whether the poses besides those of each split do."""
-
-    result: HandEye
-    partial: tuple[HandEye, ...]
-    error_mm: np.ndarray
-    shown: bool
-    shown_without: np.ndarray
-
-
-def _solved(
-    pairs: HandEyePoses, setup: Setup, method: str, views: Views | None, options: HandEyeOptions, rows: np.ndarray
-) -> _Outcome | StcalError:
+def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried | StcalError:
     """Returns the results of a candidate from all poses and without those of each split, or the error if it fails."""
     try:
-        solution = solved(pairs, setup, method, views, options)
+        solution = problem.solved(candidate.method)
         partial = tuple(solution.without(out) for out in rows)
-        result = solution.result
     except StcalError as error:
         return error
-    errors = [
-        deciding_error(part, pairs[out], None if views is None else views[out])
-        for part, out in zip(partial, rows, strict=True)
-    ]
-    share = 1 - rows.shape[1] / len(pairs)
-    shown_without = np.array([_shown(part, options, views, share) for part in partial])
-    return _Outcome(result, partial, np.array(errors), _shown(result, options, views), shown_without)
+    unseen, share = (problem[out] for out in rows), 1 - rows.shape[1] / len(problem)
+    errors = [deciding_error(part, own.pairs, own.views) for part, own in zip(partial, unseen, strict=True)]
+    shown_without = tuple(_shown(part, problem, share) for part in partial)
+    shown = _shown(solution.result, problem)
+    return Tried(candidate, np.array(errors), "", solution.result, partial, shown, shown_without)
 
 
-def _with_sigma(
-    result: HandEye, pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
-) -> HandEye:
-    """Returns the result of a closed form with covariances by the jackknife, or any other as it is."""
-    if result.covariance is not None:
-        return result
-    solution = solved(pairs, setup, result.method, views, options)
-    result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
-    return with_common_errors(result, pairs, setup, options)
-
-
-def _shown(result: HandEye, options: HandEyeOptions, views: Views | None, share: float = 1.0) -> bool:
+def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool:
     """True if board and intrinsics, where solved for from this ``share`` of the poses, differ from their files beyond
     chance."""
-    tests = []
-    if options.with_scale and result.sigma_scale:
+    tests, found, intrinsics = [], result.reprojection, problem.options.intrinsics
+    if problem.options.with_scale and result.sigma_scale:
         tests.append((((result.scale - 1) / result.sigma_scale) ** 2, 1))
-    found = result.reprojection
-    if options.intrinsics is not None and views is not None and found is not None:
-        basis = intrinsic_basis(options.intrinsics.colmap_model)
-        off = basis.T @ (found.camera.parameters() - views.camera.parameters()) / basis.sum(0)
+    if intrinsics is not None and problem.views is not None and found is not None:
+        basis = intrinsic_basis(intrinsics.colmap_model)
+        off = basis.T @ (found.camera.parameters() - problem.views.camera.parameters()) / basis.sum(0)
         if found.camera_covariance is not None:
             tests.append((float(off @ generalised_inverse(found.camera_covariance) @ off), len(off)))
     return all(share * squared > chi2.ppf(1 - SHOWN, dof) for squared, dof in tests)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """The candidates that were solved, in their order, and the poses held out, (s, k)."""
-
-    outcomes: dict[Candidate, _Outcome]
-    rows: np.ndarray
-
-    def best(self, split: int | None = None) -> Candidate:
-        """Returns the first candidate that is not behind the best by more than chance, without the poses of the
-        ``split``; none that solves for what these poses do not show."""
-        rows = self.rows if split is None else np.where(np.isin(self.rows, self.rows[split]), -1, self.rows)
-        if (rows < 0).all():  # a single split: no other poses were held out
-            rows = self.rows
-        adjusted = [
-            each
-            for each, outcome in self.outcomes.items()
-            if each not in CLOSED_FORMS and (outcome.shown if split is None else outcome.shown_without[split])
-        ]
-        closed = [each for each in self.outcomes if each in CLOSED_FORMS]
-        chosen = self._first_of(adjusted or closed, rows)
-        rival = self._first_of(closed, rows) if adjusted and closed else chosen
-        return rival if self._behind(chosen, rival, rows) > WITHOUT_WEIGHTS else chosen
-
-    def _first_of(self, candidates: list[Candidate], rows: np.ndarray) -> Candidate:
-        """Returns the first of the candidates that is not behind the best of them by more than chance."""
-        best = min(candidates, key=lambda each: float(self.outcomes[each].error_mm[rows >= 0].mean()))
-        return next(each for each in candidates if self._behind(each, best, rows) <= BY_CHANCE)
-
-    def _behind(self, candidate: Candidate, other: Candidate, rows: np.ndarray) -> float:
-        """Returns the mean error of a candidate minus that of another one, in standard errors of this difference."""
-        difference = self.outcomes[candidate].error_mm - self.outcomes[other].error_mm
-        excess, standard_error = _difference(difference, rows)
-        return excess / max(standard_error, TINY_MM) if excess > 0 else 0.0
-
-    def as_good(self, candidate: Candidate, chosen: Candidate) -> bool:
-        """True if the candidate predicts as well as the chosen one, within one standard error."""
-        return self._behind(candidate, chosen, self.rows) <= AS_GOOD
+def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tried:
+    """Returns the first of the tried that is not behind the best by more than chance, without the poses of the
+    ``split``; none that solves for what these poses do not show. ``rows`` : (s, k) poses held out."""
+    if split is not None:
+        others = np.where(np.isin(rows, rows[split]), -1, rows)
+        rows = rows if (others < 0).all() else others  # a single split: no other poses were held out
+    shown = [each for each in tried if (each.shown if split is None else each.shown_without[split])]
+    adjusted, closed = ([each for each in shown if each.closed == kind] for kind in (False, True))
+    chosen = _first_of(adjusted or closed, rows)
+    rival = _first_of(closed, rows) if adjusted and closed else chosen
+    return rival if _behind(chosen, rival, rows) > WITHOUT_WEIGHTS else chosen
 
 
-def _difference(off: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
-    """Returns the mean over poses of differences ``off`` (s, k), and its standard error; ``rows`` (s, k) below 0 are
-    ignored."""
-    valid = rows >= 0
-    poses = np.unique(rows[valid])
-    means = np.array([off[valid & (rows == pose)].mean() for pose in poses])
-    return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
+def _first_of(tried: list[Tried], rows: np.ndarray) -> Tried:
+    """Returns the first of the tried that is not behind the best of them by more than chance."""
+    best = min(tried, key=lambda each: float(each.error_mm[rows >= 0].mean()))
+    return next(each for each in tried if _behind(each, best, rows) <= BY_CHANCE)
+
+
+def _behind(one: Tried, other: Tried, rows: np.ndarray) -> float:
+    """Returns the mean over poses of the error of one minus that of the other, in standard errors of this difference;
+    0 where it is not positive. ``rows`` (s, k) below 0 are ignored."""
+    off, valid = one.error_mm - other.error_mm, rows >= 0
+    means = np.array([off[valid & (rows == pose)].mean() for pose in np.unique(rows[valid])])
+    standard_error = float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
+    return max(float(means.mean()), 0.0) / max(standard_error, TINY_MM)
 
 
 @one_thread()
 def choose(
-    pairs: HandEyePoses,
-    setup: Setup,
-    views: Views | None,
-    options: HandEyeOptions,
+    problem: HandEyeProblem,
     prior: CameraPrior | None,
     rows: np.ndarray,
     workers: int | None = 1,
     progress: Callable[[int, int], None] = lambda *_: None,
-) -> Choice:
+) -> ChosenWay:
     """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form.
 
     A candidate with unknown board or camera takes part where they differ from their files by more than chance.
     :func:`~stcal.handeye.validate.deciding_error` on held-out poses decides. Solutions without some poses are one step
     from the solution of all.
 
-    ``options`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
+    ``problem`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
     None; ``rows`` : (s, k) poses to hold out in each split; ``progress`` : called with the number of solutions done,
     and of all.
 
     Raises StcalError: the first candidate, which trusts all files, fails.
     """
-    pairs, views, options = repaired(pairs, setup, views, options)
+    problem = problem.mended()
     for out in rows:
-        require_solvable_without(pairs, setup, options, out)
-    candidates = [
-        candidate
-        for candidate in (BY_POSES if views is None else BY_VIEWS)
-        if (prior is not None or not candidate.camera) and not (options.four_dof and candidate in CLOSED_FORMS)
-    ]
-    jobs = [
-        (pairs, setup, candidate.method, views, candidate.options(options, prior), rows) for candidate in candidates
-    ]
-    finished: dict[int, _Outcome | StcalError] = {}
-    for i, outcome in run_parallel(_solved, jobs, 1 if views is None else workers):
-        if i == 0 and isinstance(outcome, StcalError):  # what the first one cannot use, the others should not
-            raise outcome
-        finished[i] = outcome
+        with naming_held_out(problem, out):
+            problem.without(out).require_observable()
+    every, four_dof = BY_POSES if problem.views is None else BY_VIEWS, problem.options.four_dof
+    candidates = [way for way in every if (prior or not way.camera) and not (four_dof and way in CLOSED_FORMS)]
+    jobs = [(candidate.of(problem, prior), candidate, rows) for candidate in candidates]
+    finished: dict[Way, Tried | StcalError] = {}
+    for i, found in run_parallel(_try, jobs, 1 if problem.views is None else workers):
+        if i == 0 and isinstance(found, StcalError):  # what the first one cannot use, the others should not
+            raise found
+        finished[candidates[i]] = found
         progress(len(finished), len(jobs))
-    outcomes = {candidate: finished[i] for i, candidate in enumerate(candidates)}
-    trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
-    chosen = trial.best()
+    able = [each for candidate in candidates if isinstance(each := finished[candidate], Tried)]
+    chosen = _best(able, rows)
     try:  # of a closed form the σ cost a solution for each pose: they are made for the chosen one alone
-        result = _with_sigma(trial.outcomes[chosen].result, pairs, setup, views, chosen.options(options, prior))
+        result = _with_sigma(chosen, chosen.candidate.of(problem, prior))
     except StcalError as error:
-        outcomes[chosen] = error
-        trial = _Trial({each: own for each, own in trial.outcomes.items() if each not in CLOSED_FORMS}, rows)
-        chosen = trial.best()
-        result = trial.outcomes[chosen].result
-    best_of_splits = [trial.outcomes[trial.best(k)].partial[k] for k in range(len(rows))]
-    errors = [
-        predicted(part, pairs[out], None if views is None else views[out])
-        | {"mount_from_camera": part.mount_from_camera.matrix()}
-        for part, out in zip(best_of_splits, rows, strict=True)
-    ]
+        finished[chosen.candidate] = error
+        able = [each for each in able if not each.closed]
+        chosen = _best(able, rows)
+        result = _with_sigma(chosen, problem)
+    best_of_splits = (_best(able, rows, k).partial[k] for k in range(len(rows)))
+    errors = [errors_of(part, problem[out]) for part, out in zip(best_of_splits, rows, strict=True)]
     held_out = HeldOutPoses.of_splits(rows, errors)
-    tried = tuple(
-        Tried(candidate, NO_ERRORS, str(each)) if isinstance(each, StcalError) else Tried(candidate, each.error_mm)
-        for candidate, each in outcomes.items()
-    )
-    rivals = {
-        candidate: outcome.result
-        for candidate, outcome in trial.outcomes.items()
-        if candidate != chosen and candidate not in CLOSED_FORMS and trial.as_good(candidate, chosen)
-    }
+    every = ((candidate, finished[candidate]) for candidate in candidates)
+    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in every)
+    others = (each for each in able if each is not chosen and not each.closed)
+    rivals = [each for each in others if _behind(each, chosen, rows) <= AS_GOOD]
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
-    of_splits = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
+    of_splits = np.array([part.mount_from_camera.matrix() for part in chosen.partial])
     result = replace(held_out, mount_from_camera=of_splits).widened(result)
-    result, notes = _widened(result, chosen, rivals)
-    where = "of the board's origin" if views is None else "at the board"
-    return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, where), notes)
+    result, notes = _widened(result, chosen.candidate, rivals)
+    where = "of the board's origin" if problem.views is None else "at the board"
+    return ChosenWay(tried, chosen.candidate, result, held_out, _sentence(tried, chosen, result, where), notes)
 
 
-def _widened(result: HandEye, chosen: Candidate, rivals: dict[Candidate, HandEye]) -> tuple[HandEye, tuple[str, ...]]:
+def _with_sigma(tried: Tried, problem: HandEyeProblem) -> HandEye:
+    """Returns the result of a closed form with covariances by the jackknife, or any other as it is."""
+    if tried.result is not None and tried.result.covariance is not None:
+        return tried.result
+    solution = problem.solved(tried.candidate.method)
+    without_one = [solution.without(np.array([i])) for i in range(len(problem))]
+    return with_common_errors(with_jackknife(solution.result, without_one), problem)
+
+
+def _widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
     """Widens σ until they cover the rivals, which predict as well. Returns the result, and notes on distant rivals."""
     factor, notes, pose = 1.0, [], Poses.of([result.mount_from_camera])
-    for candidate, rival in rivals.items():
-        if result.covariance is None or rival.covariance is None:
+    for each in rivals:
+        if (rival := each.result) is None or result.covariance is None or rival.covariance is None:
             continue
         gap = Poses.of([rival.mount_from_camera]).difference(pose)[0]
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
@@ -319,26 +265,23 @@ def _widened(result: HandEye, chosen: Candidate, rivals: dict[Candidate, HandEye
             factor = max(factor, ratio)
             turn, shift = np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             notes.append(
-                f"{candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
+                f"{each.candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
                 f"{ratio:.2g} times what their σ allow: σ are widened by that"
             )
     return result.widened(factor), tuple(notes)
 
 
-def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, where: str) -> str:
+def _sentence(tried: tuple[Tried, ...], chosen: Tried, result: HandEye, where: str) -> str:
     """Returns the choice, its gain, and what it says about camera file, board and robot, in one sentence."""
-    by_candidate = {each.candidate: each for each in tried}
-    chosen_mm, plain = by_candidate[chosen].mean_mm, tried[0]
-    parts = [
-        f"{len(tried)} ways of solving were compared by poses held out; the best, {chosen.in_words()}, errs by "
-        f"{chosen_mm:.3g} mm {where}"
-    ]
-    if plain.candidate != chosen:
+    way, plain = chosen.candidate, tried[0]
+    first = f"{len(tried)} ways of solving were compared by poses held out; the best, {way.in_words()}, errs by "
+    parts = [f"{first}{chosen.mean_mm:.3g} mm {where}"]
+    if plain.candidate != way:
         parts[0] += f", {plain.candidate.in_words()} by {plain.mean_mm:.3g} mm" if plain.error_mm.size else ""
-    filed_mm = [each.mean_mm for each in tried if chosen.camera and not each.candidate.camera and each.error_mm.size]
+    filed_mm = [each.mean_mm for each in tried if way.camera and not each.candidate.camera and each.error_mm.size]
     if filed_mm:
-        parts.append(f"the camera file costs {min(filed_mm) - chosen_mm:.2g} mm")
-    if chosen.scale and result.sigma_scale is not None:
+        parts.append(f"the camera file costs {min(filed_mm) - chosen.mean_mm:.2g} mm")
+    if way.scale and result.sigma_scale is not None:
         percent = 100 * (result.scale - 1)
         size = f"{abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {'larger' if percent > 0 else 'smaller'} than"
         if abs(percent) >= MANY_PERCENT:

@@ -13,8 +13,8 @@ from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.data.pairs import HandEyePoses, Loop
-from stcal.handeye.result import HandEye
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
+from stcal.handeye.handeye_result import HandEye
 from stcal.io.json import Pose, ResultFile, Vector
 from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table
@@ -29,8 +29,7 @@ MOST_TILT = np.radians(40)
 MARGIN = 0.1
 """Margin that the board's outermost points keep from the image border, as a share of the image's sides."""
 ABOUT = 0.25
-"""Distance from the board's mean place to the other points at which σ is judged, in distances of the board from the
-camera."""
+"""Distance from the board's mean place to the other points at which σ is judged, as a share of its distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -39,14 +38,10 @@ class NextPoses(Brief):
 
     Parameters
     ----------
-    base_from_flange : Poses
-        Planned poses of the flange, mm.
-    camera_from_board : Poses
-        Poses of the board that the camera would see, mm.
-    sigma_mm : (k + 1,) array
-        Worst σ of a point at the board due to the transform: now, and after each planned pose.
-    turn_rad : (k,) array
-        Smallest rotation of the flange against any earlier pose, planned poses included.
+    base_from_flange : planned poses of the flange, mm
+    camera_from_board : poses of the board that the camera would see, mm
+    sigma_mm : (k + 1,), worst σ of a point at the board due to the transform: now, and after each planned pose
+    turn_rad : (k,), smallest rotation of the flange against any earlier pose, planned poses included
     """
 
     base_from_flange: Poses
@@ -80,31 +75,17 @@ def plan_poses(
 
     Parameters
     ----------
-    pairs : HandEyePoses
-        Poses taken so far.
-    result : HandEye
-        Result from these poses.
-    count : int
-        Number of poses to plan.
-    outline : (n, 3) array, optional
-        Points of the board that must be in the image, mm; the board's origin if None.
-    camera : Camera, optional
-        Camera whose image must hold the outline. If None, the board is placed along lines of sight on which its origin
-        was seen.
-    reachable : callable, optional
-        Returns for n poses base_from_flange whether the robot reaches them, (n,) bool; all are reachable if None. It is
-        called with :data:`ASKED` poses at a time, the best first.
-    seed : int
-        Seed of the random candidates.
+    pairs : poses taken so far
+    result : result from these poses
+    count : number of poses to plan
+    outline : (n, 3), points of the board that must be in the image, mm; the board's origin if None
+    camera : camera whose image must hold the outline. If None, the board is placed along lines of sight on which its
+        origin was seen.
+    reachable : returns for n poses base_from_flange whether the robot reaches them, (n,) bool; all are reachable if
+        None. It is called with :data:`ASKED` poses at a time, the best first.
+    seed : seed of the random candidates
 
-    Returns
-    -------
-    NextPoses
-
-    Raises
-    ------
-    InputError
-        The result has no covariance, or no candidate is reachable with the board in view.
+    Raises InputError: the result has no covariance, or no candidate is reachable with the board in view.
     """
     if result.covariance is None:
         raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
@@ -132,7 +113,13 @@ def plan_poses(
         unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)
         normals = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
         sigma_after = np.array([worst_sigma(candidate, x, points) for candidate in normals])
-        row = _first_reachable(flange, np.argsort(sigma_after), reachable)
+        order = np.argsort(sigma_after)
+        batches = [order[start : start + ASKED] for start in range(0, len(order), ASKED)]
+        able = (batch if reachable is None else batch[reachable(flange[batch])] for batch in batches)
+        row = next((int(batch[0]) for batch in able if len(batch)), None)
+        if row is None:
+            said = f"plan: none of {len(flange)} views of the whole board is in the robot's reach"
+            raise InputError("E-PLAN-OUT-OF-REACH", f"{said}; check robot file, board and setup")
         normal = normals[row]
         sigma.append(float(sigma_after[row]))
         flanges.append(flange[row])
@@ -151,30 +138,12 @@ def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray
     return float(np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).max()))
 
 
-def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Poses], np.ndarray] | None) -> int:
-    """Returns the row of the first pose that the robot reaches, in the given ``order`` (n,)."""
-    if reachable is None:
-        return int(order[0])
-    for start in range(0, len(order), ASKED):
-        batch = order[start : start + ASKED]
-        in_reach = np.flatnonzero(reachable(flange[batch]))
-        if len(in_reach):
-            return int(batch[in_reach[0]])
-    raise InputError(
-        "E-PLAN-OUT-OF-REACH",
-        f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, board and "
-        "setup",
-    )
-
-
 def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
     """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
     the poses, or those from the σ of the result."""
     sigma = result.sigma
-    robot, camera = (
-        np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
-        for side in ("robot", "camera")
-    )
+    pairs = ([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")] for side in ("robot", "camera"))
+    robot, camera = (np.diag(np.square(np.repeat(pair, 3))) for pair in pairs)
     if loop.robot_covariance is not None and "robot_rad" not in sigma:
         robot = loop.robot_covariance.mean(0)
     if loop.camera_covariance is not None:
@@ -213,10 +182,8 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     place = rng.uniform(distance.min(), distance.max(), (CANDIDATES, 1)) * sight
     # Start from a view that was seen, turn it to face the camera, roll it about the line of sight, then tilt it.
     base = rng.integers(len(earlier), size=CANDIDATES)
-    facing = (
-        earlier.rotation[base, :, 2]
-        * np.sign(np.einsum("ma,ma->m", earlier.rotation[base, :, 2], places[base]))[:, None]
-    )
+    facing = earlier.rotation[base, :, 2]
+    facing = facing * np.sign(np.einsum("ma,ma->m", facing, places[base]))[:, None]
     straight = _turned_onto(facing, sight) @ earlier.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
@@ -241,10 +208,6 @@ def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None]).as_matrix()
 
 
-JOINT_DIGITS = 3
-"""Number of digits of joint values (deg or mm) on the terminal."""
-
-
 class HandEyePlanFile(ResultFile):
     """Result file of ``handeye plan``."""
 
@@ -253,15 +216,12 @@ class HandEyePlanFile(ResultFile):
     method: str = Field(description="that solved for the poses taken")
     taken: list[str] = Field(description="names of the poses taken that the solution rests on")
     sigma_mm: Vector = Field(
-        description="largest σ, in any direction, of a point at the board: now, and with each of the poses and those "
-        "before"
+        description="largest σ, in any direction, of a point at the board: now, and after each of the poses"
     )
     base_from_flange: list[Pose] = Field(description="poses to take, in order")
     camera_from_board: list[Pose] = Field(description="how the board is seen there")
     turn_rad: Vector = Field(description="of each pose against the nearest pose taken")
-    joints: dict[str, Vector] = Field(
-        description="values of the poses by column, deg or mm; empty without a robot file"
-    )
+    joints: dict[str, Vector] = Field(description="values of the poses by column, deg or mm; empty without a robot")
 
 
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
@@ -274,7 +234,7 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
     for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
         place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
         rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
-        cells.append([f"next {k + 1}", *(f"{values[k]:.{JOINT_DIGITS}f}" for values in joints.values())])
+        cells.append([f"next {k + 1}", *(f"{values[k]:.3f}" for values in joints.values())])
     last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
     blocks = [
         Table(heads, rows),
@@ -282,12 +242,9 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
         "turn: relative to the nearest pose taken; rx, ry, rz: rotation vector. σ include only independent errors of "
         f"the poses. Collisions are not checked, only {last}",
     ]
-    return Document(
-        "Poses to take next",
-        f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
-        "point at the board with each",
-        [Section("Poses", blocks, terminal=True)],
-    )
+    about = f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
+    about += "point at the board with each"
+    return Document("Poses to take next", about, [Section("Poses", blocks, terminal=True)])
 
 
 @require_arguments
@@ -296,10 +253,8 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
 
     Parameters
     ----------
-    planned : NextPoses
-        Of :func:`~stcal.handeye.plan_poses`, k poses.
-    joints : dict of (k,) array, optional
-        Joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm.
+    planned : of :func:`~stcal.handeye.plan_poses`, k poses
+    joints : (k,), joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm
 
     Returns
     -------
@@ -308,19 +263,17 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
     """
     joints = joints or {}
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
-    rows: list[Sequence] = [
-        ["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)]
-    ]
+    heads = ["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)]
+    rows: list[Sequence] = [heads]
     for k, turn in enumerate(planned.turn_rad):
         values = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
-        cells = [repr(float(value)) for value in values]
-        rows.append([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
+        poses = (cell for each in frames.values() for cell in pose_cells(each[k]))
+        rows.append([k + 1, *(repr(float(value)) for value in values), *poses])
     return csv_text(rows)
 
 
 def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
     """Returns the file of the planned poses, for programs."""
-    poses = {name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")}
     return HandEyePlanFile(
         format="stcal handeye plan 1",
         setup=result.setup,
@@ -329,5 +282,5 @@ def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarr
         sigma_mm=planned.sigma_mm,
         turn_rad=planned.turn_rad,
         joints=joints,
-        **poses,
+        **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
     )

@@ -1,8 +1,7 @@
 """Offset between the clocks of robot and camera, from images that were taken while the robot moved.
 
 The trajectory's derivative is a further column of the pose adjustment (as in Kelly & Sukhatme, Int. J. Robotics Res.
-30, 2011, and Furgale, Rehder & Siegwart, IROS 2013, for a camera beside an inertial sensor; here the trajectory is the
-robot's own, and its errors are estimated).
+30, 2011, and Furgale, Rehder & Siegwart, IROS 2013; here the trajectory is the robot's own, with estimated errors).
 """
 
 from dataclasses import dataclass, replace
@@ -13,12 +12,12 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.noise import UNKNOWNS, Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
-from stcal.handeye.result import HandEye
 
 WITHIN_S, SCAN_S = 1.0, 0.05
 """Range and step of the scan for a first offset, in s. A robot's motion within one step is smooth."""
@@ -96,21 +95,24 @@ def estimate_offset(
     """
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
-        raise InputError(
-            "E-TIME-OFFSET-FEW",
-            f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for a time offset; take more",
-        )
-    if _inside(stream, seconds).any():
-        _require_motion(stream, seconds)
+        raise InputError("E-TIME-OFFSET-FEW", f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for an offset")
+    if (within := _inside(stream, seconds)).any():  # at rest the noise of the samples would pass for motion
+        noises, moved = stream.rest(), stream.travel(seconds[within], WINDOW_S)
+        if not any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noises, moved, strict=True)):
+            raise DegenerateError(
+                "E-TIME-OFFSET-STANDSTILL",
+                f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and "
+                f"{np.degrees(moved[0]):.2g}° within {WINDOW_S:g} s (RMS), where samples err by {noises[1]:.2g} mm and "
+                f"{np.degrees(noises[0]):.2g}°: no time offset can be determined; leave --time-offset out, or take "
+                "images while the robot moves",
+            )
     offset = _scanned(pairs, stream, seconds, setup, with_scale)
     state = None
     for _ in range(ROUNDS):
         within = _inside(stream, seconds + offset)
         if within.sum() < LEAST_POSES:
-            raise InputError(
-                "E-TIME-OFFSET-RANGE",
-                f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more",
-            )
+            said = f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more"
+            raise InputError("E-TIME-OFFSET-RANGE", said)
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
         state = state or LoopState(*closed_form.robust(loop, with_scale))
@@ -139,28 +141,13 @@ def estimate_offset(
             slope = inverse[:UNKNOWNS, count] / inverse[count, count]
             at = stream.at(seconds[within] + offset)
             return TimeOffset(offset, sigma, slope, within, at, turn, travel)
-    raise ConvergenceError(
-        "E-TIME-OFFSET-UNSETTLED",
-        f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses",
-    )
+    said = f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s"
+    raise ConvergenceError("E-TIME-OFFSET-UNSETTLED", f"{said}; check times and poses")
 
 
 def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:
     """Returns a mask (m,) of the times that lie within the stream."""
     return (seconds >= 0) & (seconds <= stream.seconds[-1])
-
-
-def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
-    """Raises DegenerateError if the flange stands still, where the noise of the samples would pass for motion."""
-    noise, moved = stream.rest(), stream.travel(seconds[_inside(stream, seconds)], WINDOW_S)
-    if any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noise, moved, strict=True)):
-        return
-    raise DegenerateError(
-        "E-TIME-OFFSET-STANDSTILL",
-        f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and {np.degrees(moved[0]):.2g}° "
-        f"within {WINDOW_S:g} s (RMS), where samples err by {noise[1]:.2g} mm and {np.degrees(noise[0]):.2g}°: no "
-        "time offset can be determined; leave --time-offset out, or take images while the robot moves",
-    )
 
 
 def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Setup, with_scale: bool) -> float:

@@ -13,14 +13,12 @@ from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
-from stcal.handeye.data.views import View, Views, resect
-from stcal.handeye.judge.mistakes import repair
-from stcal.handeye.judge.observability import check
+from stcal.handeye.data.corner_views import View, Views, resect
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Motions, Setup
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.methods.noise import UNKNOWNS
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import IN_COMMON, METHODS, HandEyeOptions, handeye, solved
+from stcal.handeye.solving import IN_COMMON, METHODS, HandEyeOptions, HandEyeProblem
 from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
@@ -29,6 +27,8 @@ SETUP_BETTER = 4.0
 """Factor by which the product of rotation and translation error must be smaller in the other setup."""
 LEAST_LEFT = 3
 """Least number of poses that must remain to solve with."""
+ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
+TRANSFORMS = ("mount_from_camera", "stand_from_board")
 SCATTERED = 1.5
 """Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
 scatters as much if the poses err as assumed."""
@@ -40,18 +40,14 @@ class HeldOutPoses(Brief):
 
     Parameters
     ----------
-    rows : (s, k) int array
-        Rows of the poses that were held out.
-    rotation_rad, translation_mm : (s, k) arrays
-        Deviation of the chain through robot and camera from the board's pose: angle, and distance of the origins.
-    board_mm : (s, k) array, or None without corners
-        3-D error at the board: the board is placed by the robot's chain, and each corner's line of sight is intersected
-        with it. Distance of the intersection from the corner, mean over the corners of a view.
-    pose_mm : (s, k) array, or None without corners
-        Distance between the corners as placed by the robot's chain and by the pose from the view alone, mean over the
-        corners. It contains the error of the latter pose, mostly along the line of sight.
-    mount_from_camera : (s, 4, 4) array, optional
-        Solution from the other poses of each split, mm.
+    rows : (s, k) int, rows of the poses that were held out
+    rotation_rad, translation_mm : (s, k), deviation of the chain through robot and camera from the board's pose: angle,
+        and distance of the origins
+    board_mm : (s, k), 3-D error at the board: the board is placed by the robot's chain, and each corner's line of sight
+        is intersected with it. Distance of the intersection from the corner, mean over the corners of a view.
+    pose_mm : (s, k), distance between the corners as placed by the robot's chain and by the pose from the view alone,
+        mean over the corners. It contains the error of the latter pose, mostly along the line of sight.
+    mount_from_camera : (s, 4, 4), solution from the other poses of each split, mm
     """
 
     rows: np.ndarray
@@ -63,7 +59,7 @@ class HeldOutPoses(Brief):
 
     def __post_init__(self):
         freeze(self, "rows", (None, None), "held-out poses", int)
-        for name in ("rotation_rad", "translation_mm", "board_mm", "pose_mm"):
+        for name in ERRORS:
             if getattr(self, name) is not None:
                 freeze(self, name, self.rows.shape, name)
         if self.mount_from_camera is not None:
@@ -79,11 +75,9 @@ class HeldOutPoses(Brief):
 
         ``of`` : mask (m,) of the poses that count, all if None. Empty if none of these was held out.
         """
-        names = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
         mask = np.ones(self.rows.shape, bool) if of is None else of[self.rows]
-        if not mask.any():
-            return {}
-        return {name: float(getattr(self, name)[mask].mean()) for name in names if getattr(self, name) is not None}
+        known = {name: getattr(self, name) for name in ERRORS} if mask.any() else {}
+        return {name: float(errors[mask].mean()) for name, errors in known.items() if errors is not None}
 
     def summary(self, outliers: np.ndarray | None = None) -> dict:
         """Returns the numbers of splits and of poses in each, and the means, of all poses and without outliers."""
@@ -134,14 +128,10 @@ class Compared(Brief):
 
     Parameters
     ----------
-    method : str
-        One of :data:`~stcal.handeye.METHODS`.
-    result : HandEye or None
-        Solution from all poses; None if the method fails.
-    held_out : HeldOutPoses or None
-        Errors on held-out poses; None if the method fails, or no poses were held out.
-    reason : str
-        Why the method fails; empty if it does not.
+    method : one of :data:`~stcal.handeye.METHODS`
+    result : solution from all poses; None if the method fails
+    held_out : errors on held-out poses; None if the method fails, or no poses were held out
+    reason : why the method fails; empty if it does not
     """
 
     method: str
@@ -156,33 +146,24 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
 
     Parameters
     ----------
-    count : int
-        Number of poses.
-    held_out : int, optional
-        Number of poses k to hold out at once; if None, a quarter of the poses, at least one.
-    repeats : int
-        Number of splits.
-    seed : int
-        Seed of the random order.
+    count : number of poses
+    held_out : number of poses k to hold out at once; if None, a quarter of the poses, at least one
+    repeats : number of splits
+    seed : seed of the random order
 
     Returns
     -------
     (repeats, k) int array
         Rows held out in each split, in ascending order.
 
-    Raises
-    ------
-    InputError
-        Fewer than three poses would remain.
+    Raises InputError: fewer than three poses would remain.
     """
     if held_out is not None and held_out < 1:
         raise InputError("E-OPTION-RANGE", f"cross-validation: held_out {held_out}: 1 or more needed")
     k = max(1, count // 4) if held_out is None else held_out
     if count - k < LEAST_LEFT:
-        raise InputError(
-            "E-HELD-OUT-FEW",
-            f"cross-validation: {k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more poses",
-        )
+        said = f"{k} of {count} poses held out leave {count - k}, {LEAST_LEFT} needed; take more"
+        raise InputError("E-HELD-OUT-FEW", f"cross-validation: {said}")
     return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
 
@@ -202,75 +183,53 @@ def cross_validate(
 
     Parameters
     ----------
-    pairs, setup, method, views, options
-        See :func:`~stcal.handeye.handeye`.
-    rows : (s, k) int array, optional
-        Poses to hold out; those of :func:`splits` if None.
-    workers : int or None
-        Number of processes for adjustments of corners; as many as cores if None.
-    progress : callable, optional
-        Called with the number of splits done, and the number of all splits.
+    pairs, setup, method, views, options : see :func:`~stcal.handeye.handeye`
+    rows : (s, k) int, poses to hold out; those of :func:`splits` if None
+    workers : number of processes for adjustments of corners; as many as cores if None
+    progress : called with the number of splits done, and the number of all splits
 
-    Returns
-    -------
-    HeldOutPoses
-
-    Raises
-    ------
-    StcalError
-        A split cannot be solved; see :func:`~stcal.handeye.handeye`.
+    Raises StcalError: a split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
-    pairs, views, options = repaired(pairs, setup, views, options or HandEyeOptions())
-    rows = splits(len(pairs)) if rows is None else rows
-    jobs = [(pairs, setup, method, views, options, out) for out in rows]
-    slow = views is not None and method in (None, "reprojection")
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
+    return refitted(problem, method, splits(len(pairs)) if rows is None else rows, workers, progress)
+
+
+def refitted(
+    problem: HandEyeProblem,
+    method: str | None,
+    rows: np.ndarray,
+    workers: int | None = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> HeldOutPoses:
+    """Returns the errors of :func:`cross_validate` for a problem after repair."""
+    jobs = [(problem, method, out) for out in rows]
+    slow = problem.views is not None and method in (None, "reprojection")
     return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
 
 
-def repaired(
-    pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
-) -> tuple[HandEyePoses, Views | None, HandEyeOptions]:
-    """Returns poses, views and options with the numberings of a symmetric board corrected."""
-    if not options.symmetries:
-        return pairs, views, options
-    mended = repair(pairs, setup, options.symmetries, views)
-    return mended.pairs, mended.views, replace(options, symmetries=())
+def errors_without(problem: HandEyeProblem, method: str | None, out: np.ndarray) -> dict[str, np.ndarray]:
+    """Solves without the poses ``out``, (k,). Returns :func:`errors_of` these poses."""
+    with naming_held_out(problem, out):
+        result = problem.without(out).solved(method).result
+    return errors_of(result, problem[out])
 
 
-def errors_without(
-    pairs: HandEyePoses,
-    setup: Setup,
-    method: str | None,
-    views: Views | None,
-    options: HandEyeOptions,
-    out: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Solves without the poses ``out``, (k,). Returns the fields of :class:`HeldOutPoses` for these poses, by name."""
-    remaining, arm = np.setdiff1d(np.arange(len(pairs)), out), options.arm
-    own = options if arm is None else replace(options, arm=arm[remaining])
-    with _naming_held_out(pairs, out):
-        result = handeye(pairs[remaining], setup, method, None if views is None else views[remaining], own, part=True)
-    unseen = pairs[out]
-    if arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
-        unseen = replace(unseen, base_from_flange=arm[out].poses(result.reprojection.arm))
-    errors = predicted(result, unseen, None if views is None else views[out])
-    return errors | {"mount_from_camera": result.mount_from_camera.matrix()}
+def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
+    """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
+    pairs, arm, adjusted = unseen.pairs, unseen.options.arm, result.reprojection
+    if arm is not None and adjusted is not None and adjusted.arm is not None:
+        pairs = replace(pairs, base_from_flange=arm.poses(adjusted.arm))
+    return predicted(result, pairs, unseen.views) | {"mount_from_camera": result.mount_from_camera.matrix()}
 
 
 @contextmanager
-def _naming_held_out(pairs: HandEyePoses, out: np.ndarray) -> Iterator[None]:
+def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
     """Adds to a DegenerateError the names of the poses ``out``, (k,), that were held out."""
     try:
         yield
     except DegenerateError as error:
-        raise DegenerateError(error.code, f"without {', '.join(pairs.names[i] for i in out)}: {error}") from error
-
-
-def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
-    """Raises DegenerateError if the poses besides ``out``, (k,), do not determine the answer."""
-    with _naming_held_out(pairs, out):
-        remaining = pairs[np.setdiff1d(np.arange(len(pairs)), out)]
-        check(Loop.of(remaining, setup), setup, pairs.where, options.four_dof)
+        names = ", ".join(problem.pairs.names[i] for i in out)
+        raise DegenerateError(error.code, f"without {names}: {error}") from error
 
 
 def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
@@ -301,11 +260,10 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
     scale, at_board = result.scale, {}
     if views is not None:
         camera, adjusted_views = as_adjusted(result, views)
-        by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
-        pose_mm = [
-            np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
-            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
-        ]
+        by_view, _ = resect(Views(camera, tuple(adjusted_views)), pairs.names)
+        chains = zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
+        off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
+        pose_mm = [np.linalg.norm(each, axis=1).mean() for each in off]
         at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
         loop, scale = replace(loop, camera_from_board=by_view), 1.0
     turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
@@ -313,23 +271,25 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
 
 
 @one_thread()
-def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, rows: np.ndarray) -> str:
+def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     """Returns a note with both errors if method ``pose`` predicts held-out poses ``rows`` (s, k) far better in the
-    other setup, else ""."""
+    other setup."""
+    setup = problem.setup
     opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
-    plain = replace(options, intrinsics=None, symmetries=())
-    rows = rows[:SETUP_SPLITS]
+    plain = replace(problem, views=None, options=replace(problem.options, intrinsics=None, symmetries=()))
     try:
-        means = [cross_validate(pairs, each, "pose", None, plain, rows).means() for each in (setup, opposite)]
+        first, other = (
+            refitted(replace(plain, setup=each), "pose", rows[:SETUP_SPLITS]).means() for each in (setup, opposite)
+        )
     except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
-        return ""
-    (turn, shift), (other_turn, other_shift) = ((m["rotation_rad"], m["translation_mm"]) for m in means)
+        return ()
+    (turn, shift), (other_turn, other_shift) = (list(each.values()) for each in (first, other))
     if not (turn * shift > SETUP_BETTER * other_turn * other_shift and turn > other_turn and shift > other_shift):
-        return ""
-    return Grave(
-        f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
-        f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}: give --setup {opposite} if it is that"
-    )
+        return ()
+    as_stated = f"{np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}"
+    as_other = f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}"
+    said = f"poses held out are missed by {as_stated}, by {as_other}"
+    return (Grave(f"{said}: give --setup {opposite} if it is that"),)
 
 
 @require_arguments
@@ -348,46 +308,34 @@ def compare(
 
     Parameters
     ----------
-    pairs, setup, views, options
-        See :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is skipped.
-    methods : tuple of str
-        Names out of :data:`~stcal.handeye.METHODS`.
-    rows, workers
-        See :func:`cross_validate`; nothing is held out if ``rows`` is empty.
-    progress : callable, optional
-        Called with the number of methods done, and the number of all methods.
+    pairs, setup, views, options : see :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is skipped
+    methods : names out of :data:`~stcal.handeye.METHODS`
+    rows, workers : see :func:`cross_validate`; nothing is held out if ``rows`` is empty
+    progress : called with the number of methods done, and the number of all methods
 
     Returns
     -------
     tuple of Compared
         One per method, in the order of ``methods``; a method that fails has a reason.
 
-    Raises
-    ------
-    InputError
-        The poses follow another convention.
-    DegenerateError
-        No method can solve these poses.
+    Raises InputError: the poses follow another convention. Raises DegenerateError: no method can solve these poses.
     """
-    pairs, views, options = repaired(pairs, setup, views, options or HandEyeOptions())
-    handeye(pairs, setup, "pose", views, options)  # raises if the poses themselves are at fault, whatever the method
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
+    problem.solved("pose")  # raises if the poses themselves are at fault, whatever the method
     rows = splits(len(pairs)) if rows is None else rows
-    compared = []
+    compared, told = [], progress or (lambda *_: None)
     for done, method in enumerate(methods):
-        if progress:
-            progress(done, len(methods))
+        told(done, len(methods))
         if method == "reprojection" and views is None:
             continue
         result, held_out, reason = None, None, ""
         try:
-            result = handeye(pairs, setup, method, views, options)
-            if len(rows):
-                held_out = cross_validate(pairs, setup, method, views, options, rows, workers)
+            result = problem.solved(method).result
+            held_out = refitted(problem, method, rows, workers) if len(rows) else None
         except StcalError as error:
             reason = str(error)
         compared.append(Compared(method, result, held_out, reason))
-    if progress:
-        progress(len(methods), len(methods))
+    told(len(methods), len(methods))
     return tuple(compared)
 
 
@@ -403,41 +351,28 @@ def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
 def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
     """Returns a result with covariances by the delete-one jackknife (Quenouille 1956, Tukey 1958): solutions without
     each of m poses scatter (m − 1)⁻² as much as independent ones."""
-    m, covariances = len(without_one), {}
-    for key, moved in _differences(without_one, result).items():
-        moved = moved - moved.mean(0)
-        covariances[key] = (m - 1) / m * moved.T @ moved
+    m, moved = len(without_one), (each - each.mean(0) for each in _differences(without_one, result))
+    mount, stand = ((m - 1) / m * each.T @ each for each in moved)
     note = Aside(f"σ of both transforms are by the jackknife: the scatter of {result.method} without each of the poses")
-    return replace(result, **covariances, notes=(*result.notes, note))
+    return replace(result, covariance=mount, stand_covariance=stand, notes=(*result.notes, note))
 
 
-def _differences(others: list[HandEye], result: HandEye) -> dict[str, np.ndarray]:
-    """Returns the differences (n, 6) of X and of Z of other results against ``result``, by the names of covariances."""
-    return {
-        key: Poses.of([getattr(other, name) for other in others]).difference(
-            Poses.of([getattr(result, name)] * len(others))
-        )
-        for key, name in (("covariance", "mount_from_camera"), ("stand_covariance", "stand_from_board"))
-    }
+def _differences(others: list[HandEye], result: HandEye) -> list[np.ndarray]:
+    """Returns the differences (n, 6) of X and of Z of other results against ``result``."""
+    pairs = [[(getattr(each, name), getattr(result, name)) for each in others] for name in TRANSFORMS]
+    return [Poses.of([a for a, _ in each]).difference(Poses.of([b for _, b in each])) for each in pairs]
 
 
-def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, options: HandEyeOptions) -> HandEye:
+def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:
     """Returns a result with covariances that contain what one σ of each common error of the board's poses moves it."""
-    common, seen = pairs.camera_from_board_common, pairs.camera_from_board
+    common, seen = problem.pairs.camera_from_board_common, problem.pairs.camera_from_board
     if common is None:
         return result
-    erring = [
-        solved(replace(pairs, camera_from_board=seen.moved(step.copy())), setup, result.method, None, options).result
-        for step in np.moveaxis(common, 2, 0)
-    ]
-    covariances = {key: moved.T @ moved for key, moved in _differences(erring, result).items()}
-    return replace(
-        result,
-        covariance=result.covariance + covariances["covariance"],
-        stand_covariance=result.stand_covariance + covariances["stand_covariance"],
-        common_covariance=covariances["covariance"],
-        notes=(*result.notes, Aside(IN_COMMON)),
-    )
+    erring = (replace(problem.pairs, camera_from_board=seen.moved(s.copy())) for s in np.moveaxis(common, 2, 0))
+    moved = [replace(problem, pairs=each, views=None).solved(result.method).result for each in erring]
+    mount, stand = (m.T @ m for m in _differences(moved, result))
+    wider = {"covariance": result.covariance + mount, "stand_covariance": result.stand_covariance + stand}
+    return replace(result, **wider, common_covariance=mount, notes=(*result.notes, IN_COMMON))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -446,12 +381,9 @@ class HeldOutMotions(Brief):
 
     Parameters
     ----------
-    fitted : int
-        Number of motions that the solution uses.
-    names : tuple of (str, str)
-        Names of the poses from which and to which each motion leads.
-    rotation_rad, translation_mm : (k,) arrays
-        Errors of Â = X B X⁻¹ against A.
+    fitted : number of motions that the solution uses
+    names : (str, str), names of the poses from which and to which each motion leads
+    rotation_rad, translation_mm : (k,), errors of Â = X B X⁻¹ against A
     """
 
     fitted: int
@@ -469,10 +401,8 @@ def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
 
     Parameters
     ----------
-    mount_from_camera
-        X.
-    motions
-        The k motions: A of the mount, B of the camera.
+    mount_from_camera : X
+    motions : the k motions: A of the mount, B of the camera
 
     Returns
     -------
@@ -499,31 +429,18 @@ def predict_motions(
 
     Parameters
     ----------
-    pairs, setup, method, views, options
-        See :func:`~stcal.handeye.handeye`.
-    count : int
-        Number of motions to hold out.
+    pairs, setup, method, views, options : see :func:`~stcal.handeye.handeye`
+    count : number of motions to hold out
 
-    Returns
-    -------
-    HeldOutMotions
-
-    Raises
-    ------
-    InputError
-        Too few poses are left.
-    StcalError
-        The solution fails; see :func:`~stcal.handeye.handeye`.
+    Raises InputError: too few poses are left. Raises StcalError: the solution fails; see
+    :func:`~stcal.handeye.handeye`.
     """
-    remaining = len(pairs) - count
-    if count < 1 or remaining < LEAST_LEFT:
-        raise InputError(
-            "E-OPTION-RANGE",
-            f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {max(len(pairs) - LEAST_LEFT, 0)} "
-            "can be held out; give another number, or more poses",
-        )
-    first_poses = np.arange(remaining)
-    result = handeye(pairs[first_poses], setup, method, None if views is None else views[first_poses], options)
-    errors = motion_errors(result.mount_from_camera, Motions.consecutive(Loop.of(pairs, setup))[remaining - 1 :])
+    remaining, most = len(pairs) - count, max(len(pairs) - LEAST_LEFT, 0)
+    if not 1 <= count <= most:
+        said = f"of {max(len(pairs) - 1, 0)} motions, 1 to {most} can be held out; give another number, or more poses"
+        raise InputError("E-OPTION-RANGE", f"--motions-held-out {count}: {said}")
+    problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions())
+    result = problem[np.arange(remaining)].solved(method).result
+    errors = motion_errors(result.mount_from_camera, Motions.consecutive(problem.loop)[remaining - 1 :])
     names = tuple(zip(pairs.names[remaining - 1 : -1], pairs.names[remaining:], strict=True))
     return HeldOutMotions(remaining - 1, names, errors[:, 0], errors[:, 1])

@@ -13,13 +13,13 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
-from stcal.handeye.data.pairs import Loop, Setup
+from stcal.handeye.data.inputs import ToldPairs, own_told, read_pairs, read_two, require_own
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.mistakes import flipped, tilted
+from stcal.handeye.judge.conventions import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import HandEyeProblem
 from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -40,9 +40,8 @@ from stcal.workflows.robot_at_images import (
 
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
-OF_IMAGES = ("--poses", "--camera", "--board")
 PREFIXES = "base_from_flange_", "camera_from_board_"
-Source = Path | Table | Told
+Source = Path | Table | ToldPairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,30 +68,24 @@ class HandEyeInput:
     timed: Timed | None = None
     notes: tuple[str, ...] = ()
 
+    def problem(self, options: HandEyeOptions) -> HandEyeProblem:
+        """Returns what is to be solved."""
+        return HandEyeProblem(self.pairs, self.setup or "eye-in-hand", self.views, options)
+
 
 def one_source(
-    source: Path,
-    second: Path | None,
-    key: str,
-    statements: Said,
-    quaternions: Order = "wxyz",
-    timing: Timing | None = None,
+    first: Path, second: Path, key: str, statements: Said, quaternions: Order = "wxyz", timing: Timing | None = None
 ) -> tuple[Source, tuple[str, ...]]:
-    """Returns the poses of two files, the robot's and the camera's, or of one, as one source; and notes on rows left
-    out.
-
-    Two tables of the package's own are joined as tables.
-    """
-    if second is None:
-        return source, ()
+    """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
+    tables of the package's own are joined as tables."""
     timing = timing or Timing()
-    told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
+    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
     if told is not None:
         return told, ()
-    for path in (source, second):
+    for path in (first, second):
         require_own(path, quaternions)
-    _require_unsaid(statements, f"{source}, {second}")
-    joined = join_tables(str(source), str(second), key, PREFIXES, quaternions)
+    _require_unsaid(statements, f"{first}, {second}")
+    joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
 
 
@@ -132,40 +125,24 @@ def read_handeye(
 
     Parameters
     ----------
-    source : str, Path or Table
-        Folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``.
-    poses : str or Path, optional
-        The robot's poses at the photographs.
-    camera, board : str or Path, optional
-        Files of the camera and of the board, or boards, in the photographs.
-    second : str or Path, optional
-        File of the camera's poses.
-    key : str
-        Column by which rows of both files belong together, or ``image=Point Name``.
-    setup : {"eye-in-hand", "eye-to-hand"}, optional
-        What carries the camera; as a file says, or ``eye-in-hand``, if None.
-    rotation : sequence of str
-        Convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
-        ``robot=`` or ``camera=`` in front for one side.
-    length_unit : sequence of str
-        Unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise.
-    poses_are : sequence of str
-        Names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
-        ``camera_from_board`` or ``board_from_camera``.
-    quaternions : {"wxyz", "xyzw"}
-        As columns of quaternions are named, or x, y, z, w in the order in which they stand.
-    tolerance_s : float
-        Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
-    image_times : str or Path, optional
-        Table of the times of photographs.
-    time_offset : bool
-        Whether the offset of the two clocks is to be estimated.
-    robot : Robot, optional
-        The robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    source : folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``
+    poses : the robot's poses at the photographs
+    camera, board : files of the camera and of the board, or boards, in the photographs
+    second : file of the camera's poses
+    key : column by which rows of both files belong together, or ``image=Point Name``
+    setup : {"eye-in-hand", "eye-to-hand"}, what carries the camera; as a file says, or ``eye-in-hand``, if None
+    rotation : convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
+        ``robot=`` or ``camera=`` in front for one side
+    length_unit : unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise
+    poses_are : names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
+        ``camera_from_board`` or ``board_from_camera``
+    quaternions : {"wxyz", "xyzw"}, as columns of quaternions are named, or x, y, z, w in the order in which they stand
+    tolerance_s : time within which the nearest of the robot's poses is taken where none can be interpolated, s
+    image_times : table of the times of photographs
+    time_offset : whether the offset of the two clocks is to be estimated
+    robot : the robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------
@@ -173,22 +150,18 @@ def read_handeye(
         ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
         :func:`stcal.workflows.calibrate_handeye` and :func:`stcal.workflows.plan_handeye`.
 
-    Raises
-    ------
-    InputError
-        A file is missing or not of the required form, one file too many was given, or no image shows the board.
+    Raises InputError: A file is missing or not of the required form, one file too many was given, or no image shows the
+    board.
     """
     statements = Said.of_options(rotation, length_unit, poses_are, setup)
-    timing = Timing(tolerance_s, _path(image_times), time_offset)
-    place, notes = Path(source) if isinstance(source, str) else source, ()
-    if isinstance(place, Path) and not place.is_dir():
-        place, notes = one_source(place, _path(second), key, statements, quaternions, timing)
-    files = Files(place, _path(poses), _path(camera), _path(board), statements, quaternions, timing, robot)
+    paths = (None if path is None else Path(path) for path in (poses, camera, board, second, image_times))
+    robot_file, camera_file, board_file, other, times = paths
+    timing, notes = Timing(tolerance_s, times, time_offset), ()
+    place = Path(source) if isinstance(source, str) else source
+    if isinstance(place, Path) and other is not None and not place.is_dir():
+        place, notes = one_source(place, other, key, statements, quaternions, timing)
+    files = Files(place, robot_file, camera_file, board_file, statements, quaternions, timing, robot)
     return replace(files.read(workers, progress), notes=notes)
-
-
-def _path(path: str | Path | None) -> Path | None:
-    return None if path is None else Path(path)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,11 +187,11 @@ class Files:
         """Returns the pairs of poses, and the views of the board if there are images."""
         if isinstance(self.source, Path) and self.source.is_dir():
             return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
-        self._require_no_images()
         source, statements = self.source, self.statements
+        self._require_no_images()
         if isinstance(source, Table):
             return HandEyeInput(source.where, read_poses(source, self.quaternions), setup=statements.setup)
-        if isinstance(source, Told):
+        if isinstance(source, ToldPairs):
             told = source
         elif (told := read_pairs(source, statements, quaternions=self.quaternions)) is None:
             pairs = read_poses(source, self.quaternions)  # first: a table that is not understood states nothing
@@ -226,39 +199,33 @@ class Files:
             return HandEyeInput(source.name, pairs, setup=statements.setup)
         where, stated = told.pairs.where, statements.setup
         if stated and told.setup and stated != told.setup:
-            raise InputError(
-                "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
-            )
-        known = {name: getattr(told, name) for name in ("left_out", "understood", "timed")}
-        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **known)
+            raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")
+        more = {"left_out": told.left_out, "understood": told.understood, "timed": told.timed}
+        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **more)
+
+    def _of_images(self) -> dict[str, Path | None]:
+        """Returns the options of images, by name."""
+        return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
 
     def _require_no_images(self) -> None:
         """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
-        source, of_images = self.source, zip(OF_IMAGES, (self.poses, self.camera, self.board), strict=True)
-        place = (
-            source.pairs.where if isinstance(source, Told) else source.where if isinstance(source, Table) else source
-        )
-        if self.robot is not None:
-            raise InputError(
-                "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
-            )
-        if isinstance(source, Path) and not source.exists():
-            raise InputError(
-                "E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed"
-            )
-        if extra := [name for name, path in of_images if path is not None]:
-            held = "is a file of poses" if isinstance(source, Path) else "are poses"
-            raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {place} {held}")
-        if self.timing.image_times is not None:
-            raise InputError(
-                "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
-            )
-        if self.timing.offset and not (isinstance(source, Told) and source.timed is not None):
-            raise InputError(
-                "E-OPTION-NEEDS",
-                f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
-                "and --poses, each with times",
-            )
+        source = self.source
+        place, held = source, "is a file of poses"
+        if not isinstance(source, Path):
+            place, held = source.pairs.where if isinstance(source, ToldPairs) else source.where, "are poses"
+        elif self.robot is None and not source.exists():
+            raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
+        extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
+        timed = isinstance(source, ToldPairs) and source.timed is not None
+        times = f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
+        for message, refused in {
+            "--with-kinematics: only with a folder of images, which show the arm's errors": self.robot is not None,
+            f"{extra}: only with a folder of images; {place} {held}": bool(extra),
+            "--image-times: only with a folder of images; poses have their times beside them": self.timing.image_times,
+            f"{times}and --poses, each with times": self.timing.offset and not timed,
+        }.items():
+            if refused:
+                raise InputError("E-OPTION-NEEDS", message)
 
     def dry_run(self) -> list[str]:
         """Returns lines on how the inputs are understood, without looking for the board in images."""
@@ -272,7 +239,7 @@ class Files:
             inputs = self.read()
             stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
             lines, count = list(inputs.understood), f"pairs: {len(inputs.pairs)}"
-            if not lines and not isinstance(source, Told):
+            if not lines and not isinstance(source, ToldPairs):
                 lines = own_told(source, self.quaternions)
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
@@ -302,6 +269,7 @@ class _Photographs:
     design: Board
     model: CameraModel
     images: list[ImageFile]
+    robot: RobotPoses
     at_images: AtImages
     arm: Arm | None
     row_of: dict[str, int]
@@ -313,8 +281,8 @@ class _Photographs:
         """Returns the images of a folder, matched with the poses in their file."""
         poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
         if poses is None or camera is None or board is None:
-            missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
-            raise InputError("E-OPTION-MISSING", f"image folder {folder}: {', '.join(missing)} needed with images")
+            missing = ", ".join(name for name, path in files._of_images().items() if path is None)
+            raise InputError("E-OPTION-MISSING", f"image folder {folder}: {missing} needed with images")
         if files.robot is None:
             robot = read_robot_poses(poses, files.quaternions, files.statements)
         elif timing.offset or timing.image_times is not None:
@@ -332,34 +300,24 @@ class _Photographs:
         names = [image.name for image in images if image.name not in late]
         row_of, missing, matching = robot.pairing(names)
         if not row_of:
-            raise InputError(
-                "E-POSES-UNMATCHED",
-                f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here; "
-                "correct them",
-            )
+            said = f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here"
+            raise InputError("E-POSES-UNMATCHED", f"{said}; correct them")
         left_out = [(each.name, each.reason) for each in skipped]
         left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        return cls(files, folder, design, model, images, at_images, arm, row_of, matching, tuple(left_out))
-
-    @property
-    def robot(self) -> RobotPoses:
-        return self.at_images.robot
-
-    def lines(self) -> list[str]:
-        """Returns lines on how the files were understood."""
-        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
-        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
-        return [
-            *self.robot_lines(),
-            f"camera: {camera}: {width} × {height} px, focal length {focal_px:.6g} px",
-            f"board: {board}: {kind_of(self.design)}",
-        ]
+        return cls(files, folder, design, model, images, robot, at_images, arm, row_of, matching, tuple(left_out))
 
     def robot_lines(self) -> tuple[str, ...]:
         """Returns lines on how the robot's poses were read and matched."""
         matched = (f"images matched {self.matching}",) if self.matching else ()
         return f"robot: {self.robot.understood}", *matched
+
+    def lines(self) -> list[str]:
+        """Returns lines on how the files were understood."""
+        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
+        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
+        size = f"{width} × {height} px, focal length {focal_px:.6g} px"
+        return [*self.robot_lines(), f"camera: {camera}: {size}", f"board: {board}: {kind_of(self.design)}"]
 
     def pairs(self, workers: int | None, progress: Progress) -> HandEyeInput:
         """Returns the pairs of all images that show the board and have a pose."""
@@ -367,13 +325,10 @@ class _Photographs:
         detections = detect_boards(with_pose, self.model, self.design, (), workers, partial(progress, "board"))
         without_board = [(each.name, each.reason) for each in detections.skipped]
         if not (found := detections.views()):
-            raise InputError(
-                "E-IMAGES-NO-BOARD",
-                f"image folder {self.folder}: the board is in none of {len(with_pose)} images: "
-                f"{': '.join(without_board[0])}",
-            )
-        views = (View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
-        views, rows = Views(detections.camera, tuple(views)), np.array([self.row_of[name] for name in found])
+            said = f"image folder {self.folder}: the board is in none of {len(with_pose)} images"
+            raise InputError("E-IMAGES-NO-BOARD", f"{said}: {': '.join(without_board[0])}")
+        camera, rows = detections.camera, np.array([self.row_of[name] for name in found])
+        views = Views(camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values()))
         pairs = pairs_of_views(self.robot.base_from_flange[rows], views, tuple(found), str(self.folder))
         if self.robot.covariance is not None:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
@@ -383,7 +338,7 @@ class _Photographs:
             pairs,
             views,
             detections.symmetries,
-            camera_prior(refinable(self.model.calibrated(detections.camera.width, detections.camera.height))),
+            camera_prior(refinable(self.model.calibrated(camera.width, camera.height))),
             next((getattr(self.design, key) for key in PITCHES if hasattr(self.design, key)), None),
             (*without_board, *self.left_out),
             (*understood, *(f"board: {part}" for part in detections.unused())),
@@ -403,36 +358,28 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
 
     Parameters
     ----------
-    given : HandEyeInput
-        Pairs of poses, of :func:`stcal.workflows.read_handeye`.
-    options : HandEyeOptions, optional
-        As for :func:`stcal.workflows.calibrate_handeye`.
+    given : pairs of poses, of :func:`stcal.workflows.read_handeye`
+    options : as for :func:`stcal.workflows.calibrate_handeye`
 
     Returns
     -------
     HandEyeInput, str
         The input, and a sentence that names the poses.
 
-    Raises
-    ------
-    InputError
-        The input consists of images, which determine the poses by themselves.
+    Raises InputError: the input consists of images, which determine the poses by themselves.
     """
-    inputs, setup, options = given, given.setup or "eye-in-hand", options or HandEyeOptions()
-    if inputs.views is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--undo-flips: only with poses; with images, the corners decide the tilt; leave it out"
-        )
-    pairs, undone = inputs.pairs, np.zeros(len(inputs.pairs), bool)
+    problem = given.problem(options or HandEyeOptions())
+    if given.views is not None:
+        raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
+    undone = np.zeros(len(problem), bool)
     for _ in range(MOST_ROUNDS):
-        result = handeye(pairs, setup, "pose", None, options)
-        x, z = result.mount_from_camera, result.stand_from_board
-        flips = flipped(Loop.of(pairs, setup), x, z, result.outliers) & ~undone
+        result, pairs = problem.solved("pose").result, problem.pairs
+        flips = flipped(problem.loop, result.mount_from_camera, result.stand_from_board, result.outliers) & ~undone
         if not flips.any():
             break
         seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
-        turned = np.where(flips[:, None, None], other.rotation, seen.rotation)
-        pairs, undone = replace(pairs, camera_from_board=Poses(turned, seen.translation)), undone | flips
-    shown = ", ".join(name for name, flip in zip(pairs.names, undone, strict=True) if flip)
-    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(pairs)} poses: {shown or 'none'}"
-    return replace(inputs, pairs=pairs), said
+        turned = Poses(np.where(flips[:, None, None], other.rotation, seen.rotation), seen.translation)
+        problem, undone = replace(problem, pairs=replace(pairs, camera_from_board=turned)), undone | flips
+    shown = ", ".join(name for name, flip in zip(given.pairs.names, undone, strict=True) if flip)
+    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(problem)} poses: {shown or 'none'}"
+    return replace(given, pairs=problem.pairs), said

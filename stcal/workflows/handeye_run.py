@@ -14,24 +14,15 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
+from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.judge.mistakes import repair
+from stcal.handeye.handeye_pipeline import validated
+from stcal.handeye.handeye_result import HandEye
 from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
-from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import HandEyeProblem
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from stcal.handeye.validate import (
-    LEAST_LEFT,
-    better_setup,
-    compare,
-    cross_validate,
-    predict_motions,
-    repaired,
-    splits,
-)
+from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
@@ -40,20 +31,8 @@ from stcal.robot.use.compensation import joint_columns
 from stcal.workflows.handeye_inputs import HandEyeInput, naming_left_out
 from stcal.workflows.robot_at_images import Arm
 
-ALL, AUTO = "all", "auto"
-"""Words in place of a method's name: all methods, compared; the way of solving that predicts best."""
-
-
-@dataclass(frozen=True, slots=True)
-class Splits:
-    """Settings of the cross-validation: number of repeats, poses held out in each (a quarter if None), seed, processes;
-    and number of the last motions to predict, if any."""
-
-    repeats: int = 15
-    held_out: int | None = None
-    seed: int = 0
-    workers: int | None = None
-    motions: int | None = None
+ALL = "all"
+"""Word in place of a method's name: all methods, compared."""
 
 
 @require_arguments
@@ -75,116 +54,74 @@ def calibrate_handeye(
 
     Parameters
     ----------
-    given : HandEyeInput
-        Of :func:`stcal.workflows.read_handeye`.
-    method : str, optional
-        One of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best if
-        None.
-    options : HandEyeOptions, optional
-        Known errors, and further unknowns; the symmetries of the board are those of ``given``.
-    refine_camera : bool
-        Whether the intrinsics are adjusted, from those of the camera file with their σ.
-    time_offset : bool
-        Whether the offset of the two clocks is estimated first.
-    repeats : int
-        Number of splits of the cross-validation; 0 for none.
-    held_out : int, optional
-        Number of poses held out in each; a quarter if None.
-    seed : int
-        Seed of the splits.
-    motions : int, optional
-        Number of the last motions to predict from the poses before.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    given : of :func:`stcal.workflows.read_handeye`
+    method : one of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best
+        if None
+    options : known errors, and further unknowns; the symmetries of the board are those of ``given``
+    refine_camera : whether the intrinsics are adjusted, from those of the camera file with their σ
+    time_offset : whether the offset of the two clocks is estimated first
+    repeats : number of splits of the cross-validation; 0 for none
+    held_out : number of poses held out in each; a quarter if None
+    seed : seed of the splits
+    motions : number of the last motions to predict from the poses before
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------
     Outcome
         ``result``, a :class:`stcal.handeye.HandEye`, mm and rad; its errors on poses ``held_out``; ``all_notes()``.
 
-    Raises
-    ------
-    StcalError
-        As of :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    Raises StcalError: as of :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
-    setup, options, offset = given.setup or "eye-in-hand", options or HandEyeOptions(), None
+    options, offset, told = options or HandEyeOptions(), None, progress or (lambda *_: None)
     intrinsics = given.prior if refine_camera else options.intrinsics
     options = replace(options, intrinsics=intrinsics, symmetries=given.symmetries)
-    if method is None and not (options.names_unknowns or options.camera is not None):
-        method = AUTO
+    choosing = method is None and not (options.names_unknowns or options.camera is not None)
     if time_offset:
-        given, options, offset = at_offset(given, setup, options)
-    validation = Splits(repeats, held_out, seed, workers, motions)
-    told = progress or (lambda *_: None)
-    outcome = calibrate(given, setup, method, options, validation, told, time_offset)
+        given, options, offset = at_offset(given, options)
+    with naming_left_out(given.left_out):
+        if options.camera is None:
+            options = replace(options, camera=given.prior)
+        pairs, rows = given.pairs, np.zeros((0, 0), int)
+        if repeats and (held_out or len(pairs) > LEAST_LEFT):
+            rows = splits(len(pairs), held_out, repeats, seed)
+        problem = given.problem(options)
+        if method == ALL:
+            outcome = _compared(problem, rows, workers, partial(told, "methods"))
+        else:
+            prior = given.prior if given.views is not None else None
+            outcome = validated(problem, method, rows, prior, choosing, workers, partial(told, "held out"))
+        problem, result, notes = given.problem(outcome.options), outcome.result, outcome.notes
+        if len(rows):
+            notes += better_setup(problem, rows)
+        if not given.setup:
+            notes += of_setup(result.mount_from_camera, result.stand_from_board, problem.setup)
+        if given.views is None and pairs.camera_from_board_covariance is None and result.covariance is not None:
+            notes += (NO_COVARIANCE,)
+        if not time_offset:
+            result, lagging = lag_tried(problem, given.timed, result)
+            notes += lagging
+        last, mended = None, problem.mended()
+        if motions is not None:
+            last = predict_motions(pairs, problem.setup, result.method, given.views, problem.options, motions)
+        kept = {name: getattr(given, name) for name in ("where", "pitch_mm", "left_out", "understood")}
+        kept |= {"pairs": mended.pairs, "views": mended.views}
+        outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
+        if given.arm is not None:
+            outcome = with_arm(outcome, given.arm, mended, given.prior, rows, workers, partial(told, "with the arm"))
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
-def calibrate(
-    given: HandEyeInput,
-    setup: Setup,
-    method: str | None,
-    options: HandEyeOptions,
-    validation: Splits,
-    progress: Progress = lambda *_: None,
-    offset_known: bool = False,
+def _compared(
+    problem: HandEyeProblem, rows: np.ndarray, workers: int | None, progress: Callable[[int, int], None]
 ) -> Outcome:
-    """Returns the result, of each method if :data:`ALL`, of the best way if :data:`AUTO`, and its errors on poses held
-    out. Clocks that differ are tried as a cause of residuals, unless ``offset_known``.
-
-    Raises StcalError: as :func:`stcal.handeye.handeye`; the message also names what was left out before.
-    """
-    with naming_left_out(given.left_out):
-        pairs, views, workers = given.pairs, given.views, validation.workers
-        if options.camera is None:
-            options = replace(options, camera=given.prior)
-        compared, rows = (), np.zeros((0, 0), int)
-        if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
-            rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
-        if method == ALL:
-            result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
-            compared = compare(pairs, setup, views, options, rows=rows, workers=workers, progress=done)
-            held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-            solution = Validated(held_out.widened(result) if held_out else result, held_out, options)
-        else:
-            prior, done = given.prior if views is not None else None, partial(progress, "held out")
-            asked = None if method == AUTO else method
-            choosing = method == AUTO
-            solution = validated(pairs, setup, asked, views, options, prior, rows, workers, done, choosing)
-        result, options, notes = solution.result, solution.options, solution.notes
-        if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
-            notes = (*notes, meant)
-        if not given.setup:
-            notes = (*notes, *of_setup(result.mount_from_camera, result.stand_from_board, setup))
-        if views is None and pairs.camera_from_board_covariance is None and result.covariance is not None:
-            notes = (*notes, NO_COVARIANCE)
-        if not offset_known:
-            result, lagging = lag_tried(given, setup, options, result)
-            notes = (*notes, *lagging)
-        last = validation.motions
-        motions = None if last is None else predict_motions(pairs, setup, result.method, views, options, last)
-        pairs, views, _ = repaired(pairs, setup, views, options)
-        outcome = Outcome(
-            given.where,
-            result,
-            solution.held_out,
-            compared,
-            given.pitch_mm,
-            options.intrinsics.colmap_model if options.intrinsics else "",
-            views is not None and all(view.covariance is not None for view in views.views),
-            given.left_out,
-            notes,
-            motions,
-            solution.choice,
-            pairs,
-            views,
-            given.understood,
-        )
-        if given.arm is None:
-            return outcome
-        return with_arm(outcome, given.arm, options, given.prior, rows, workers, partial(progress, "with the arm"))
+    """Returns the results of all methods, and that of the default method as the result."""
+    pairs, views, options = problem.pairs, problem.views, problem.options
+    result = problem.solved().result
+    compared = compare(pairs, problem.setup, views, options, rows=rows, workers=workers, progress=progress)
+    held_out = next(each.held_out for each in compared if each.method == result.method)
+    return Outcome("", held_out.widened(result) if held_out else result, held_out, compared, options)
 
 
 NO_COVARIANCE = Aside(
@@ -196,7 +133,7 @@ NO_COVARIANCE = Aside(
 def with_arm(
     outcome: Outcome,
     arm: Arm,
-    options: HandEyeOptions,
+    problem: HandEyeProblem,
     prior: CameraPrior | None,
     rows: np.ndarray,
     workers: int | None,
@@ -204,113 +141,86 @@ def with_arm(
 ) -> Outcome:
     """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
 
-    ``outcome`` : calibration by the robot's file; ``arm`` : at the joint values of the same poses; ``options`` : of the
-    outcome; ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
+    ``outcome`` : calibration of the ``problem`` by the robot's file; ``arm`` : at the joint values of the same poses;
+    ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
     """
-    pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
-    if pairs is None or views is None:
-        raise InputError("E-OPTION-NEEDS", "--with-kinematics: only with images, whose corners show the arm's errors")
-    options, method = replace(options, arm=arm, intrinsics=prior, symmetries=()), "reprojection"
-    result = handeye(pairs, setup, method, views, options)
-    held_out, notes = None, outcome.notes
+    problem = replace(problem, options=replace(problem.options, arm=arm, intrinsics=prior))
+    result, held_out, notes = problem.solved("reprojection").result, None, outcome.notes
     if len(rows):
-        held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
+        held_out = refitted(problem, "reprojection", rows, workers, progress)
         result = held_out.widened(result)
     adjusted = result.reprojection
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
     values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
     parameters, sigma = (dict(zip(arm.names(), each, strict=True)) for each in values)
-    arm_found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
+    found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
     if held_out is not None and outcome.held_out is not None:
         now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:
-            notes = (
-                *notes,
-                f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
-                "them): leave --with-kinematics out, or take more poses",
-            )
-    model = prior.colmap_model if prior else ""
-    return replace(outcome, result=result, held_out=held_out, colmap_model=model, notes=notes, arm=arm_found)
+            gain = f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
+            notes += (f"{gain}them): leave --with-kinematics out, or take more poses",)
+    return replace(outcome, result=result, held_out=held_out, options=problem.options, notes=notes, arm=found)
 
 
 HINT_T, SURE_SIGMAS = 3.0, 4.0
-"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is reported: one
-sound set in 16,000 is beyond the latter."""
+"""Student's t from which an offset is solved for, and number of its σ from which it is reported (1 in 16,000)."""
 FALLS = 0.98
-"""Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
-does no harm."""
+"""Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
 HARMFUL = 1.0
-"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong; without σ it
-is always."""
+"""Change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always."""
 ROW_S = 0.05
-"""Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
-rows."""
+"""Time assumed between smooth rows without times: a scan of ±1 s then covers ±20 rows."""
 SMOOTH, LEAST_ROWS = 0.2, 20
 """Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
 their order counts as that of a motion; and least number of such poses."""
 
 
 @one_thread()
-def at_offset(
-    given: HandEyeInput, setup: Setup, options: HandEyeOptions
-) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
+def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
     """Returns the input with the robot's poses at the estimated offset, and numberings of a symmetric board corrected.
 
     Raises InputError: there are no times, or the robot has four axes. Raises StcalError: as :func:`estimate_offset`.
     """
     timed = given.timed
     if timed is None:
-        raise InputError(
-            "E-POSES-UNTIMED",
-            f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s, or TUM) and of "
-            "the images (their names, or --image-times)",
-        )
+        said = f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s"
+        raise InputError("E-POSES-UNTIMED", f"{said}, or TUM) and of the images (their names, or --image-times)")
     if options.four_dof:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out",
-        )
-    pairs, views, notes = given.pairs, given.views, ()
-    if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    offset = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
+        said = "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out"
+        raise InputError("E-OPTION-CONFLICT", said)
+    problem = given.problem(options).mended()
+    pairs, views, noise = problem.pairs, problem.views, options.noise
+    offset = estimate_offset(pairs, timed.stream, timed.seconds, problem.setup, noise, options.with_scale)
     rows = np.flatnonzero(offset.kept)
-    outside = [
-        (name, "outside of the robot's times at the time offset")
-        for name, k in zip(pairs.names, offset.kept, strict=True)
-        if not k
-    ]
+    outside = [name for name, kept in zip(pairs.names, offset.kept, strict=True) if not kept]
     given = replace(
         given,
         pairs=replace(pairs[rows], base_from_flange=offset.base_from_flange),
         views=None if views is None else views[rows],
         symmetries=(),
-        left_out=(*given.left_out, *outside),
-        understood=(*given.understood, *notes),
+        left_out=(*given.left_out, *((name, "outside of the robot's times at the time offset") for name in outside)),
+        understood=(*given.understood, *problem.notes),
     )
-    return given, replace(options, symmetries=()), offset
+    return given, problem.options, offset
 
 
 @one_thread()
-def lag_tried(
-    given: HandEyeInput, setup: Setup, options: HandEyeOptions, result: HandEye
-) -> tuple[HandEye, tuple[str, ...]]:
+def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> tuple[HandEye, tuple[str, ...]]:
     """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
-    with the lag goes. Without times, the order of smooth rows gives velocities. No offset may be applied to
-    ``given``."""
-    pairs = given.pairs
-    timed = _moving(given)
+    with the lag goes. Without times, the order of smooth rows gives velocities."""
+    pairs, setup, options, stated = problem.pairs, problem.setup, problem.options, timed
+    timed = _moving(pairs, timed)
     if timed is None or options.four_dof or len(result.outliers) != len(pairs):
         return result, ()
     try:
-        if abs(_lag_t(pairs, timed, setup, result)) < HINT_T:
+        if abs(_lag_t(problem, timed, result)) < HINT_T:
             return result, ()
         plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
-        before, after = (handeye(each, setup, "pose", None, plain) for each in (pairs[lag.kept], shifted))
+        problems = (HandEyeProblem(each, setup, None, plain) for each in (pairs[lag.kept], shifted))
+        before, after = (each.solved("pose").result for each in problems)
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]
@@ -319,25 +229,21 @@ def lag_tried(
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
-    with_which, ahead = f"with which residuals fall from {old} to {new}", lag.seconds > 0
-    if given.timed is not None:
-        clock = f"{1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {'ahead of' if ahead else 'behind'}"
-        said = f"by the motions the robot's clock is {clock} the camera's, {with_which}: solve with --time-offset"
-    else:
-        late = f"{abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
-        said = (
-            f"by the motions the board's poses are {late} than the robot's, {with_which}: give both with times, and "
-            "--time-offset"
-        )
+    size, sigma, ahead = abs(lag.seconds), lag.sigma_s, lag.seconds > 0
+    clock = f"robot's clock is {1e3 * size:.3g} ± {1e3 * sigma:.2g} ms {'ahead of' if ahead else 'behind'} the camera's"
+    remedy = "solve with --time-offset"
+    if stated is None:
+        late = f"{size / ROW_S:.2g} ± {sigma / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
+        clock, remedy = f"board's poses are {late} than the robot's", "give both with times, and --time-offset"
+    said = f"by the motions the {clock}, with which residuals fall from {old} to {new}: {remedy}"
     if not any(isinstance(note, SizeDoubt) for note in after.notes):
         result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
     return result, (Grave(said) if harmful else said,)
 
 
-def _moving(given: HandEyeInput) -> Timed | None:
+def _moving(pairs: HandEyePoses, timed: Timed | None) -> Timed | None:
     """Returns the robot's poses as a stream with velocities at the images, by times or by the order of smooth rows, or
     None. About one sample for each image must be smooth too."""
-    pairs, timed = given.pairs, given.timed
     if timed is not None:
         samples = timed.stream.seconds
         after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
@@ -356,10 +262,10 @@ def _moving(given: HandEyeInput) -> Timed | None:
     return timed if smooth else None
 
 
-def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
+def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
     """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
     good = np.flatnonzero(~result.outliers)
-    loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
+    loop, x = problem.loop[good], result.mount_from_camera
     residuals = loop.residuals(x, result.stand_from_board, result.scale)
     by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
     columns = 12 + (result.sigma_scale is not None)
@@ -394,30 +300,20 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
     Parameters
     ----------
-    given : HandEyeInput
-        Poses taken so far, of :func:`stcal.workflows.read_handeye`.
-    count : int
-        Number of poses to plan.
-    robot : Robot, optional
-        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
-    seed : int
-        Seed of the candidates.
+    given : poses taken so far, of :func:`stcal.workflows.read_handeye`
+    count : number of poses to plan
+    robot : robot within whose joint limits the poses are to be, from its own base to its flange, no tool
+    seed : seed of the candidates
 
     Returns
     -------
     Planned
         ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
-    DegenerateError
-        For the reasons given in :func:`stcal.handeye.handeye`.
+    Raises InputError: for the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of
+    the poses taken. Raises DegenerateError: for the reasons given in :func:`stcal.handeye.handeye`.
     """
-    setup = given.setup or "eye-in-hand"
-    options = HandEyeOptions(symmetries=given.symmetries)
-    result = handeye(given.pairs, setup, None, given.views, options)
+    result = given.problem(HandEyeOptions(symmetries=given.symmetries)).solved().result
     camera = outline = None
     if given.views is not None:
         camera = given.views.camera
@@ -443,10 +339,7 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
     message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
-        raise InputError(
-            "E-PLAN-ROBOT",
-            f"{message}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
-            "poses are",
-        )
+        remedy = "give the robot's own file, in whose base and flange (no tool) the poses are"
+        raise InputError("E-PLAN-ROBOT", f"{message}, first not {beyond[0]}; {remedy}")
     notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes

@@ -7,14 +7,13 @@ import pytest
 
 import stcal.handeye
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.report.outcome import judged
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import HandEyeProblem, handeye
 from stcal.workflows.handeye_inputs import HandEyeInput
-from stcal.workflows.handeye_run import Splits, calibrate, lag_tried
+from stcal.workflows.handeye_run import calibrate_handeye, lag_tried
 from tests.outcome import fails_with
 from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, simulated
 from tests.support.handeye_stream import simulated_stream
@@ -28,7 +27,7 @@ def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
 
 
 def told(given: HandEyeInput) -> tuple[str, ...]:
-    return lag_tried(given, "eye-in-hand", HandEyeOptions(), handeye(given.pairs))[1]
+    return lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1]
 
 
 @pytest.mark.slow
@@ -51,7 +50,7 @@ def test_clocks_that_agree_are_not_blamed(seed):
 def test_a_doubt_of_the_size_ends_with_the_lag():
     given = given_of(19, 0.05)
     doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
-    again, notes = lag_tried(given, "eye-in-hand", HandEyeOptions(), doubted)
+    again, notes = lag_tried(HandEyeProblem(given.pairs), given.timed, doubted)
     assert not any(isinstance(note, SizeDoubt) for note in again.notes)
     assert len(notes) == 1
 
@@ -121,13 +120,8 @@ def test_residuals_that_no_arm_leaves_are_not_to_be_used():
     rng = np.random.default_rng(1)
     board = given.pairs.camera_from_board
     far = Poses(board.rotation, board.translation + rng.normal(0, 40, (len(board), 3)))
-    outcome = calibrate(
-        replace(given, pairs=replace(given.pairs, camera_from_board=far), timed=None),
-        "eye-in-hand",
-        "pose",
-        HandEyeOptions(),
-        Splits(0),
-    )
+    pairs = replace(given.pairs, camera_from_board=far)
+    outcome = calibrate_handeye(replace(given, pairs=pairs, timed=None), "pose", repeats=0)
     assert judged(outcome).word == "do not use"
     assert any(finding.title == "Residuals" for finding in judged(outcome).reasons())
 
@@ -138,10 +132,10 @@ def test_a_camera_far_off_the_flange_needs_its_setup_stated():
     flange = truth.stream.at(truth.seconds).inverse()
     far = Poses(flange.rotation, flange.translation)
     given = HandEyeInput("poses", replace(truth.pairs, base_from_flange=far))
-    outcome = calibrate(given, "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    outcome = calibrate_handeye(given, "pose", repeats=0)
     assert np.linalg.norm(outcome.result.mount_from_camera.translation) > 1000
     assert any("--setup eye-to-hand" in note and isinstance(note, Grave) for note in outcome.notes)
-    stated = calibrate(replace(given, setup="eye-in-hand"), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    stated = calibrate_handeye(replace(given, setup="eye-in-hand"), "pose", repeats=0)
     assert not any("--setup" in note for note in stated.notes)
 
 
@@ -152,9 +146,9 @@ def test_a_board_at_the_base_needs_its_setup_stated():
     flange = camera @ pairs.camera_from_board @ FLANGE_FROM_BOARD.inverse()
     inverted = HandEyePoses(flange.inverse(), pairs.camera_from_board)
     given = HandEyeInput("poses", inverted)
-    outcome = calibrate(given, "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    outcome = calibrate_handeye(given, "pose", repeats=0)
     assert any("off the base's origin" in note and "--setup eye-to-hand" in note for note in outcome.notes)
-    right = calibrate(HandEyeInput("poses", pairs), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    right = calibrate_handeye(HandEyeInput("poses", pairs), "pose", repeats=0)
     assert not any("--setup" in note for note in right.notes)
 
 

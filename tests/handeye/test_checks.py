@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
-from stcal.handeye.data.pairs import Loop
-from stcal.handeye.data.views import View, Views, pairs_of_views
-from stcal.handeye.judge.mistakes import repair
-from stcal.handeye.judge.observability import Observability
+from stcal.handeye.data.corner_views import View, Views, pairs_of_views
+from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.judge.conventions import repair
+from stcal.handeye.judge.observable import Observability
 from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from stcal.io.poses.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
 from tests.levels import FULL
@@ -276,10 +276,7 @@ def test_three_poses_tell_no_size():
 
 @pytest.mark.parametrize(
     ("factor", "unit"),
-    [
-        (25.4, "the robot's were in inches"),
-        pytest.param(0.1, "its lengths were in centimetres", marks=FULL),
-    ],
+    [(25.4, "the robot's were in inches"), pytest.param(0.1, "its lengths were in centimetres", marks=FULL)],
 )
 def test_units_of_one_side_are_named(factor, unit):
     pairs = simulated(np.random.default_rng(18), 12, **NOISE).pairs

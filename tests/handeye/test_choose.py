@@ -8,8 +8,8 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions, Noise, Views, pairs_of_views, splits
-from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Candidate, choose
-from stcal.handeye.solve import handeye, solved
+from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Way, choose
+from stcal.handeye.solving import HandEyeProblem, handeye
 from stcal.io.cameras.model import camera_prior
 from tests.levels import sampled
 from tests.support.handeye import CAMERA, error, simulated, simulated_views
@@ -29,7 +29,7 @@ def prior_of(camera):
 
 def chosen(truth, camera=CAMERA, count=10, seed=0):
     pairs, views = filed(truth, camera)
-    return choose(pairs, truth.setup, views, HandEyeOptions(), prior_of(camera), splits(len(pairs), None, count, seed))
+    return choose(HandEyeProblem(pairs, truth.setup, views), prior_of(camera), splits(len(pairs), None, count, seed))
 
 
 def off_mm(found, truth):
@@ -53,7 +53,7 @@ def test_a_camera_file_that_is_wrong_is_found_out():
     truth = simulated_views(np.random.default_rng(5), 14, "eye-in-hand", ROBOT, 0.1)
     found = chosen(truth, camera)
     assert found.chosen.camera
-    plain = next(each for each in found.tried if each.candidate == Candidate("reprojection"))
+    plain = next(each for each in found.tried if each.candidate == Way("reprojection"))
     assert plain.mean_mm > 1.5 * found.held_out.board_mm.mean()
     assert "the camera file costs" in found.sentence
     pairs, views = filed(truth, camera)
@@ -66,7 +66,7 @@ def test_a_camera_file_that_is_wrong_is_found_out():
 )
 def test_poses_alone_are_chosen_among_too(scale, said):
     truth, pairs = pairs_of_size(scale, 7, 16)
-    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(16, None, 8))
+    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(16, None, 8))
     assert found.chosen.name == ("pose + scale" if said else "pose")
     assert all(part in found.sentence for part in said.split(" … "))
     if said:
@@ -86,11 +86,11 @@ def pairs_of_size(scale, seed, count=15):
 def test_sound_poses_are_taken_as_filed(seed):
     """Sets on whose poses held out the scale (28, 32) or a closed form (33, 34) is ahead, by chance."""
     truth, pairs = pairs_of_size(1.0, seed)
-    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(15))
-    by_pose = solved(pairs, truth.setup, "pose", None, HandEyeOptions()).result
-    free = solved(pairs, truth.setup, "pose", None, HandEyeOptions(with_scale=True)).result
+    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(15))
+    by_pose = handeye(pairs, truth.setup, "pose")
+    free = handeye(pairs, truth.setup, "pose", options=HandEyeOptions(with_scale=True))
     assert abs(free.scale - 1) < 2.5 * free.sigma_scale
-    assert found.chosen == Candidate("pose")
+    assert found.chosen == Way("pose")
     assert off_mm(found.result, truth) == pytest.approx(off_mm(by_pose, truth), abs=1e-9)
     assert not [note for note in found.result.notes if "scatter" in note]
     assert np.sqrt(found.result.covariance[3, 3] / by_pose.covariance[3, 3]) < 1.5
@@ -101,10 +101,10 @@ def test_sound_poses_are_taken_as_filed(seed):
 def test_a_size_is_solved_for_where_the_poses_show_it(sigmas):
     """The same poses, with the size so many σ off its file; beyond 2.6 σ is 1 in 100 by chance."""
     truth, pairs = pairs_of_size(1.0, 30)
-    free = solved(pairs, truth.setup, "pose", None, HandEyeOptions(with_scale=True)).result
+    free = handeye(pairs, truth.setup, "pose", options=HandEyeOptions(with_scale=True))
     scale = (1 + sigmas * free.sigma_scale) / free.scale
     pairs = pairs_of_size(scale, 30)[1]
-    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(15))
+    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(15))
     assert found.chosen.scale == (abs(sigmas) > 2.6)
 
 
@@ -112,8 +112,8 @@ def test_a_size_is_solved_for_where_the_poses_show_it(sigmas):
 def test_intrinsics_that_the_corners_do_not_show_are_not_solved_for(monkeypatch):
     """Even where they predict far better; they are where the file's focal length is 2 % off."""
     truth = simulated_views(np.random.default_rng(3), 10, "eye-in-hand", ROBOT, 0.1)
-    monkeypatch.setattr("stcal.handeye.choose.BY_VIEWS", (Candidate("reprojection"), Candidate("reprojection", True)))
-    monkeypatch.setattr("stcal.handeye.choose._Trial._first_of", lambda trial, candidates, rows: candidates[-1])
+    monkeypatch.setattr("stcal.handeye.choose.BY_VIEWS", (Way("reprojection"), Way("reprojection", True)))
+    monkeypatch.setattr("stcal.handeye.choose._first_of", lambda tried, rows: tried[-1])
     assert not chosen(truth).chosen.camera
     focal = 1.02 * CAMERA.focal
     assert chosen(truth, replace(CAMERA, focal=focal)).chosen.camera
@@ -121,7 +121,7 @@ def test_intrinsics_that_the_corners_do_not_show_are_not_solved_for(monkeypatch)
 
 def test_one_split_is_enough():
     truth = simulated(np.random.default_rng(8), 6, "eye-in-hand", ROBOT)
-    found = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, splits(6, None, 1))
+    found = choose(HandEyeProblem(truth.pairs, truth.setup), None, splits(6, None, 1))
     assert found.held_out.rows.shape == (1, 1)
 
 
@@ -131,19 +131,21 @@ def test_answers_that_contradict_widen_sigma(monkeypatch):
     monkeypatch.setattr("stcal.handeye.choose.BY_POSES", BY_POSES[:2])
     truth = simulated(np.random.default_rng(9), 12, "eye-in-hand", ROBOT)
     rows = splits(12, None, 6)
-    plain = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, rows)
+    plain = choose(HandEyeProblem(truth.pairs, truth.setup), None, rows)
     assert plain.notes == ()
 
-    def moved(pairs, setup, method, views, options):
-        solution = solved(pairs, setup, method, views, options)
-        if options.with_scale:
+    solved = HandEyeProblem.solved
+
+    def moved(problem, method):
+        solution = solved(problem, method)
+        if problem.options.with_scale:
             x = solution.result.mount_from_camera
             x = replace(x, translation=x.translation + np.array([5.0, 0, 0]))
             solution = replace(solution, result=replace(solution.result, mount_from_camera=x))
         return solution
 
-    monkeypatch.setattr("stcal.handeye.choose.solved", moved)
-    found = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, rows)
+    monkeypatch.setattr(HandEyeProblem, "solved", moved)
+    found = choose(HandEyeProblem(truth.pairs, truth.setup), None, rows)
     assert found.chosen.name == "pose"
     (note,) = found.notes
     assert "pose + scale predicts as well as pose" in note
@@ -162,7 +164,7 @@ def test_a_closed_form_is_taken_where_it_predicts_better():
     middle = flange.translation.mean(0)
     bent = flange.translation + (flange.translation - middle) @ np.random.default_rng(1).normal(0, 0.02, (3, 3))
     pairs = replace(truth.pairs, base_from_flange=replace(flange, translation=bent))
-    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(14, None, 6))
+    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(14, None, 6))
     mean = {each.candidate: each.mean_mm for each in found.tried}
     best = min(mean, key=mean.__getitem__)
     assert mean[found.chosen] <= 1.1 * mean[best]
@@ -178,7 +180,7 @@ def test_steps_from_the_solution_of_all_are_solutions_of_the_others():
     out, options = np.array([2, 5, 11]), HandEyeOptions(noise)
     remaining = np.setdiff1d(np.arange(14), out)
     for method in ("pose", "reprojection", "shah"):
-        near = solved(truth.pairs, truth.setup, method, truth.views, options).without(out)
+        near = HandEyeProblem(truth.pairs, truth.setup, truth.views, options).solved(method).without(out)
         exact = handeye(truth.pairs[remaining], truth.setup, method, truth.views[remaining], options)
         moved = error(near, exact)
         size = [1e-9] * 6 if exact.covariance is None else np.sqrt(np.diag(exact.covariance))

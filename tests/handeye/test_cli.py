@@ -201,7 +201,7 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "code", "parts"),
     [
-        (["0.png", "0.png"], INPUT, ["line 2 and line 3: both are of image '0.png'"]),
+        (["0.png", "0.png"], INPUT, ["line 2 and line 3 are both image '0.png'"]),
         (["a.png", "b.png"], INPUT, ["no row is of an image in"]),
         (["0.png", "1.png"], COMPUTATION, ["2 poses, 3 needed", "left out before, first 2.png: no row in poses.csv"]),
     ],
@@ -252,7 +252,7 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     assert code == 0
     assert [row["held_out"] for row in rows] == [None] * len(rows)
     assert "\nheld out (" not in shown.split("Methods")[0]
-    assert "verdict: use with care: errors on poses held out are not known" in shown
+    assert "May I use it? With care: errors on poses held out are not known" in shown
 
 
 @pytest.mark.slow
@@ -320,7 +320,7 @@ def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
     assert command(good, "--splits", 4, "--strict")[0] == 0
     code, out, err = command(bad, "--splits", 4)
     assert code == 0
-    assert "verdict: do not use" in out
+    assert "May I use it? No" in out
     code, _, err = command(bad, "--splits", 4, "--strict", "--out", tmp_path / "h.json")
     assert code == 4
     assert err.splitlines()[-1].startswith("error: --strict: failed: ")
@@ -333,9 +333,9 @@ def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command,
     sides = {name: getattr(truth, name).inverse() for name in ("base_from_flange", "camera_from_board")}
     words = (write(tmp_path / "poses.csv", sides), "--method", "pose", "--splits", 2)
     _, out, _ = command(*words, "--out", tmp_path / "h.json")
-    starts = ("verdict:", "what to do:")
+    starts = ("May I use it?", "what to do:")
     verdict, remedy = (next(line for line in out.splitlines() if line.startswith(start)) for start in starts)
-    assert "do not use" in verdict
+    assert "No: " in verdict
     assert "flange_from_base" in remedy
     assert "board_from_camera" in remedy
     assert command(*words, "--quiet") == (0, "", f"warning: {verdict}\n")

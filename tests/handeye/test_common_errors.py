@@ -7,14 +7,14 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.handeye import handeye
-from stcal.handeye.data.pairs import read_poses
-from stcal.handeye.solve import HandEyeOptions, solved
-from stcal.handeye.solve import handeye as handeye_by
+from stcal.handeye.data.pose_pairs import read_poses
+from stcal.handeye.solving import HandEyeOptions, HandEyeProblem
+from stcal.handeye.solving import handeye as handeye_by
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
-from stcal.workflows.handeye_run import Splits, calibrate
+from stcal.workflows.handeye_run import calibrate_handeye
 from tests.support.handeye import simulated, squared
 
 COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T
@@ -77,9 +77,9 @@ def test_a_closed_form_by_the_jackknife_contains_them():
     found = []
     for seed in range(20):
         pairs, truth = draw(seed)
-        solution = solved(pairs, "eye-in-hand", "shah", None, None)
+        solution = HandEyeProblem(pairs).solved("shah")
         result = with_jackknife(solution.result, [solution.without(np.array([i])) for i in range(len(pairs))])
-        found.append(squared(with_common_errors(result, pairs, "eye-in-hand", HandEyeOptions()), truth) / 6)
+        found.append(squared(with_common_errors(result, HandEyeProblem(pairs)), truth) / 6)
     assert np.mean(found) < chi2.ppf(0.999, 120) / 120 * 1.3  # a jackknife of sixteen poses
 
 
@@ -119,8 +119,5 @@ def test_the_verdict_does_not_ask_for_more_poses():
 def test_poses_of_the_board_without_covariance_say_what_sigma_lack():
     pairs = simulated(np.random.default_rng(3), 12, robot=(1e-4, 0.03), camera=(2e-4, 0.05)).pairs
     stated = replace(pairs, camera_from_board_covariance=np.tile(OWN, (12, 1, 1)))
-    notes = [
-        calibrate(HandEyeInput("t", each), "eye-in-hand", "pose", HandEyeOptions(), Splits(0, 0)).all_notes()
-        for each in (pairs, stated)
-    ]
+    notes = [calibrate_handeye(HandEyeInput("t", each), "pose", repeats=0).all_notes() for each in (pairs, stated)]
     assert [any("state no covariance" in note for note in each) for each in notes] == [True, False]

@@ -57,7 +57,7 @@ def test_the_setup_that_a_file_states_is_taken(command, tmp_path):
     assert code == 0
     assert "flange_from_base as easy_handeye writes it of eye-to-hand" in shown
     assert "base_from_camera" in shown
-    said = "of a setup eye-to-hand, --setup eye-in-hand; leave the option out"
+    said = "of eye-to-hand, --setup eye-in-hand; leave it out"
     assert_error(command(*arguments, *QUICK, "--setup", "eye-in-hand"), INPUT, said)
     arguments = easy_handeye(tmp_path, truth.pairs, "")  # as its server leaves it: --setup tells
     assert command(*arguments, *QUICK, "--setup", "eye-to-hand")[0] == 0

@@ -5,9 +5,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, plan_poses
-from stcal.handeye.data.pairs import SETUPS, Loop
+from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from tests.outcome import fails_with
 from tests.support.handeye import CAMERA, board_corners, disturbed, simulated, squared
 

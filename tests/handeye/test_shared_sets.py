@@ -1,11 +1,8 @@
 """Two real data sets, from photographs: the acceptance figures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from stcal.workflows.handeye_run import Splits
 from tests.scripts import load_script
 
 MEAN_MM = 0.85
@@ -24,7 +21,7 @@ def script():
 @pytest.mark.full
 def test_charuco_photographs(script, shared_data, tmp_path):
     data = shared_data("charuco_handeye").parent
-    splits = replace(script.SPLITS, workers=1)
+    splits = script.SPLITS | {"workers": 1}
     ours, text = script.charuco(data, tmp_path / "a", splits)
     park, _ = script.charuco(data, tmp_path / "b", splits, "park-martin")
     errors, others = script.by_split(ours), script.by_split(park)
@@ -39,7 +36,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
 
 @pytest.mark.full
 def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
-    found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, Splits(0, workers=1))
+    found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, {"repeats": 0, "workers": 1})
     board = found["board"]
     sigma_mm = 20 * board["scale_sigma"]
     assert len(found["poses"]) == 15

@@ -5,8 +5,8 @@ import pytest
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views, splits
-from stcal.handeye.data.pairs import HandEyePoses
-from stcal.handeye.solve import handeye
+from stcal.handeye.data.pose_pairs import HandEyePoses
+from stcal.handeye.solving import HandEyeProblem, handeye
 from stcal.handeye.validate import better_setup
 from tests.levels import sampled
 from tests.support.handeye import disturbed, error, simulated, simulated_views
@@ -78,8 +78,9 @@ def test_errors_of_a_stated_pair_widen_sigma():
 def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
     truth = simulated(np.random.default_rng(seed), 5, setup, (5e-3, 2.0), (2e-3, 0.5))
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[setup]
-    assert better_setup(truth.pairs, setup, HandEyeOptions(), splits(5)) == ""
-    assert f"give --setup {setup} if it is that" in better_setup(truth.pairs, other, HandEyeOptions(), splits(5))
+    assert better_setup(HandEyeProblem(truth.pairs, setup), splits(5)) == ()
+    (note,) = better_setup(HandEyeProblem(truth.pairs, other), splits(5))
+    assert f"give --setup {setup} if it is that" in note
 
 
 @pytest.mark.slow

@@ -17,8 +17,8 @@ from stcal.handeye import (
     predict_motions,
     splits,
 )
-from stcal.handeye.data.pairs import Loop, Motions
-from stcal.handeye.solve import handeye
+from stcal.handeye.data.pose_pairs import Loop, Motions
+from stcal.handeye.solving import handeye
 from stcal.handeye.validate import predicted
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated, simulated_views
@@ -100,7 +100,7 @@ def test_a_method_that_fails_says_why():
     by = {c.method: c for c in found}
     assert by["pose"].held_out.means()["translation_mm"] < 1e-3
     assert by["shah"].result is None
-    assert "needs rotations about two axes" in by["shah"].reason
+    assert "needs turns about two axes" in by["shah"].reason
 
 
 def test_a_split_that_cannot_be_solved_is_named():

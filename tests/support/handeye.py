@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses, Setup
-from stcal.handeye.data.views import View, Views, pairs_of_views
-from stcal.handeye.result import HandEye
+from stcal.handeye.data.corner_views import View, Views, pairs_of_views
+from stcal.handeye.data.pose_pairs import HandEyePoses, Setup
+from stcal.handeye.handeye_result import HandEye
 
 FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])
 BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])

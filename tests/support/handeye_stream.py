@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses, Setup
+from stcal.handeye.data.pose_pairs import HandEyePoses, Setup
 from stcal.handeye.data.stream import Stream
 from tests.support.handeye import BASE_FROM_BOARD, BASE_FROM_CAMERA, FLANGE_FROM_BOARD, FLANGE_FROM_CAMERA, disturbed
 

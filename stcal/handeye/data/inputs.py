@@ -5,14 +5,15 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.pairs import HandEyePoses, Setup, inverted
+from stcal.handeye.data.pose_pairs import HandEyePoses, Setup, inverted
 from stcal.handeye.data.recognise import read_columns, read_content, todays
-from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, Unit, inverse_name
+from stcal.handeye.data.record import FRAMES, Known, PoseContent, PoseSide, Role, Said, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
@@ -46,13 +47,20 @@ class Posed:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def called(self, row: int) -> str:
-        """Returns the name of a row, or its place."""
-        return self.names[row] if self.names else self.places[row]
+    def __getitem__(self, rows: Sequence[int]) -> "Posed":
+        """Returns these rows alone."""
+        at = list(rows)
+        names, places = (tuple(every[i] for i in at) if every else () for every in (self.names, self.places))
+        covariance, common = (None if each is None else each[at] for each in (self.covariance, self.common))
+        return replace(self, poses=self.poses[at], names=names, places=places, covariance=covariance, common=common)
+
+    def called(self) -> tuple[str, ...]:
+        """Returns the names of the rows, or their places."""
+        return self.names or self.places
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class ToldPairs:
     """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
     (name, why); ``timed`` : where the robot's poses were taken by time."""
 
@@ -62,34 +70,33 @@ class Told:
     left_out: tuple[tuple[str, str], ...] = ()
     timed: Timed | None = None
 
+    @classmethod
+    def of(cls, robot: Posed, camera: Posed, names: Sequence[str], where: str, **more: Any) -> "ToldPairs":
+        """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
+        covariances = robot.covariance, camera.covariance
+        pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
+        lines = (f"robot: {robot.understood}", f"camera: {camera.understood}", *more.pop("lines", ()))
+        return cls(pairs, lines, **more)
 
-def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
+
+def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs | None:
     """Returns the pose pairs of one file; None where it is one of the package's own tables.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with the file, or that it holds poses of one side only.
+    Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
     """
     content = read_content(path, statements, key, quaternions)
     if content is None:
         return None
-    if not content.both:
-        side = content.sides[0]
-        held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, robot or camera"
-        raise InputError(
-            "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
-        )
+    if len(content.sides) == 1:
+        frames = content.sides[0].frames
+        held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
+        said = f"{path}: {content.form} with {held}"
+        raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
     robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
-        raise InputError(
-            "E-POSES-UNITS",
-            f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}; "
-            "write both in one unit, or to two files for --a and --b",
-        )
-    rows = list(range(len(robot)))
-    names = robot.names or camera.names or robot.places
-    return Told(_pairs(robot, camera, rows, rows, names, path.name), _both(robot, camera), content.setup)
+        said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
+    return ToldPairs.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
 
 
 def read_two(
@@ -100,22 +107,19 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
-) -> Told | None:
-    """Returns the robot's poses and the camera's, from two files, as pairs.
+) -> ToldPairs | None:
+    """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
+    tables.
 
-    The result is None where both files are the package's own tables. The rows are joined by image or time, or by their
-    order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
-    are those at the camera's times, within ``tolerance_s``.
+    The rows are joined by image or time, or by their order where neither file has names. Where times are not equal,
+    and for all rows where ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``.
     """
-    keys = keys_of(key)
-    contents = [
-        read_content(path, statements.of(role), own, quaternions)
-        for role, path, own in zip(FRAMES, (first, second), keys, strict=True)
-    ]
+    files = tuple(zip(FRAMES, (first, second), keys_of(key), strict=True))
+    contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
     if contents[0] is None and contents[1] is None:
         return None
     sides = []
-    for role, path, content, own in zip(FRAMES, (first, second), contents, keys, strict=True):
+    for (role, path, own), content in zip(files, contents, strict=True):
         if content is None:
             table = read_table(path, "table", quaternions)
             content = read_columns(table, own, statements)
@@ -124,29 +128,29 @@ def read_two(
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
     setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
-    stamps = [stamps_of(side.names) if side.names else None for side in sides]
-    if timed and None in stamps:
-        without = sides[stamps.index(None)]
-        raise InputError(
-            "E-POSES-UNTIMED", f"{without.where}: no times of its poses; with --time-offset both files need them"
-        )
-    times, wanted = stamps
+    times, wanted = (stamps_of(side.names) if side.names else None for side in sides)
+    if timed and (times is None or wanted is None):
+        untimed = (robot if times is None else camera).where
+        raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
         return _by_time(robot, camera, times, wanted, setup, where, tolerance_s)
     rows, how = matched(robot, camera, key)
     a, b = [i for i, _ in rows], [j for _, j in rows]
-    stream = None
+    stamped = None
     if times is not None and wanted is not None and len(set(times)) >= max(len(times), len(rows) + 1):
         stream = Stream.of(times, robot.poses, first.name)
-    stamped = None
-    if stream is not None and wanted is not None and stream.spacing_s() <= LONGEST_S:
-        stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
-    alone = sorted(set(range(len(robot))) - set(a)) if stamped is None else ()  # samples between images are no mistake
-    left_out = [(robot.called(i), f"in {first.name} alone") for i in alone]
-    left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
-    pairs = _pairs(robot, camera, a, b, tuple(robot.called(i) for i in a), where)
-    notes = (f"rows joined {how}",) if how else ()
-    return Told(pairs, (*_both(robot, camera), *notes), setup, tuple(left_out), stamped)
+        if stream.spacing_s() <= LONGEST_S:
+            stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
+    alone = [(robot.called(), first, a)] if stamped is None else []  # samples between images are no mistake
+    left_out = [
+        (name, f"in {path.name} alone")
+        for names, path, used in (*alone, (camera.called(), second, b))
+        for i, name in enumerate(names)
+        if i not in used
+    ]
+    lines = (f"rows joined {how}",) if how else ()
+    more = {"lines": lines, "setup": setup, "left_out": tuple(left_out), "timed": stamped}
+    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, **more)
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
@@ -192,55 +196,41 @@ def _by_time(
     setup: Setup | None,
     where: str,
     tolerance_s: float,
-) -> Told:
+) -> ToldPairs:
     """Returns the robot's poses at the camera's times."""
     stream = Stream.of(times, robot.poses, Path(robot.where).name)
     seconds = stream.after_origin(wanted)
     taken = taken_at(stream, seconds, tolerance_s)
     if not taken.kept.any():
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
-        )
-    rows = np.flatnonzero(taken.kept)
-    at_images = replace(robot, poses=taken.base_from_flange, covariance=None)
-    names = tuple(camera.names[i] for i in rows)
-    pairs = _pairs(at_images, camera, range(len(rows)), rows.tolist(), names, where)
-    left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
-    lines = (*_both(robot, camera), taken.said)
+        first = f"{camera.names[0]}, {taken.why[0]}"
+        raise InputError("E-POSES-UNMATCHED", f"{camera.where}: no pose has one of the robot: first {first}")
+    rows, lines = np.flatnonzero(taken.kept), (taken.said,)
     if robot.covariance is not None:
         lines += ("covariances of the robot's poses are not used: they are of other times",)
-    return Told(pairs, lines, setup, left_out, Timed(stream, seconds[rows]))
+    at_images, seen = replace(robot, poses=taken.base_from_flange, covariance=None), camera[rows.tolist()]
+    left_out = tuple((name, why) for name, why in zip(camera.names, taken.why, strict=True) if why)
+    more = {"lines": lines, "setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
+    return ToldPairs.of(at_images, seen, seen.names, where, **more)
 
 
-def _side(content: Content, role: Role, path: Path) -> Side:
-    """Returns the side of a role, or the only side where nothing states its role."""
-    side = content.of(role)
-    if side is None and len(content.sides) == 1 and content.sides[0].frames is None:
-        side = content.sides[0]
+def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> Posed:
+    """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
+    with a line on how they were read."""
+    wanted, first, statements = FRAMES[role][0], content.sides[0], statements.of(role)
+    side = content.of(role) or (first if len(content.sides) == 1 and first.frames is None else None)
     if side is None:
-        frames = content.sides[0].frames
-        held = frames.name if frames else "poses"
-        raise InputError(
-            "E-POSES-MIXED", f"{path}: {content.form} of {held}, {FRAMES[role][0]} needed here; give another file"
-        )
-    return side
-
-
-def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed:
-    """Returns poses of a role in the direction that is needed, mm, with a line on how they were read."""
-    side, statements = _side(content, role, path), statements.of(role)
+        held = first.frames.name if first.frames else "poses"
+        raise InputError("E-POSES-MIXED", f"{path}: {content.form} of {held}, {wanted} needed here; give another file")
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
         raise InputError(
-            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible"
+            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: length {measured:.3g}, at most {FARTHEST:g}"
         )
     frames = _direction(side, role, path, statements)
     factor, unit, guessed = _unit(side, frames.name, path, statements)
     poses = Poses(side.rotation, factor * side.translation)
     covariance, common = side.covariance, side.common
-    wanted = FRAMES[role][0]
     if frames.name != wanted:
         poses, covariance, common = inverted(poses, covariance, common)
     parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
@@ -250,7 +240,7 @@ def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed
     return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), guessed, common)
 
 
-def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
+def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Known:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option = statements.frames_of(role)
     if option is not None:
@@ -261,30 +251,27 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
                 f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; if the name is wrong, change it "
                 f"in the file{f', to {name}' if name else ''}; else leave the option out",
             )
-        return Frames(option, "as you say")
+        return Known(option, "as you say")
     if side.frames is not None:
         return side.frames
     if side.trajectory and role == "camera":
-        return Frames("board_from_camera", "by default, the camera's trajectory")
-    return Frames(FRAMES[role][0], "by default")
+        return Known("board_from_camera", "by default, the camera's trajectory")
+    return Known(FRAMES[role][0], "by default")
 
 
-def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
+def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
     """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
     unit, option = side.unit, statements.length_unit
     if option is not None and not (unit is not None and unit.stated):
-        unit = Unit(option, "as you say")
+        unit = Known(option, "as you say", False)
     if unit is not None:
         return LENGTHS[unit.name], f"{unit.name} {unit.by}", ""
     distances = np.linalg.norm(side.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
         near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
-        raise InputError(
-            "E-POSES-UNITS",
-            f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units; write all in "
-            "the same unit and give --length-unit mm or m",
-        )
+        said = f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units"
+        raise InputError("E-POSES-UNITS", f"{said}; write all in the same unit and give --length-unit mm or m")
     if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
         raise InputError(
             "E-POSES-UNITS",
@@ -295,19 +282,6 @@ def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, s
     return LENGTHS[guess], f"{guess} by their size, up to {farthest:.4g}", guess
 
 
-def _pairs(
-    robot: Posed, camera: Posed, a: Sequence[int], b: Sequence[int], names: tuple[str, ...], where: str
-) -> HandEyePoses:
-    of_robot = None if robot.covariance is None else robot.covariance[list(a)]
-    of_camera = None if camera.covariance is None else camera.covariance[list(b)]
-    common = None if camera.common is None else camera.common[list(b)]
-    return HandEyePoses(robot.poses[list(a)], camera.poses[list(b)], of_robot, of_camera, names, where, common)
-
-
-def _both(robot: Posed, camera: Posed) -> tuple[str, ...]:
-    return f"robot: {robot.understood}", f"camera: {camera.understood}"
-
-
 def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]], str]:
     """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched.
 
@@ -316,25 +290,16 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
     if not robot.names and not camera.names:
         if len(robot) == len(camera):
             return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
-        raise InputError(
-            "E-POSES-COUNT",
-            f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
-            "of each, or names, needed",
-        )
+        counts = f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times"
+        raise InputError("E-POSES-COUNT", f"{counts}; as many of each, or names, needed")
     if not robot.names or not camera.names:
         without, other = (robot, camera) if not robot.names else (camera, robot)
-        raise InputError(
-            "E-POSES-UNNAMED",
-            f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …; name both, like "
-            f"with a column {key}",
-        )
+        said = f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …"
+        raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column {key}")
     rows = partners(robot.names, camera.names)
     if rows is None:
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one, "
-            f"{camera.names[0]} … in the other; correct them",
-        )
+        said = f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one"
+        raise InputError("E-POSES-UNMATCHED", f"{said}, {camera.names[0]} … in the other; correct them")
     return rows
 
 

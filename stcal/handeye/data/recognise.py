@@ -16,7 +16,7 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order
-from stcal.handeye.data.record import EVERY_FRAME, Content, Frames, Said, Side, Unit, require_each_once
+from stcal.handeye.data.record import EVERY_FRAME, Known, PoseContent, PoseSide, Said, require_each_once
 from stcal.handeye.data.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.poses.columns import find_column, places_of, read_rotations
@@ -41,25 +41,21 @@ def todays(table: Table) -> bool:
     return bool(placed) and all(f"{prefix}qw" in table for prefix in placed)
 
 
-def read_columns(table: Table, key: str, statements: Said) -> Content | None:
+def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
     """Returns the poses in the columns of a table; None where it has none."""
-    names, sides = _row_names(table, key), []
-    for frame in EVERY_FRAME:
-        side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, statements)
-        if side is not None:
-            sides.append(side)
-    if not sides:
-        side = _side(table, "", None, names, statements)
-        sides = [side] if side is not None else []
+    names = _row_names(table, key)
+    prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
+    read = [_side(table, prefix, frames, names, statements) for prefix, frames in prefixes.items()]
+    sides = [side for side in read if side is not None]
+    if not sides and (side := _side(table, "", None, names, statements)) is not None:
+        sides = [side]
     if not sides:
         return None
     roles = [side.frames.role for side in sides if side.frames is not None]
     if len(set(roles)) < len(roles):
         both = ", ".join(side.frames.name for side in sides if side.frames is not None)
-        raise InputError(
-            "E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed, take the others out"
-        )
-    return Content(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
+        raise InputError("E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed; drop the others")
+    return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
 
 def _row_names(table: Table, key: str) -> tuple[str, ...]:
@@ -77,36 +73,30 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     return ()
 
 
-def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], statements: Said) -> Side | None:
+def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> PoseSide | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
     place = _place(table, prefix)
-    if place is None:
+    turned = None if place is None else read_rotations(table, prefix, statements.rotation)
+    if place is None or turned is None:
         return None
-    turned = read_rotations(table, prefix, statements.rotation)
-    if turned is None:
-        return None
-    at, unit = place
     covariance = table.pose_covariances(prefix)
-    side = Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
-    return replace(side, covariance=covariance, common=table.common_errors(covariance, prefix))
+    common = table.common_errors(covariance, prefix)
+    at, unit = place
+    side = PoseSide(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
+    return replace(side, covariance=covariance, common=common)
 
 
-def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
+def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
     for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
         for unit in (*LENGTHS, ""):
-            columns = [
-                find_column(table, prefix, f"{form.format(axis)}_{unit}" if unit else form.format(axis))
-                for axis in "xyz"
-            ]
-            present = [column for column in columns if column is not None]
+            names = (form.format(axis) + f"_{unit}" * bool(unit) for axis in "xyz")
+            present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
             if len(present) == len("xyz"):
                 values = np.column_stack([table.numbers(column) for column in present])
-                return values, Unit(unit, "by the columns", True) if unit else None
+                return values, Known(unit, "by the columns") if unit else None
             if present and unit and form == "{}":
-                raise InputError(
-                    "E-TABLE-COLUMN-MISSING",
-                    f"{table.where}: {', '.join(present)} alone; x, y and z in one unit needed",
-                )
+                alone = f"{table.where}: {', '.join(present)} alone"
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
     return None
 
 
@@ -128,6 +118,7 @@ _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 _UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
 _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
 """A unit in the header of a table, which is no list of YAML."""
+_HEADER = re.compile(r"[^:\[{]*[,;\t]")
 _SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
 """A header of columns between which spaces stand, of six names at least, as a pose needs."""
 
@@ -151,11 +142,10 @@ class File:
 
     @property
     def first(self) -> str:
-        """The first line, without white space around it."""
         return next((line.strip() for _, line in self.lines if not separator_stated(line)), "")
 
 
-def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Content | None:
+def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
     """Returns the content of a file. Returns None for the package's own tables, and for tables whose readers give
     better messages.
 
@@ -177,10 +167,8 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
         return None
     content = next(reader(file) for is_of, reader in FORMATS if is_of(file))
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out",
-        )
+        said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
+        raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
     return content
 
 
@@ -203,16 +191,14 @@ def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: i
         row = of_line(line)
         if row is None or len(row) != count:
             held = "no numbers" if row is None else f"{len(row)} numbers"
-            raise InputError(
-                "E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first line needed; correct it"
-            )
+            raise InputError("E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first one needed")
         values.append(row)
     places = tuple(f"line {number}" for number, _ in file.lines)
     require_finite(np.array(values), places, file.where)
     return np.array(values), places
 
 
-def _of_universal(file: File) -> Content:
+def _of_universal(file: File) -> PoseContent:
     """Returns the poses of lines ``p[x, y, z, rx, ry, rz]``."""
 
     def inside(line: str) -> list[float] | None:
@@ -221,10 +207,10 @@ def _of_universal(file: File) -> Content:
 
     values, places = _table_of(file, inside, 6)
     rotation, words = turned_values(values[:, 3:], file.said.rotation, "the numbers after x, y, z", places, file.where)
-    return Content("rows of numbers", (Side(rotation, values[:, :3], places, words),))
+    return PoseContent("rows of numbers", (PoseSide(rotation, values[:, :3], places, words),))
 
 
-def _of_tum(file: File) -> Content:
+def _of_tum(file: File) -> PoseContent:
     """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
     values, places = _table_of(file, _numbers, TUM)
     names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
@@ -237,10 +223,10 @@ def _of_tum(file: File) -> Content:
             order = list(said_convention(file.said.rotation, what, file.where, len("wxyz")).order)
     require_each_once(names, places, file.where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
-    turned, unit = f"quaternions {', '.join(order)}", Unit("m", "as in TUM")
+    turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
     rotation = of_quaternions(wxyz, places, file.where)
-    side = Side(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
-    return Content("TUM trajectory (timestamp, place, quaternion)", (side,))
+    side = PoseSide(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
+    return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
 
 
 def _row_of_numbers(file: File) -> list[float] | None:
@@ -250,16 +236,11 @@ def _row_of_numbers(file: File) -> list[float] | None:
     return _numbers(file.first) or (_numbers(others[0]) if named else None)
 
 
-def _refuse_rows(file: File) -> Content:
+def _refuse_rows(file: File) -> PoseContent:
     raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
 
 
-def _is_table(file: File) -> bool:
-    header = _BRACKETED_UNIT.sub("", file.first)
-    return bool(re.match(r"[^:\[{]*[,;\t]", header) or _SPACED.fullmatch(file.first))
-
-
-def _of_table(file: File) -> Content | None:
+def _of_table(file: File) -> PoseContent | None:
     table = read_table(file.path, "pose file", file.quaternions)
     return None if todays(table) else read_columns(table, file.key, file.said)
 
@@ -271,7 +252,7 @@ def _is_json(file: File) -> bool:
         return False
 
 
-def _of_values(file: File, value: Any, form: str) -> Content:
+def _of_values(file: File, value: Any, form: str) -> PoseContent:
     content = read_tree(value, form, file.said, file.where)
     if content is None:
         held = f"keys {', '.join(map(str, list(value)[:SHOWN]))} …" if isinstance(value, dict) else form
@@ -279,12 +260,10 @@ def _of_values(file: File, value: Any, form: str) -> Content:
     return content
 
 
-def _of_yaml(file: File) -> Content:
+def _of_yaml(file: File) -> PoseContent:
     if len(file.text.encode("utf-8")) > SETTINGS_BYTES:
-        raise InputError(
-            "E-FILE-TOO-LARGE",
-            f"{file.where}: {len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read",
-        )
+        sizes = f"{len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
+        raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
     try:
         documents = [each for each in load_documents(file.text) if each is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -296,7 +275,7 @@ def _of_yaml(file: File) -> Content:
     return _of_values(file, documents[0], "YAML")
 
 
-def _of_npz(file: File) -> Content:
+def _of_npz(file: File) -> PoseContent:
     """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
     others = []
@@ -305,10 +284,8 @@ def _of_npz(file: File) -> Content:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
             size = sum(member.file_size for member in members)
             if size > TABLE_BYTES:
-                raise InputError(
-                    "E-FILE-TOO-LARGE",
-                    f"{file.where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read",
-                )
+                sizes = f"{size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
+                raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
             for member in members:
                 name, content = member.filename.removesuffix(".npy"), archive.read(member)
                 try:
@@ -334,25 +311,20 @@ def _array(data: bytes, where: str) -> np.ndarray | list[str]:
     except DAMAGED as error:
         raise _damaged(where, error) from error
     if stream.tell() != len(data):
-        raise InputError(
-            "E-NUMPY-UNREADABLE", f"{where}: {len(data) - stream.tell()} bytes behind its array; save it again"
-        )
+        raise InputError("E-NUMPY-UNREADABLE", f"{where}: {len(data) - stream.tell()} bytes after its array; save anew")
     if array.dtype.kind == "U":
         return [str(text) for text in array.ravel()]
     if array.dtype.kind not in "iuf" or not array.ndim or not array.size:
-        raise InputError(
-            "E-NUMPY-CONTENT", f"{where}: an array of {array.dtype}, shape {array.shape}; poses as numbers needed"
-        )
+        raise InputError("E-NUMPY-CONTENT", f"{where}: array of {array.dtype}, shape {array.shape}; numbers needed")
     return np.array(array, dtype=float)
 
 
 def _damaged(where: str, error: Exception) -> InputError:
-    return InputError(
-        "E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({' '.join(str(error).split())[:80]}); save it again"
-    )
+    said = " ".join(str(error).split())[:80]
+    return InputError("E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({said}); save it again")
 
 
-FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], Content | None]], ...] = (
+FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], PoseContent | None]], ...] = (
     (
         lambda file: file.data.startswith(NPY),
         lambda file: _of_values(file, _array(file.data, file.where), "NumPy array"),
@@ -362,7 +334,7 @@ FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], Content | None]]
     (lambda file: bool(_UNIVERSAL.fullmatch(file.first)), _of_universal),
     (lambda file: len(_numbers(file.first) or ()) == TUM, _of_tum),
     (_row_of_numbers, _refuse_rows),
-    (_is_table, _of_table),
+    (lambda file: bool(_HEADER.match(_BRACKETED_UNIT.sub("", file.first)) or _SPACED.fullmatch(file.first)), _of_table),
     (lambda file: True, _of_yaml),
 )
 """Whether a file is of a format, by its content, and the reader of that format, in this order."""

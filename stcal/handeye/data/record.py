@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.handeye.data.pairs import Setup
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -21,13 +21,12 @@ FRAMES: dict[Role, tuple[str, str]] = {
 }
 """The transform that is needed for each side, and its inverse."""
 EVERY_FRAME = tuple(name for names in FRAMES.values() for name in names)
-MATRICES = "4×4 matrices"
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
-    """``name`` : one of :data:`FRAMES`; ``by`` : how it is known, in words; ``stated`` : whether the file itself states
-    it, so that an option cannot contradict it."""
+class Known:
+    """``name`` of a transform, of :data:`EVERY_FRAME`, or of a unit, of :data:`stcal.io.table.LENGTHS`; ``by`` : how it
+    is known, in words; ``stated`` : whether the file itself states it, so that an option cannot contradict it."""
 
     name: str
     by: str
@@ -35,40 +34,27 @@ class Frames:
 
     @property
     def role(self) -> Role:
+        """The side that has this transform."""
         return "robot" if self.name in FRAMES["robot"] else "camera"
 
 
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """Unit of length: ``name`` as in :data:`stcal.io.table.LENGTHS`; ``by``, ``stated`` as in :class:`Frames`."""
-
-    name: str
-    by: str
-    stated: bool = False
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Side:
+class PoseSide:
     """Poses of the robot or of the camera.
 
-    Parameters
-    ----------
-    rotation, translation : (m, 3, 3) rotation and translation of each pose; lengths in ``unit``
-    places : place of each pose in its file: ``line 7``
-    turned : how rotations are written, in words
-    unit, frames : None where the file does not say
-    names : image or timestamp of each pose; empty where there are none
-    trajectory : whether poses are those of a moving body in a world, as in files of trajectories
-    covariance : (m, 6, 6) covariances of the transforms of ``frames``, mm and rad
-    common : (m, 6, k) errors that these transforms have in common, contained in their covariances
+    ``rotation``, ``translation`` : (m, 3, 3), (m, 3), lengths in ``unit``; ``places`` : place of each pose in its file,
+    like ``line 7``; ``turned`` : how rotations are written, in words; ``unit``, ``frames`` : None where the file does
+    not say; ``names`` : image or timestamp of each pose, if any; ``trajectory`` : whether poses are those of a moving
+    body in a world; ``covariance`` : (m, 6, 6) of the transforms of ``frames``, mm and rad; ``common`` : (m, 6, k)
+    errors that these have in common, contained in their covariances.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
     places: tuple[str, ...]
     turned: str
-    unit: Unit | None = None
-    frames: Frames | None = None
+    unit: Known | None = None
+    frames: Known | None = None
     names: tuple[str, ...] = ()
     trajectory: bool = False
     covariance: np.ndarray | None = None
@@ -84,24 +70,19 @@ class Side:
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
-    """Content of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
+class PoseContent:
+    """PoseContent of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
     known, or one side of each role; ``setup`` : setup that the file states, if any; ``passed_over`` : other content of
     the file that is not used."""
 
     form: str
-    sides: tuple[Side, ...]
+    sides: tuple[PoseSide, ...]
     setup: Setup | None = None
     passed_over: tuple[str, ...] = ()
 
-    def of(self, role: Role) -> Side | None:
+    def of(self, role: Role) -> PoseSide | None:
         """Returns the side that is stated to be of this role."""
         return next((side for side in self.sides if side.frames is not None and side.frames.role == role), None)
-
-    @property
-    def both(self) -> bool:
-        """True if these are pose pairs."""
-        return len(self.sides) == len(ROLES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,30 +105,25 @@ class Said:
         cls, rotation: Sequence[str], length_unit: Sequence[str], frames: Sequence[str], setup: Setup | None = None
     ) -> "Said":
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
-        ``robot=`` and ``camera=``, and of ``--poses-are``.
-        """
-        whole: dict[str, str] = {}
-        by_role: dict[tuple[Role, str], str] = {}
+        ``robot=`` and ``camera=``, and of ``--poses-are``."""
+        values: dict[tuple[str, str], str] = {}
         for option, value in (*(("rotation", v) for v in rotation), *(("length_unit", v) for v in length_unit)):
             role, equals, name = value.partition("=")
             typed = f"--{option.replace('_', '-')} {value}"
             if equals and role not in ROLES:
                 raise InputError("E-OPTION-VALUE", f"{typed}: robot= or camera= needed before the name")
-            own_role: Role = "robot" if role == "robot" else "camera"
-            if (equals and (own_role, option) in by_role) or (not equals and option in whole):
+            place, name = (role, option) if equals else ("", option), name if equals else role
+            if place in values:
                 raise InputError("E-OPTION-REPEATED", f"{typed}: given twice; one for each of robot and camera")
-            if equals:
-                by_role[own_role, option] = name
-            else:
-                whole[option] = role
-        own: tuple[tuple[Role, str, str], ...] = tuple((*place, name) for place, name in by_role.items())
-        return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, own)
+            values[place] = name
+        own: tuple[tuple[Role, str, str], ...] = tuple(
+            (role, option, name) for role in ROLES for (of, option), name in values.items() if of == role
+        )
+        return cls(values.get(("", "rotation")), values.get(("", "length_unit")), tuple(frames), setup, own)
 
     def of(self, role: Role) -> "Said":
         """Returns the statements that hold for poses of this role."""
-        values = {name: value for entry_role, name, value in self.own if entry_role == role}
-        rotation, unit = values.get("rotation", self.rotation), values.get("length_unit", self.length_unit)
-        return Said(rotation, unit, self.frames, self.setup)
+        return replace(self, own=(), **{name: value for entry_role, name, value in self.own if entry_role == role})
 
     def options(self) -> list[str]:
         """Returns the names of the options that were given."""
@@ -162,10 +138,8 @@ class Said:
         for unit in (self.length_unit, *(value for _, name, value in self.own if name == "length_unit")):
             if unit and unit not in LENGTHS:
                 raise InputError("E-OPTION-VALUE", f"--length-unit {unit}: unknown; {', '.join(LENGTHS)} needed")
-        if len({Frames(name, "").role for name in self.frames}) < len(self.frames):
-            raise InputError(
-                "E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each of robot and camera at most"
-            )
+        if len({Known(name, "").role for name in self.frames}) < len(self.frames):
+            raise InputError("E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each side at most")
 
     def frames_of(self, role: Role) -> str | None:
         """Returns the transform that poses of this role are stated to be; None where it is not stated."""
@@ -180,9 +154,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
         i = bad[0]
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""
         row = " ".join(f"{v:g}" for v in matrices[i, 3])
-        raise InputError(
-            "E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; correct it"
-        )
+        raise InputError("E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; mend it")
     return proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3]
 
 
@@ -192,7 +164,7 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     for name, place in zip(names, places, strict=True):
         if name in first:
             raise InputError(
-                "E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed"
+                "E-POSE-REPEATED", f"{where}: {first[name]} and {place} are both {kind}{name!r}; one needed"
             )
         first[name] = place
 
@@ -213,9 +185,8 @@ _FORMS = (
     (re.compile(rf"(?:{_LEFT})_?t_?(?:{_RIGHT})"), "ab", False),
     (re.compile(rf"t_(?:{_LEFT})_(?:{_RIGHT})"), "ab", False),
 )
-"""Forms of names of transforms; which of the two frames is the first of ``a_from_b``; and whether no other reading is
-possible."""
-_PART = re.compile(r"(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
+"""Forms of names of transforms; which frame is the first of ``a_from_b``; whether no other reading is possible."""
+_PART = re.compile(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
 """Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
 ROLES_BY_NAME: dict[Role, re.Pattern] = {
     "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)(_?(pose|transform|matri(x|ce))s?)?"),
@@ -226,20 +197,22 @@ ROLES_BY_NAME: dict[Role, re.Pattern] = {
 """Names that tell whether poses are the robot's or the camera's, but not in which direction."""
 
 
-def frames_of(key: str) -> Frames | None:
+def frames_of(key: str) -> Known | None:
     """Returns the transform that a name means; None where it means none."""
-    name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
+    name = _plain(key)
     if name in EVERY_FRAME:
-        return Frames(name, f"by its name {key}")
-    bare = _PART.sub("", name, count=1) if _PART.match(name) else name
+        return Known(name, f"by its name {key}")
     for form, order, only in _FORMS:
-        match = form.fullmatch(bare)
-        if match:
+        if match := form.fullmatch(_PART.sub("", name, count=1)):
             sides = {part[0]: part[2:] for part, text in match.groupdict().items() if text is not None}
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
-                return Frames(frames, f"by its name {key}", only)
+                return Known(frames, f"by its name {key}", only)
     return None
+
+
+def _plain(key: object) -> str:
+    return re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
 
 
 def inverse_name(key: str) -> str:
@@ -254,5 +227,4 @@ def inverse_name(key: str) -> str:
 
 def role_of(key: str) -> Role | None:
     """Returns the side whose poses a name means, where the name has no direction."""
-    name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
-    return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)
+    return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(_plain(key))), None)

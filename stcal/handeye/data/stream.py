@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import rms_of
+from stcal.handeye.data.pose_pairs import rms_of
 
 LONGEST_S = 0.25
 """Largest distance in time of two samples between which a pose is interpolated."""
@@ -29,8 +29,7 @@ STEP = 1e-3
 WINDOW = 4
 """Number of samples of a cubic."""
 LOO_NOISE = float(np.sqrt(1 + 34 / 36))
-"""Scatter of a sample about the cubic through its four neighbours, in σ of one sample; it holds the noise of all
-five."""
+"""Scatter of a sample about the cubic through its four neighbours, in σ of one sample, with the noise of all five."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +55,12 @@ class Stream:
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
         """Returns the stream of samples that may be in any order."""
         if len(times) < 2:
-            raise InputError(
-                "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"
-            )
+            raise InputError("E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the stream")
         order = sorted(range(len(times)), key=times.__getitem__)
         origin = times[order[0]]
         seconds = np.array([float(times[i] - origin) for i in order])
         if len(same := np.flatnonzero(np.diff(seconds) < SAME_S)):
-            raise InputError(
-                "E-TIMES-REPEATED", f"{where}: two samples of the time {times[order[same[0]]]}; take one of them out"
-            )
+            raise InputError("E-TIMES-REPEATED", f"{where}: two samples of time {times[order[same[0]]]}; take one out")
         return cls(seconds, poses[order], origin, where)
 
     def after_origin(self, times: Sequence[Decimal]) -> np.ndarray:
@@ -78,8 +73,7 @@ class Stream:
         n, width = len(self), min(WINDOW, len(self))
         before = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, n - 2)
         nodes = np.clip(before - 1, 0, n - width)[:, None] + np.arange(width)
-        weight = _lagrange(self.seconds[nodes], seconds)
-        return self._weighted(before, nodes, weight)
+        return self._weighted(before, nodes, _lagrange(self.seconds[nodes], seconds))
 
     def velocity(self, seconds: np.ndarray) -> np.ndarray:
         """Returns velocities (k, 6) at times after the origin, of the left perturbation, rad/s and mm/s."""
@@ -120,9 +114,8 @@ class Stream:
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Returns weights (k, w) of values at nodes (k, w) for the polynomial through them, evaluated at (k,)."""
-    width = nodes.shape[1]
     weight = np.ones(nodes.shape)
-    for i, j in permutations(range(width), 2):
+    for i, j in permutations(range(nodes.shape[1]), 2):
         weight[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
     return weight
 
@@ -156,28 +149,29 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     after = np.clip(np.searchsorted(samples, seconds), 1, len(samples) - 1)
     before = after - 1
     nearest = np.where(seconds - samples[before] <= samples[after] - seconds, before, after)
-    gap_s = np.abs(samples[nearest] - seconds)
-    inside = (seconds >= samples[0]) & (seconds <= samples[-1]) & (samples[after] - samples[before] <= LONGEST_S)
-    near, same = gap_s <= tolerance_s, gap_s < SAME_S
-    kept = inside | near | same
+    gap_s, spacing = np.abs(samples[nearest] - seconds), samples[after] - samples[before]
+    inside = (seconds >= samples[0]) & (seconds <= samples[-1]) & (spacing <= LONGEST_S)
+    same = gap_s < SAME_S
+    kept = inside | same | (gap_s <= tolerance_s)
     at = np.where(inside & ~same, seconds, samples[nearest])
     why = []
     for k, time in enumerate(seconds):
-        away, gap = f"{gap_s[k]:.4g} s", samples[after[k]] - samples[before[k]]
+        away = f"{gap_s[k]:.4g} s"
         reason = f"{away} {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
         if samples[0] <= time <= samples[-1]:
             allowed = f"{LONGEST_S:g} s allowed; the nearest sample is {away} away"
-            reason = f"in a gap of {gap:.3g} s of {stream.where}, {allowed}"
+            reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {allowed}"
         why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
-    counts = int(same.sum()), int((inside & ~same).sum()), int((kept & ~inside & ~same).sum())
-    parts = [f"{counts[0]} at a sample"] if counts[0] else []
-    if counts[1]:
+    interpolated, nearby = inside & ~same, kept & ~inside & ~same
+    parts = [f"{int(same.sum())} at a sample"] if same.any() else []
+    if interpolated.any():
         turn, shift = stream.rest()
         noise = "" if np.isnan(turn) else f", each within {shift:.2g} mm and {np.degrees(turn):.2g}° of the others"
-        parts.append(f"{counts[1]} interpolated (cubic; samples {stream.spacing_s():.3g} s apart{noise})")
-    if counts[2]:
-        farthest = gap_s[kept & ~inside & ~same].max()
-        parts.append(f"{counts[2]} by the nearest sample, up to {farthest:.3g} s away ({tolerance_s:g} s allowed)")
+        spaced = f"cubic; samples {stream.spacing_s():.3g} s apart{noise}"
+        parts.append(f"{int(interpolated.sum())} interpolated ({spaced})")
+    if nearby.any():
+        farthest = f"up to {gap_s[nearby].max():.3g} s away ({tolerance_s:g} s allowed)"
+        parts.append(f"{int(nearby.sum())} by the nearest sample, {farthest}")
     if len(seconds) > kept.sum():
         parts.append(f"{len(seconds) - int(kept.sum())} left out")
     message = f"poses by time: {len(seconds)} times in {len(samples)} samples of {stream.where}: {', '.join(parts)}"
@@ -186,9 +180,8 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:
     """Returns the times that names mean, in s; None where one is none, or where all may count images."""
-    parsed = [time_of(name) for name in names]
-    times = [time for time in parsed if time is not None]
-    if not times or len(times) < len(parsed):
+    times = [time for name in names if (time := time_of(name)) is not None]
+    if not times or len(times) < len(names):
         return None
     fraction = any(re.search(r"\d\.\d", name) for name in names)
     return times if fraction or max(abs(time) for time in times) >= LEAST_STAMP else None

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.pairs import Setup
+from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.record import (
     FRAMES,
-    MATRICES,
-    Content,
-    Frames,
+    Known,
+    PoseContent,
+    PoseSide,
     Said,
-    Side,
-    Unit,
     frames_of,
     of_matrices,
     require_each_once,
@@ -36,22 +34,20 @@ LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timesta
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
 SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
 """Setups by easy_handeye's names of them."""
-ROS = Unit("m", "as in ROS")
+ROS = Known("m", "as in ROS", False)
 
 
-def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | None:
+def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
     """Returns the poses in plain values; None where there are none."""
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
-            raise InputError(
-                "E-POSES-NOT-FOUND",
-                f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
-            )
+            said = "the result of an easy_handeye calibration; give its samples, NAME.samples"
+            raise InputError("E-POSES-NOT-FOUND", f"{where}: {said}")
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
         if content is not None:
             return content
         if (side := _side_of(value, where)) is not None:
-            return Content(form, (side,))
+            return PoseContent(form, (side,))
         for key in HOLDERS:
             if isinstance(value.get(key), Mapping | list | np.ndarray):
                 content = read_tree(value[key], form, statements, where)
@@ -61,14 +57,11 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
         return None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if (
-        isinstance(value, list)
-        and isinstance(value[0], Mapping)
-        and (content := _of_pairs(value, form, where)) is not None
-    ):
+    listed = isinstance(value, list) and isinstance(value[0], Mapping)
+    if (content := _of_pairs(list(value), form, where) if listed else None) is not None:
         return content
     side = _side_of(value, where)
-    return None if side is None else Content(form, (side,))
+    return None if side is None else PoseContent(form, (side,))
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -82,10 +75,8 @@ def numbers(value: Any) -> np.ndarray | None:
         return flat.reshape(rows, columns) if fits and flat is not None else None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if not isinstance(value, np.ndarray) and not _all_numbers(value):
-        return None
     try:
-        return np.array(value, dtype=float)
+        return np.array(value, dtype=float) if isinstance(value, np.ndarray) or _all_numbers(value) else None
     except (ValueError, TypeError):
         return None
 
@@ -120,42 +111,37 @@ def _name_in(value: Mapping) -> str:
     return next((str(v).strip() for v in given if isinstance(v, str | int | float) and not isinstance(v, bool)), "")
 
 
-def _side_of(value: Any, where: str, frames: Frames | None = None) -> Side | None:
+def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | None:
     """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping):
-        if (found := _matrix(value)) is not None:
+        if _matrix(value) is not None:
             value, places = [value], ("the pose",)
         else:
-            names, places, value = tuple(map(str, value)), tuple(map(str, value)), list(value.values())
+            names = places = tuple(map(str, value))
+            value = list(value.values())
             if any(_matrix(item) is None for item in value):
                 return None
-    else:
+    elif isinstance(value, list | np.ndarray):
         array = numbers(value)
-        if array is not None and array.shape in ((4, 4), (16,)):
-            value = [array]
-        places = tuple(f"pose {i}" for i in range(1, len(value) + 1)) if isinstance(value, list | np.ndarray) else ()
-    matrices = []
-    for item, place in zip(value if places else (), places, strict=True):
-        found = _matrix(item)
-        if found is None and not matrices:
-            return None
-        if found is None:
-            raise InputError(
-                "E-POSE-VALUE",
-                f"{where}: {place}: not a 4×4 matrix like the one before it; correct it, or take it out",
-            )
-        matrices.append(found)
-    if not matrices:
+        value = [array] if array is not None and array.shape in ((4, 4), (16,)) else value
+        places = tuple(f"pose {i}" for i in range(1, len(value) + 1))
+    else:
         return None
-    named = tuple(name for _, name in matrices)
+    found = [_matrix(item) for item in value]
+    if not found or found[0] is None:
+        return None
+    bad = [place for place, each in zip(places, found, strict=True) if each is None]
+    if bad:
+        raise InputError("E-POSE-VALUE", f"{where}: {bad[0]}: not a 4×4 matrix like the one before; take it out")
+    matrices, named = zip(*filter(None, found), strict=True)
     names = names or (named if all(named) else ())
     require_each_once(names, places[: len(names)], where)
-    rotation, translation = of_matrices(np.array([matrix for matrix, _ in matrices]), places, where)
-    return Side(rotation, translation, places, MATRICES, None, frames, names)
+    rotation, translation = of_matrices(np.array(matrices), places, where)
+    return PoseSide(rotation, translation, places, "4×4 matrices", None, frames, names)
 
 
-def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None:
+def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent | None:
     """Returns easy_handeye's samples, in which the robot's poses are inverted for a camera that stands still."""
     samples, parameters = value.get("samples", value), value.get("parameters")
     if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
@@ -167,9 +153,8 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | Non
             return None
         for i, sample in enumerate(samples, 1):
             if "robot" not in sample or camera_key not in sample:
-                raise InputError(
-                    "E-POSE-INCOMPLETE", f"{where}: sample {i}: robot and {camera_key} needed; take it out"
-                )
+                needed = f"robot and {camera_key} needed; take it out"
+                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: {needed}")
         lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
     else:
         return None
@@ -180,20 +165,16 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | Non
             setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
     fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
-    frames = (
-        Frames(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
-        Frames("camera_from_board", "as easy_handeye writes it", False),
-    )
+    by = "as easy_handeye writes it"
+    frames = Known(FRAMES["robot"][fixed], f"{by} of {of_setup}", False), Known("camera_from_board", by, False)
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
-    return Content("easy_handeye samples", _same_count(sides, where), setup)
+    return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
 
 
-def _of_messages(values: Any, where: str, frames: Frames) -> Side:
+def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
     """Returns the poses of a list of ROS's transforms, metres."""
     if not isinstance(values, list) or not values:
-        raise InputError(
-            "E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; take samples, and save them"
-        )
+        raise InputError("E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; save them anew")
     places, rows = tuple(f"sample {i}" for i in range(1, len(values) + 1)), []
     for value, place in zip(values, places, strict=True):
         parts = value.get("transform", value) if isinstance(value, Mapping) else {}
@@ -202,19 +183,18 @@ def _of_messages(values: Any, where: str, frames: Frames) -> Side:
         if isinstance(at, Mapping) and isinstance(turn, Mapping):
             row = numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
         if row is None:
-            raise InputError(
-                "E-POSE-VALUE", f"{where}: {place}: no translation x, y, z and rotation x, y, z, w; correct it"
-            )
+            said = "no translation x, y, z and rotation x, y, z, w; correct it"
+            raise InputError("E-POSE-VALUE", f"{where}: {place}: {said}")
         rows.append(row)
     require_finite(np.array(rows), places, where)
     rotation = of_quaternions(np.array(rows)[:, 3:], places, where)
-    return Side(rotation, np.array(rows)[:, :3], places, "quaternions x, y, z, w by name", ROS, frames)
+    return PoseSide(rotation, np.array(rows)[:, :3], places, "quaternions x, y, z, w by name", ROS, frames)
 
 
-def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
+def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
     """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
-    named: dict[str, Frames] = {}
+    named: dict[str, Known] = {}
     others, names = [], ()
     for key, item in value.items():
         if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
@@ -226,7 +206,7 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
         if role is None or not shaped or (frames is None and _side_of(item, where) is None):
             others.append(str(key))
             continue
-        frames = frames or Frames(FRAMES[role][0], "by default", False)
+        frames = frames or Known(FRAMES[role][0], "by default", False)
         parts.setdefault(frames.name, {})[str(key)] = item
         named[frames.name] = frames
     if not parts:
@@ -234,18 +214,14 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
     roles = [frames.role for frames in named.values()]
     if len(set(roles)) < len(roles) or any(len(item) > 2 for item in parts.values()):
         keys = ", ".join(key for item in parts.values() for key in item)
-        raise InputError(
-            "E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file"
-        )
+        raise InputError("E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each")
     sides = []
     for name, item in parts.items():
         [first, *more] = item.values()
         side = _of_rotations(item, where, named[name]) if more else _side_of(first, where, named[name])
         if side is None:
-            raise InputError(
-                "E-POSES-NOT-FOUND",
-                f"{where}: {', '.join(item)}: no poses; 4×4 matrices, or matrices 3×3 and translations, needed",
-            )
+            needed = "4×4 matrices, or matrices 3×3 and translations, needed"
+            raise InputError("E-POSES-NOT-FOUND", f"{where}: {', '.join(item)}: no poses; {needed}")
         sides.append(side)
     if names and len(names) != len(sides[0]):
         raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
@@ -253,10 +229,10 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
         require_each_once(names, sides[0].places, where)
         sides = [replace(side, names=names) for side in sides]
     opencv = any("2" in key for item in parts.values() for key in item)
-    return Content("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
+    return PoseContent("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
-def _of_rotations(parts: dict[str, Any], where: str, frames: Frames) -> Side:
+def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays = {}
     for key, value in parts.items():
@@ -268,15 +244,12 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Frames) -> Side:
     turn, at = arrays[turn_key], arrays[at_key]
     count = 1 if at.size == len("xyz") else len(at)
     if at.size != 3 * count or turn.size != 9 * count:
-        raise InputError(
-            "E-POSES-SHAPE",
-            f"{where}: {turn_key} of shape {turn.shape}, {at_key} of {at.shape}; a matrix 3×3 and a translation of 3 "
-            "numbers for each pose needed",
-        )
+        shapes = f"{where}: {turn_key} of shape {turn.shape}, {at_key} of {at.shape}"
+        raise InputError("E-POSES-SHAPE", f"{shapes}; a matrix 3×3 and a translation of 3 numbers for each pose needed")
     places = tuple(f"pose {i}" for i in range(1, count + 1))
     at = at.reshape(count, 3)
     require_finite(at, places, where)
-    return Side(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
+    return PoseSide(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
 
 
 def _flat(value: Any) -> Any:
@@ -284,17 +257,15 @@ def _flat(value: Any) -> Any:
     return value if array is None else array.ravel().tolist()
 
 
-def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> Content | None:
+def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | None:
     """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
     stacks: dict[str, Any] = {}
     for key, entry in value[0].items():
         if (frames_of(key) is None and role_of(key) is None) or _matrix(entry) is None:
             continue
         if without := [i for i, other in enumerate(value, 1) if key not in other]:
-            raise InputError(
-                "E-POSE-INCOMPLETE",
-                f"{where}: pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out",
-            )
+            said = f"pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out"
+            raise InputError("E-POSE-INCOMPLETE", f"{where}: {said}")
         stacks[key] = [other[key] for other in value]
     if not stacks:
         return None
@@ -305,10 +276,10 @@ def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> Content | None
     if content is None:
         return None
     sides = tuple(replace(side, unit=ROS) for side in content.sides) if moveit else content.sides
-    return Content("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
+    return PoseContent("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
 
 
-def _same_count(sides: list[Side], where: str) -> tuple[Side, ...]:
+def _same_count(sides: list[PoseSide], where: str) -> tuple[PoseSide, ...]:
     if len({len(side) for side in sides}) > 1:
         counts = " and ".join(f"{len(side)} of {side.frames.name if side.frames else 'one side'}" for side in sides)
         raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")

@@ -5,16 +5,16 @@ from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import STALE, HandEyePoses, Loop, Setup, apart
-from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
+from stcal.handeye.data.pose_pairs import STALE, HandEyePoses, Loop, Setup, apart
+from stcal.handeye.judge.observable import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
 from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
+from stcal.report.document import Answer
 from stcal.row_order import change_along
 
 Word = Literal["good", "use with care", "do not use"]
@@ -27,16 +27,11 @@ class Finding:
 
     Parameters
     ----------
-    title : str
-        Name of the matter.
-    word : {"good", "use with care", "do not use"}
-        The verdict.
-    said : str
-        What was found, in words.
-    value, limit : str
-        What was measured, and the limit of ``good``; empty where there is none.
-    remedy : str
-        What to do; empty where nothing has to be done.
+    title : name of the matter
+    word : {"good", "use with care", "do not use"}, the verdict
+    said : what was found, in words
+    value, limit : what was measured, and the limit of ``good``; empty where there is none
+    remedy : what to do; empty where nothing has to be done
     """
 
     title: str
@@ -53,8 +48,7 @@ class Verdict:
 
     Parameters
     ----------
-    findings : tuple of Finding
-        In the order in which they were made.
+    findings : in the order in which they were made
     """
 
     findings: tuple[Finding, ...]
@@ -77,31 +71,32 @@ class Verdict:
         """Returns what to do against the reasons that forbid to use the calibration, each once."""
         return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
 
-    def doubt(self) -> str:
-        """Returns the sentence of a verdict that is not good; empty for a good one."""
-        return "" if self.word == GOOD else f"verdict: {self.sentence()}"
-
     def sentence(self) -> str:
         """Returns the word and its reasons in one line."""
-        return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"
+        return f"{self.word}: {self._why()}"
+
+    def doubt(self) -> str:
+        """Returns the answer that is not yes; empty for a good calibration."""
+        return "" if self.word == GOOD else self.answer().lines()[0]
+
+    def answer(self) -> Answer:
+        """Returns the answer at the head of a report."""
+        return Answer(dict(zip(get_args(Word), ("yes", "with care", "no"), strict=True))[self.word], self._why())
+
+    def _why(self) -> str:
+        return "; ".join(each.said for each in self.reasons())
 
 
 class Grave(str):
     """A note that says that the result is wrong, or answers another question."""
 
-    __slots__ = ()
-
 
 class Aside(str):
     """A note that does not weaken the result, or whose subject the verdict judges itself."""
 
-    __slots__ = ()
-
 
 class SizeDoubt(Grave):
     """A note that the board's size differs from the stated one, which an offset of the clocks can also cause."""
-
-    __slots__ = ()
 
 
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
@@ -119,8 +114,7 @@ SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
 """Probability that a move along the order of sound poses is named, and least share of the squares that it explains;
 the same where each pose is at a place of its own, so that errors common to a place are no move."""
 STILL = 0.005
-"""Share of the usual turn, and of the usual way, between two poses, below both of which a side did not move: a robot's
-feedback at rest repeats to micrometres."""
+"""Share of the usual turn and way between two poses, below both of which a side did not move."""
 FEW = 200
 """Largest number of poses of which all pairs are compared for what is usual."""
 HALL_MM = 5e4
@@ -142,16 +136,17 @@ def of_outliers(
     notes = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
-        notes.append(
-            Aside(f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out")
-        )
+        said = f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
+        notes.append(Aside(said))
     if (outliers & ~flips).mean() > MANY:
-        notes.append(
-            Grave(
-                f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
-                "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
-            )
-        )
+        said = f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
+        said += "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
+        notes.append(Grave(said))
+    if flips.any():
+        said = f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat "
+        said += "target is, which its image hardly excludes: "
+        said += ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
+        notes.append(Aside(f"{said}; --undo-flips takes that one, or give images"))
     return tuple(notes)
 
 
@@ -189,12 +184,11 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
         between = below**2 * (1 / first + 1 / (m - first))
         if between.max() > APART * (along @ along):
             k = int(first[between.argmax()])
-            groups = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
-            gap = abs(along[groups[0]].mean() - along[groups[1]].mean()) * unit
-            first_ones = f"{len(groups[0])} with {names[0]} and {len(groups[1])} with {names[groups[1][0]]}"
+            one, two = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
+            gap = abs(along[one].mean() - along[two].mean()) * unit
             return (
-                f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera "
-                "moved in between? solve each separately",
+                f"the poses fall into two groups that are {gap:.2g}{word} apart, {len(one)} with {names[0]} and "
+                f"{len(two)} with {names[two[0]]}: was board or camera moved in between? solve each separately",
             )
     return ()
 
@@ -205,8 +199,7 @@ def of_order(
     """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
     jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals, or be beyond
     chance where the poses are ``apart``."""
-    parts = residuals.reshape(-1, 2, 3)
-    sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)
+    sigma = np.repeat(np.median(np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2), axis=0), 3)
     if not (sigma > 0).all():
         return ()
     white = jacobian / sigma[:, None]
@@ -224,52 +217,45 @@ def of_order(
     if change.kind == "drift":
         return (f"{what} drifts from the first pose to the last, by {size}: fasten it, and take the poses again",)
     likely = f" ({names[change.first]} to {names[change.last]} as likely)" if change.first < change.last else ""
-    return (
-        f"{what} moved before {names[change.row]}{likely}, by {size}: solve the poses before it, and those from it "
-        f"on, separately",
-    )
+    before = f"{what} moved before {names[change.row]}{likely}, by {size}"
+    return (f"{before}: solve the poses before it, and those from it on, separately",)
 
 
 def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
     """Returns a note if the board is of another size than stated. ``hint`` is the scale after one step, with its σ."""
-    if not _is_other(*hint, HINTED):
+
+    def other(scale: float, sigma: float, sigmas: float) -> bool:
+        return abs(scale - 1) > max(sigmas * sigma, SIZE_SHARE)
+
+    if not other(*hint, HINTED):
         return ()
     try:  # the hint comes from one large step, so the scale is solved for
         solution = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
     except StcalError:
         return ()
     scale, sigma = solution.state.scale, float(np.sqrt(generalised_inverse(solution.normal)[12, 12]))
-    if not (_is_other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
+    if not (other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
         return ()
-    return (
-        SizeDoubt(
-            f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: "
-            + ("name the columns so, x_in …, or give --length-unit; if not, " if unit_of(scale) else "")
-            + "check its size and the camera file, or solve with the scale"
-        ),
-    )
-
-
-def _is_other(scale: float, sigma: float, sigmas: float) -> bool:
-    return abs(scale - 1) > max(sigmas * sigma, SIZE_SHARE)
+    unit = unit_of(scale)
+    said = f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit}: "
+    said += "name the columns so, x_in …, or give --length-unit; if not, " if unit else ""
+    return (SizeDoubt(f"{said}check its size and the camera file, or solve with the scale"),)
 
 
 def of_distance(loop: Loop) -> tuple[str, ...]:
     """Returns a note if all lengths are in another unit, which no equation shows."""
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
-    if away > HALL_MM:
-        remedy = "if lengths are in mm, name the columns x_mm …, or give the unit mm"
-        return (Grave(f"the board is {away:.0f} mm from the camera (median): {remedy}"),)
-    if away >= NEAR_MM:
+    if NEAR_MM <= away <= HALL_MM:
         return ()
-    remedy = "name the columns x_m … or x_in …, or give --length-unit m where none states a unit"
-    message = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres or inches, {remedy}"
-    return (Grave(message),)
+    said, remedy = f"{away:.0f}", "lengths are in mm, name the columns x_mm …, or give the unit mm"
+    if away < NEAR_MM:
+        said, remedy = f"{away:.2g}", "lengths are in metres or inches, name the columns x_m … or x_in …, or give "
+        remedy += "--length-unit m where none states a unit"
+    return (Grave(f"the board is {said} mm from the camera (median): if {remedy}"),)
 
 
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
-"""Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
-stated; brackets are shorter."""
+"""Distances of a camera from its flange that are doubted, and called wrong unless the setup is stated."""
 LONG_MM, NEARER = 250.0, 0.5
 """Distance of a camera from the flange, and share of it within which the board lies of the base's origin, from which
 on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
@@ -294,23 +280,6 @@ def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[st
     return (Grave(said) if away > TOO_FAR_MM and not stated else said,)
 
 
-def of_rounds(settled: bool) -> tuple[str, ...]:
-    """Returns a note if the estimated σ, or the set of good poses, still change at the end."""
-    if settled:
-        return ()
-    return ("the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses",)
-
-
-def of_variance(factor: float, redundancy: int) -> tuple[str, ...]:
-    """Returns a note if the mean square of residuals over σ, ``factor``, is not 1 within chance."""
-    low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
-    if low <= factor <= high:
-        return ()
-    return (
-        f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect; correct σ, or look for errors",
-    )
-
-
 MOST = 2000
 """Largest number of poses of which all pairs are compared. From more poses, this many are chosen evenly."""
 
@@ -326,9 +295,8 @@ def spread_text(base_from_flange: Poses, setup: Setup) -> list[str]:
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(observability.turns_rad))
     axes = int((observability.turns_rad > LEAST_TURN).sum())
     some = base_from_flange.rotation[np.unique(np.linspace(0, m - 1, min(m, MOST)).astype(int))]
-    largest = max(
-        float(Rotation.from_matrix(some[i + 1 :] @ some[i].T).magnitude().max()) for i in range(len(some) - 1)
-    )
+    turned = (some[i + 1 :] @ some[i].T for i in range(len(some) - 1))
+    largest = max(float(Rotation.from_matrix(each).magnitude().max()) for each in turned)
     box = " × ".join(f"{side:.0f}" for side in np.ptp(base_from_flange.translation, axis=0))
     lines = [
         f"motions: the flange turns about {axes} {'axis' if axes == 1 else 'axes'} ({turns} RMS about its principal "

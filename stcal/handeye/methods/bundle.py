@@ -13,13 +13,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
 
-SETTLED_MM = 1e-3
-"""Largest motion of a flange in a round of linear steps, in mm, after which only squares of the motion are
-neglected."""
-ARM_ROUNDS = 10
-PARTS = ("arm_rad", "arm_mm")
-"""Groups of σ of the parameters about the arm's file: directions of axes, and places of axes."""
-
 
 @runtime_checkable
 class ArmModel(Protocol):
@@ -53,11 +46,6 @@ class LinearArm:
     slope: np.ndarray
     angles: np.ndarray
 
-    @classmethod
-    def about(cls, arm: ArmModel, parameters: np.ndarray) -> "LinearArm":
-        """Returns the linearisation of a model."""
-        return cls(parameters, arm.slope(parameters), arm.angles)
-
     def __getitem__(self, rows) -> "LinearArm":
         """Returns the linearisation with these poses alone."""
         return LinearArm(self.parameters, self.slope[rows], self.angles)
@@ -70,19 +58,14 @@ class LinearArm:
 
     def slope_after(self, step: np.ndarray) -> np.ndarray:
         """Returns the derivative (m, 6, k) of :meth:`moved`, left, at a step: rotation vectors do not add."""
-        turn = np.einsum("mak,k->ma", self.slope[:, :3], step)
-        cross = skew(turn)
+        cross = skew(np.einsum("mak,k->ma", self.slope[:, :3], step))
         to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
         return np.concatenate([to_left @ self.slope[:, :3], self.slope[:, 3:]], axis=1)
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Returns the rows of the parameters in each of :data:`PARTS` that has any."""
-        rows_of_part = dict(zip(PARTS, (np.flatnonzero(self.angles), np.flatnonzero(~self.angles)), strict=True))
+        """Returns the rows of the parameters by group of σ: directions of axes and places of axes, if any."""
+        rows_of_part = {"arm_rad": np.flatnonzero(self.angles), "arm_mm": np.flatnonzero(~self.angles)}
         return {name: rows for name, rows in rows_of_part.items() if len(rows)}
-
-    def moves_mm(self, step: np.ndarray) -> float:
-        """Returns the largest motion of a flange by the step (k,), in mm."""
-        return float(np.linalg.norm(self.slope[:, 3:] @ step, axis=1).max())
 
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
@@ -179,10 +162,8 @@ class Corners:
     def bundle(self, values: Mapping[str, Any]) -> Bundle:
         """Returns the unknowns, those that are not solved for included."""
         arm = values["arm"].array[0] if "arm" in values else np.zeros(0)
-        flange, camera = (
-            self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, arm),
-            self.camera,
-        )
+        flange, camera = self.base_from_flange, self.camera
+        flange = flange if self.arm is None else self.arm.moved(flange, arm)
         if "robot" in values:
             off = values["robot"]
             flange = Poses(off.rotation @ flange.rotation, off.translation + flange.translation)

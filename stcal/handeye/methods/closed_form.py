@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.rigid import Poses, Rigid, best_rotations
-from stcal.handeye.data.pairs import Loop, Motions
+from stcal.handeye.data.pose_pairs import Loop, Motions
 from stcal.io.device import quiet_opencv
 
 SUBSETS = 200
 """Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
 LEAST_LENGTH = 0.1
-"""Least ratio of the fitted length of the camera's paths to that of the flange. It is 1 but for the board's size, and 0
-where neither moves."""
+"""Least ratio of the lengths of camera's and flange's paths: 1 but for the board's size, 0 where neither moves."""
 LEAST_SCALE = 1e-6
 """Smallest scale of the board; lengths in metres give 0.001."""
 SEED = 0
@@ -36,34 +35,24 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     """
     m = len(loop)
     if m < 3:
-        raise DegenerateError(
-            "E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more"
-        )
+        raise DegenerateError("E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; turn the flange about two axes")
     candidates = [_linear(loop, np.arange(m)[None], with_scale)]
     rng = np.random.default_rng(SEED)
     if m > 3:
-        size = 3 if m < 6 else 4
         order = rng.permuted(np.tile(np.arange(m), (SUBSETS, 1)), axis=1)
-        candidates.append(_linear(loop, order[:, :size], with_scale))
+        candidates.append(_linear(loop, order[:, : 3 if m < 6 else 4], with_scale))
     parts = [np.concatenate(arrays) for arrays in zip(*candidates, strict=True)]
     turn, shift = _misses(loop, *parts)
-    shift = _in_board_units(shift, parts[4])
     best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
-    inside = (turn[best] <= 3 * np.median(turn[best])) & (shift[best] <= 3 * np.median(shift[best]))
+    turn, shift = turn[best], shift[best]
+    inside = (turn <= 3 * np.median(turn)) & (shift <= 3 * np.median(shift))
     if inside.sum() >= 3:
         again = _linear(loop, np.flatnonzero(inside)[None], with_scale)
         new_turn, new_shift = _misses(loop, *again)
-        new_shift = _in_board_units(new_shift, again[4])
-        if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
+        if np.median(new_turn) * np.median(new_shift) < np.median(turn) * np.median(shift):
             parts, best = again, 0
     x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
     return Rigid(x, t_x), Rigid(z, t_z), float(scale)
-
-
-def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Returns distances (s, m) over scales (s,); infinite for a board of no size."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(np.abs(scale) < LEAST_SCALE, np.inf, shift.T / np.abs(scale)).T
 
 
 def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
@@ -74,16 +63,13 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     motions = motions[motions.has_log()]
     camera_axis = (motions.alpha @ mount_axis) @ motions.beta
     if not np.linalg.norm(camera_axis) > LEAST_LENGTH:
-        raise DegenerateError(
-            "E-HANDEYE-AXES", "hand-eye: the flange turns, and the board does not turn with it in the camera"
-        )
+        raise DegenerateError("E-HANDEYE-AXES", "hand-eye: the flange turns, and the board not with it in the camera")
     turn = Rotation.align_vectors(mount_axis[None], camera_axis[None])[0]
     board = eye.translation @ turn.as_matrix().T
     along = (board @ mount_axis)[:, None] * mount_axis
     across = np.stack([board - along, np.cross(mount_axis, board)], axis=2)
-    rows = np.concatenate(
-        [hand.rotation @ across, hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2
-    ).reshape(-1, 8)
+    of_stand = np.tile(-np.eye(3), (len(loop), 1, 1))
+    rows = np.concatenate([hand.rotation @ across, hand.rotation, of_stand], axis=2).reshape(-1, 8)
     right = -hand.translation - np.einsum("mab,mb->ma", hand.rotation, along)
     cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
     length = float(np.hypot(cosine, sine))
@@ -97,7 +83,6 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
-    eye = loop.camera_from_board
     scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
     t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
     return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
@@ -140,13 +125,17 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z."""
+    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
+    infinite for a board of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     chain = hand.rotation @ (x[:, None] @ eye.rotation)
     cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)
-    return np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(at + hand.translation - t_z[:, None], axis=2)
+    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(size < LEAST_SCALE, np.inf, shift.T / size).T
+    return np.arccos(np.clip(cosine, -1, 1)), shift
 
 
 def mean_pose(chain: Poses) -> Rigid:
@@ -169,36 +158,27 @@ AX_ZB = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORL
 def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
     """Returns X and Z by one of :data:`AX_XB`, whose Z is the mean of the chains, or :data:`AX_ZB`; ``unit_mm`` weighs
     like one radian. Raises ConvergenceError: OpenCV fails, or its result is not a rigid transform."""
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
+
+    def split(poses: Poses) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        return list(poses.rotation), list(poses.translation / unit_mm)
+
+    def rigid(rotation: np.ndarray, translation: np.ndarray) -> Rigid:
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
+            said = f"hand-eye: {method} returns no transform; the motions are too small or too alike for it"
+            raise ConvergenceError("E-HANDEYE-METHOD-FAILS", said)
+        u, _, vt = np.linalg.svd(rotation)
+        return Rigid(u @ vt, unit_mm * translation.ravel())
+
+    hand, eye = loop.stand_from_mount, split(loop.camera_from_board)
     try:
         with quiet_opencv():  # of few poses it prints lines of its own
             if method in AX_XB:
-                r, t = cv2.calibrateHandEye(*_split(hand, unit_mm), *_split(eye, unit_mm), method=AX_XB[method])
-                x = _rigid(r, t, unit_mm, method)
+                x = rigid(*cv2.calibrateHandEye(*split(hand), *eye, method=AX_XB[method]))
                 return x, mean_pose(loop.chain(x))
-            mount_from_stand = hand.inverse()
-            r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(
-                *_split(eye, unit_mm), *_split(mount_from_stand, unit_mm), method=AX_ZB[method]
-            )
+            r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(*eye, *split(hand.inverse()), method=AX_ZB[method])
     except cv2.error as error:
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err}); use another method"
-        ) from error
-    return _rigid(r_x, t_x, unit_mm, method).inverse(), _rigid(r_z, t_z, unit_mm, method).inverse()
-
-
-def _split(poses: Poses, unit_mm: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return list(poses.rotation), list(poses.translation / unit_mm)
-
-
-def _rigid(rotation: np.ndarray, translation: np.ndarray, unit_mm: float, method: str) -> Rigid:
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.linalg.det(rotation) > 0):
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS",
-            f"hand-eye: {method} returns no transform; the motions are too small or too alike for it",
-        )
-    u, _, vt = np.linalg.svd(rotation)
-    return Rigid(u @ vt, unit_mm * translation.ravel())
+        raise ConvergenceError("E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err})") from error
+    return rigid(r_x, t_x).inverse(), rigid(r_z, t_z).inverse()
 
 
 GAP = 1e-4
@@ -221,9 +201,7 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
     x = smallest_largest(c, d, x)
     u, s, vt = np.linalg.svd(x[:9].reshape(3, 3, order="F"))
     if np.linalg.det(u @ vt) < 0 or s[2] < 0.1:
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; the motions are too small or too alike for it"
-        )
+        raise ConvergenceError("E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; motions are too alike")
     return Rigid(u @ vt, unit_mm * x[9:])
 
 
@@ -260,15 +238,9 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.column_stack([-2 * (hessian @ y[:-1] - pull), np.ones(len(c))])
 
     ahead = np.eye(13)[-1]
-    solution = minimize(
-        lambda y: y[-1],
-        np.append(x, 1.0),
-        jac=lambda _: ahead,
-        method="SLSQP",
-        constraints={"type": "ineq", "fun": below, "jac": below_slope},
-        options={"maxiter": 500, "ftol": 1e-14},
-    )
-    x = solution.x[:-1]
+    limits, options = {"type": "ineq", "fun": below, "jac": below_slope}, {"maxiter": 500, "ftol": 1e-14}
+    start, objective = np.append(x, 1.0), lambda y: y[-1]
+    x = minimize(objective, start, jac=lambda _: ahead, method="SLSQP", constraints=limits, options=options).x[:-1]
     errors = squared(x).sum(1)
     # The minimum of a weighted mean of the squared errors is below that of the largest: multipliers give the best mean.
     active = errors > (1 - 1e-2) * errors.max()

@@ -10,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid, skew
-from stcal.handeye.data.pairs import Motions
+from stcal.handeye.data.pose_pairs import Motions
 
 MOST = 100_000
 """Largest number of candidates, and of generations."""
@@ -42,6 +42,13 @@ class Bounds:
                 f"{FARTHEST:g} and a positive half width needed",
             )
 
+    def in_words(self, factor: float, unit: str) -> str:
+        """Returns the bounds in words, times ``factor``."""
+        about = "the closed-form solution" if self.centre is None else "zero"
+        if any(self.centre or ()):
+            about = ", ".join(f"{factor * coordinate:g}" for coordinate in self.centre or ()) + unit
+        return f"±{factor * self.half_width:.4g}{unit} about {about}"
+
 
 @dataclass(frozen=True, slots=True)
 class EvolutionOptions:
@@ -49,17 +56,13 @@ class EvolutionOptions:
 
     Parameters
     ----------
-    population, generations : int
-        M and the number of generations.
-    factor, crossover : float
-        F and CR.
-    weight : float
-        λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated).
-    bounds_rad : Bounds
-        Bounds of the rotation vectors of the first population. The paper takes them from knowledge of the set-up; its
-        values are not legible in the source.
-    bounds_mm : Bounds, optional
-        Bounds of its translations; where None, about zero, as wide as the distance of the farthest board or flange.
+    population, generations : M and the number of generations
+    factor, crossover : F and CR
+    weight : λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated)
+    bounds_rad : bounds of the rotation vectors of the first population. The paper takes them from knowledge of the
+        set-up; its values are not legible in the source.
+    bounds_mm : bounds of its translations; where None, about zero, as wide as the distance of the farthest board or
+        flange
     seed : int
     """
 
@@ -94,23 +97,12 @@ class EvolutionOptions:
 
     def in_words(self, unit_mm: float) -> str:
         """Returns in words the settings that the paper leaves to choose, or that its copy does not show."""
-        turn = _in_words(self.bounds_rad, 180 / np.pi, "°")
-        shift = _in_words(self.bounds_mm, 1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
+        turn = self.bounds_rad.in_words(180 / np.pi, "°")
+        shift = self.bounds_mm.in_words(1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
         return (
             f"differential evolution: first population {turn} and {shift}; λ {self.weight:g} with lengths in units of "
             f"{unit_mm:g} mm; the paper's own bounds are not legible, and what it reaches depends on them"
         )
-
-
-def _in_words(bounds: Bounds, factor: float, unit: str) -> str:
-    about = "the closed-form solution"
-    if bounds.centre is not None:
-        about = (
-            ", ".join(f"{factor * coordinate:g}" for coordinate in bounds.centre) + unit
-            if any(bounds.centre)
-            else "zero"
-        )
-    return f"±{factor * bounds.half_width:.4g}{unit} about {about}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,9 +144,8 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()
     parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
-    centre = np.concatenate(
-        [about[3 * i : 3 * i + 3] if bounds.centre is None else bounds.centre for i, bounds in enumerate(parts)]
-    )
+    own = (about[:3], about[3:])
+    centre = np.concatenate([a if b.centre is None else b.centre for a, b in zip(own, parts, strict=True)])
     scale = np.repeat([1.0, 1 / objective.unit_mm], 3)
     centre, half = centre * scale, np.repeat([bounds.half_width for bounds in parts], 3) * scale
     x = rng.uniform(centre - half, centre + half, (size, 6))

@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
-from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""
@@ -34,15 +34,11 @@ class Noise:
 
     Parameters
     ----------
-    robot_rad, robot_mm : float, optional
-        σ of base_from_flange, in the axes of the base, about the flange.
-    camera_rad, camera_mm : float, optional
-        σ of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to
-        be 0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
-    corner_px : float, optional
-        σ of a corner in the image, or the factor of the stated covariances of corners. Never 0.
-    board_mm : float, optional
-        σ of a corner's place on the board.
+    robot_rad, robot_mm : σ of base_from_flange, in the axes of the base, about the flange
+    camera_rad, camera_mm : σ of camera_from_board, about the board's origin. If nothing is known of either side,
+        ``robot_mm`` is taken to be 0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
+    corner_px : σ of a corner in the image, or the factor of the stated covariances of corners. Never 0.
+    board_mm : σ of a corner's place on the board
     """
 
     robot_rad: float | None = None
@@ -57,15 +53,11 @@ class Noise:
         for side in ("robot", "camera"):
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):
-                raise InputError(
-                    "E-SIGMA-INCOMPLETE", f"noise: one of σ_rot and σ_trans of the {side} is given; both or none needed"
-                )
+                said = f"noise: one of σ_rot and σ_trans of the {side} is given"
+                raise InputError("E-SIGMA-INCOMPLETE", f"{said}; both or none needed")
             if pair[0] is not None and not (0 <= pair[0] <= MOST_RAD and 0 <= pair[1] <= MOST_MM):
-                raise InputError(
-                    "E-SIGMA-VALUE",
-                    f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm; 0 to "
-                    f"{np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible",
-                )
+                said = f"noise: σ of the {side} is {np.degrees(pair[0]):g}° and {pair[1]:g} mm"
+                raise InputError("E-SIGMA-VALUE", f"{said}; 0 to {np.degrees(MOST_RAD):g}° and {MOST_MM:g} mm possible")
         for name, least in (("corner_px", 1e-9), ("board_mm", 0.0)):
             value = getattr(self, name)
             if value is not None and not (least <= value <= MOST_MM):
@@ -95,44 +87,36 @@ class LoopComponents:
 
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect."""
-        lengths = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
-        squared = [robust_sigma(length, 3) ** 2 for length in lengths.T]
+        turn, shift = (robust_sigma(each, 3) ** 2 for each in np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T)
         turns = max(sum(name.endswith("_rad") for name in self.names), 1)
-        by_kind = {"rad": squared[0] / turns, "mm": squared[1], "factor": 1.0}
-        return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
+        by_kind = {"rad": turn / turns, "mm": shift, "factor": 1.0}
+        return np.maximum([by_kind[name.rpartition("_")[2]] for name in self.names], self.least())
 
     def least(self) -> np.ndarray:
         """Returns the lower limits (f,) of the variances."""
-        return np.square([LEAST[_kind(name)] for name in self.names])
-
-
-def _kind(name: str) -> str:
-    """Returns ``rad``, ``mm`` or ``factor``."""
-    return name.rpartition("_")[2]
+        return np.square([LEAST[name.rpartition("_")[2]] for name in self.names])
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
     """Returns the components at an estimate of X. Covariances of the camera's poses hold the images' noise up to a
     factor, as the intrinsics' errors have the same weak directions; it is estimated where the robot's σ are too."""
-    jacobians = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
-    stated = {"robot": loop.robot_covariance, "camera": loop.camera_covariance}
-    for side, (rad, mm) in {
-        "robot": (noise.robot_rad, noise.robot_mm),
-        "camera": (noise.camera_rad, noise.camera_mm),
-    }.items():
-        if stated[side] is None and rad is not None and mm is not None:
-            stated[side] = np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (len(loop), 1, 1))
     known, free = np.zeros((len(loop), 6, 6)), {}
-    for side, jacobian in jacobians.items():
-        if stated[side] is not None:
-            carried = jacobian @ stated[side] @ np.swapaxes(jacobian, 1, 2)
-            if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
-                free["camera_factor"] = carried
-            else:
-                known = known + carried
+    for side, jacobian, stated, rad, mm in (
+        ("robot", loop.by_robot(mount_from_camera, scale), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
+        ("camera", loop.by_camera(mount_from_camera, scale), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
+    ):
+        of_images = stated is not None
+        if stated is None and rad is not None and mm is not None:
+            stated = np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (len(loop), 1, 1))
+        if stated is None:
+            for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
+                free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
             continue
-        for name, columns in ((f"{side}_rad", slice(0, 3)), (f"{side}_mm", slice(3, 6))):
-            free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
+        carried = jacobian @ stated @ np.swapaxes(jacobian, 1, 2)
+        if side == "camera" and of_images and "robot_rad" in free:
+            free["camera_factor"] = carried
+        else:
+            known = known + carried
     if len(free) == 4:  # shifts of robot and camera move the board alike
         del free["robot_mm"]
     if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses determine one component less

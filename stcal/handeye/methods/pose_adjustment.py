@@ -10,7 +10,7 @@ from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01
@@ -182,9 +182,9 @@ def _squared(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Returns poses to start with, by σ from medians: at least the better two thirds, so as not to select by chance."""
-    squared = np.sort(_squared(residuals, covariance))
-    enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
-    return _squared(residuals, covariance) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
+    squared = _squared(residuals, covariance)
+    enough = min(max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES), len(squared))
+    return squared <= max(chi2.ppf(1 - FALSE_ALARM, 6), np.sort(squared)[enough - 1])
 
 
 def _agreeing(

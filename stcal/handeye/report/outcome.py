@@ -1,20 +1,21 @@
 """All results of a hand-eye command, and the verdict on them."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import f
 
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import skew
-from stcal.handeye.choose import Choice
-from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.data.views import Views
-from stcal.handeye.judge.mistakes import flipped
-from stcal.handeye.judge.observability import COMMON_MM, in_words
+from stcal.handeye.choose import ChosenWay
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
+from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.judge.conventions import flipped
+from stcal.handeye.judge.observable import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, SizeDoubt, Verdict, Word, spoken
-from stcal.handeye.result import HandEye
+from stcal.handeye.solving import HandEyeOptions
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 
@@ -37,42 +38,42 @@ class ArmFound:
 class Outcome:
     """A calibration with everything that its report shows.
 
-    Parameters
-    ----------
-    where : names of the files that were solved
-    result : HandEye
-    held_out : errors of the result's method on held-out poses
-    compared : results of every method, if a comparison was asked for
-    pitch_mm : pitch of dots or squares, as the board's file states it
-    colmap_model : model of the camera whose intrinsics were solved for
-    own_sigmas : whether corners came with covariances. The result's ``corner_px`` is then their factor.
-    left_out : images and rows that did not take part, and why
-    notes : notes in addition to those of the result
-    motions : errors of the last motions, held out
-    choice : the candidates that were tried, if no method was named
-    pairs : the pairs that were solved, after repair of the numbering of a symmetric board
-    views : the corners after the same repair, if there were images
-    understood : how files of other programs were interpreted
-    arm : the arm's parameters, if they were solved for
-    time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
+    ``where`` : names of the files that were solved; ``result`` : HandEye; ``held_out`` : errors of the result's method
+    on held-out poses; ``compared`` : results of every method, if a comparison was asked for; ``options`` : by which the
+    result was solved; ``pitch_mm`` : pitch of dots or squares, as the board's file states it; ``left_out`` : images and
+    rows that did not take part, and why; ``notes`` : notes in addition to those of the result; ``motions`` : errors of
+    the last motions, held out; ``choice`` : the candidates that were tried, if no method was named; ``pairs``,
+    ``views`` : the poses that were solved, and their corners if there were images; a symmetric board's as numbered;
+    ``understood`` : how files of other programs were interpreted; ``arm`` : the arm's parameters, if they were solved
+    for; ``time_offset`` : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain
+    its σ.
     """
 
     where: str
     result: HandEye
     held_out: HeldOutPoses | None = None
     compared: tuple[Compared, ...] = ()
+    options: HandEyeOptions = field(default_factory=HandEyeOptions)
     pitch_mm: float | None = None
-    colmap_model: str = ""
-    own_sigmas: bool = False
     left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
-    choice: Choice | None = None
+    choice: ChosenWay | None = None
     pairs: HandEyePoses | None = None
     views: Views | None = None
     understood: tuple[str, ...] = ()
     arm: ArmFound | None = None
     time_offset: TimeOffset | None = None
+
+    @property
+    def colmap_model(self) -> str:
+        """Model of the camera whose intrinsics were solved for."""
+        return self.options.intrinsics.colmap_model if self.options.intrinsics else ""
+
+    @property
+    def own_sigmas(self) -> bool:
+        """Whether corners came with covariances. The result's ``corner_px`` is then their factor."""
+        return self.views is not None and all(view.covariance is not None for view in self.views.views)
 
     def sentence(self) -> str:
         """Returns what was solved for and what that gains; empty if the user chose what to solve for."""
@@ -106,11 +107,9 @@ class Outcome:
         if found is None or found.camera_covariance is None:
             return None
         parameters, sigma = found.camera.parameters(), np.sqrt(np.diag(found.camera_covariance))
-        return {
-            "model": self.colmap_model,
-            "parameters": dict(zip(PARAMETER_NAMES, parameters, strict=True)),
-            "sigma": dict(zip(parameter_names(self.colmap_model), sigma, strict=True)),
-        }
+        values = dict(zip(PARAMETER_NAMES, parameters, strict=True))
+        sigmas = dict(zip(parameter_names(self.colmap_model), sigma, strict=True))
+        return {"model": self.colmap_model, "parameters": values, "sigma": sigmas}
 
 
 SUSPICIOUS, FAILED = 1e-3, 1e-5
@@ -126,47 +125,38 @@ WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 """Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
 that were never calibrated and poses of single tags stay below half of these."""
 OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
-"""Deviation of a board from its stated size, and in σ, beyond which it is told: a printer is off by that
-much, a pitch that was measured is not."""
+"""Deviation of a board's size, and in σ, beyond which it is told: printers err by that, measured pitches do not."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
 
 def judged(outcome: Outcome) -> Verdict:
     """Returns the verdict on a calibration."""
-    tests = [
-        _of_residuals(outcome),
-        _of_prediction(outcome),
-        _of_share(outcome),
-        _of_common_errors(outcome),
-        _of_motions(outcome),
-        _of_size(outcome),
-        _of_outliers(outcome),
-    ]
-    return Verdict(tuple(each for each in (*tests, *of_notes(outcome.all_notes())) if each is not None))
+    kinds = (_of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers)
+    tests = [judge(outcome) for judge in kinds]
+    for note in outcome.all_notes():  # the text behind a note's colon is the remedy
+        if not isinstance(note, Aside):
+            said, _, remedy = note.partition(": ")
+            tests.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
+    return Verdict(tuple(each for each in tests if each is not None))
 
 
 def _of_residuals(outcome: Outcome) -> Finding | None:
     """Refuses residuals that are too large for a sound robot and camera, even if they predict held-out poses well."""
-    if outcome.pairs is None or not (used := ~outcome.result.outliers).any():
+    result, used = outcome.result, ~outcome.result.outliers
+    if outcome.pairs is None or not used.any():
         return None
-    turn, shift = outcome.result.rms()
-    scale = outcome.result.scale
-    away = scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
+    turn, shift = result.rms()
+    away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
-    return Finding(
-        "Residuals",
-        BAD,
-        f"the poses miss one another by {np.degrees(turn):.2g}° and {shift:.3g} mm (RMS), {shift / away:.0%} of the "
-        f"board's distance of {away:.0f} mm",
-        f"{np.degrees(turn):.2g}°, {shift:.3g} mm",
-        f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm",
-        ""
-        if any(isinstance(note, SizeDoubt) for note in outcome.all_notes())
-        else "pair each pose of the board with that of the flange at the same moment, and check units, directions and "
-        "the camera file",
-    )
+    value = f"{np.degrees(turn):.2g}°, {shift:.3g} mm"
+    said = f"the poses miss one another by {value.replace(',', ' and')} (RMS), {shift / away:.0%} of the board's "
+    said += f"distance of {away:.0f} mm"
+    limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
+    remedy = "pair each pose of the board with that of the flange at that time, and check units, directions and camera"
+    remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
+    return Finding("Residuals", BAD, said, value, limit, remedy)
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
@@ -191,10 +181,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     expected = (1 + unknowns / predicting) / (1 - unknowns / equations)
     dof = equations / 2, (equations - unknowns) / 2
     limits = [fitted * float(np.sqrt(expected * f.ppf(1 - odds, *dof))) for odds in (SUSPICIOUS, FAILED)]
-    word = _word(error, *limits)
-    promise = f"as the residuals of {fitted:.3g} mm promise"
-    if word != GOOD:
-        promise = f"where the residuals of {fitted:.3g} mm promise {fitted * np.sqrt(expected):.3g} mm"
+    word, promised = _word(error, *limits), f"the residuals of {fitted:.3g} mm promise"
+    promise = f"as {promised}" if word == GOOD else f"where {promised} {fitted * np.sqrt(expected):.3g} mm"
     said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
     remedy = "take more poses, and look for poses that do not belong to the others"
     return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
@@ -207,12 +195,11 @@ def _of_share(outcome: Outcome) -> Finding | None:
     if share is None or outcome.arm is not None:
         return None
     distance, sigma, shift = share
-    share_of_transform, word = sigma**2 / (sigma**2 + shift**2), _word(sigma**2 / (sigma**2 + shift**2), HALF, MOST)
+    share_of_transform = sigma**2 / (sigma**2 + shift**2)
+    word = _word(share_of_transform, HALF, MOST)
     alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
-    said = (
-        f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
-        f"away), the error of a single pose {shift:.2g} mm (RMS)"
-    )
+    said = f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was "
+    said += f"({distance:.0f} mm away), the error of a single pose {shift:.2g} mm (RMS)"
     remedy = "take more poses, and turn the flange more, about two axes"
     return _graded("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
 
@@ -230,10 +217,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
         return None
     distance, sigma, shift = share
     word: Word = CARE if sigma > shift else GOOD
-    said = (
-        f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
-        f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
-    )
+    said = f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
+    said += f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
     remedy = "calibrate the camera better, or solve from the images: more poses do not help"
     return _graded(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
@@ -249,9 +234,8 @@ def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) ->
     if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
         return None
     place = pairs.camera_from_board.translation[~result.outliers] * result.scale
-    jacobian = np.concatenate(
-        [-skew(place @ result.mount_from_camera.rotation.T), np.tile(np.eye(3), (used, 1, 1))], axis=2
-    )
+    by_turn = -skew(place @ result.mount_from_camera.rotation.T)
+    jacobian = np.concatenate([by_turn, np.tile(np.eye(3), (used, 1, 1))], axis=2)
     variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
     return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))
@@ -265,18 +249,16 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     ratio = observability.sigma_mm / COMMON_MM
     word = _word(ratio, AS_ONE, AS_THREE)
     first, second, _ = np.degrees(observability.turns_rad)
+    title, value, limit = "Motions of the flange", f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}"
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
-        remedy = (
-            f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
-            f"robot with four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
-        )
-        return Finding("Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", remedy)
+        remedy = f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which "
+        remedy += "a robot with four axes cannot show; or turn the flange about another axis too, without --four-dof"
+        return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
-    value = f"{ratio:.2f} × σ of a pose"
-    return _graded("Motions of the flange", word, said, value, f"{AS_ONE:g}", observability.missing())
+    return _graded(title, word, said, value, limit, observability.missing())
 
 
 def _of_size(outcome: Outcome) -> Finding | None:
@@ -294,22 +276,20 @@ def _of_outliers(outcome: Outcome) -> Finding:
     result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
     if not bad:
         return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
-    said, others, flips = [], bad, ()
+    said, flips = [], ()
     if outcome.pairs is not None:
         loop = Loop.of(outcome.pairs, result.setup)
         tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
         flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+    others = tuple(name for name in bad if name not in flips)
     if flips:
-        others = tuple(name for name in bad if name not in flips)
         tilt = "poses are tilted the other way, as the second pose of a flat target is"
         said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
     if others:
         said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
     remedies = []
     if flips and outcome.views is None:
-        remedies.append(
-            "solve with --undo-flips, which takes the other tilt, or give images instead of the board's poses"
-        )
+        remedies.append("solve with --undo-flips, which takes the other tilt, or give images, not the board's poses")
     if others:
         which = _few(others) if flips else "these poses"
         remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")
@@ -319,16 +299,6 @@ def _of_outliers(outcome: Outcome) -> Finding:
 
 def _few(names: Sequence[str]) -> str:
     return ", ".join(map(spoken, names[:SHOWN])) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-
-
-def of_notes(notes: Iterable[str]) -> list[Finding]:
-    """Returns a finding for each note except asides. The text behind a note's colon becomes the remedy."""
-    findings = []
-    for note in notes:
-        if not isinstance(note, Aside):
-            said, _, remedy = note.partition(": ")
-            findings.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
-    return findings
 
 
 def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: str) -> Finding:

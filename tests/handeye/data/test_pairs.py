@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, read_poses
-from stcal.handeye.data.pairs import inverted
+from stcal.handeye.data.pose_pairs import inverted
 from stcal.io.table import COVARIANCE
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated

@@ -8,9 +8,9 @@ import pytest
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
-from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from stcal.io.cameras.model import camera_prior
 from tests.outcome import refuses
 from tests.support.handeye import error, normalised, simulated_views

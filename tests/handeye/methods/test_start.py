@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import HandEyePoses, Loop
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
 from stcal.handeye.methods.closed_form import mean_pose, robust
 from tests.outcome import fails_with
 from tests.support.handeye import disturbed, simulated

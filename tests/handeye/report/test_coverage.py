@@ -7,11 +7,10 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.views import View, Views, pairs_of_views
-from stcal.handeye.report.figures import by_robot, image_coverage
+from stcal.handeye.data.corner_views import View, Views, pairs_of_views
+from stcal.handeye.report.handeye_page import by_robot, image_coverage, outcome_report
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.page import outcome_report
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from tests.support.handeye import simulated_views
 
 

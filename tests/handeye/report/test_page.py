@@ -10,10 +10,10 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.file import HandEyeFile
+from stcal.handeye.report.handeye_file import HandEyeFile
+from stcal.handeye.report.handeye_page import outcome_report
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.page import outcome_report
-from stcal.handeye.solve import FACTORS, handeye
+from stcal.handeye.solving import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text
@@ -72,8 +72,8 @@ def test_every_sigma_that_there_is_has_a_name():
     wrong = replace(camera, focal=1.02 * camera.focal)
     views = replace(truth.views, camera=wrong)
     prior = camera_prior(Camera.of(wrong, "PINHOLE"))
-    result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
-    outcome = Outcome("images", result, colmap_model="PINHOLE")
+    options = HandEyeOptions(intrinsics=prior)
+    outcome = Outcome("images", handeye(truth.pairs, truth.setup, None, views, options), options=options)
     assert "camera file, focal length" in outcome_report(outcome).text()
     assert "Camera, as adjusted" in outcome_report(outcome).page()
     assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5

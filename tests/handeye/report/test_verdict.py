@@ -9,7 +9,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.report.outcome import Outcome, judged, share_of_variance
-from stcal.handeye.solve import handeye
+from stcal.handeye.solving import handeye
 from stcal.handeye.validate import cross_validate, splits
 from tests.support.handeye import simulated
 

@@ -52,7 +52,7 @@ def changed(i: int, edit) -> np.ndarray:
             ["pose 1 is", "as if in two units", "--length-unit"],
         ),
         (GOOD[:, :3], ["no poses", "4×4 matrices", "TUM", "needed"]),
-        (np.zeros((0, 4, 4)), ["shape (0, 4, 4); poses as numbers needed"]),
+        (np.zeros((0, 4, 4)), ["shape (0, 4, 4); numbers needed"]),
     ],
 )
 def test_bad_arrays_are_named(tmp_path, matrices, parts):
@@ -119,10 +119,10 @@ DAMAGED = archived(saved(GOOD))
         ("a.npy", PROGRAM, "not a file of NumPy (Object arrays"),
         ("a.npz", archived(PROGRAM), "no arrays of numbers"),
         ("a.npy", PROMISE.getvalue(), "not a file of NumPy"),
-        ("a.npy", saved(GOOD) * 2, "bytes behind its array"),
+        ("a.npy", saved(GOOD) * 2, "bytes after its array"),
         ("a.npy", saved(GOOD).replace(b"(5, 4, 4)", b"(5, 4, 4 "), "not a file of NumPy"),
         ("a.npz", DAMAGED[:60] + b"\xff" * 20 + DAMAGED[80:], "not a file of NumPy"),
-        ("a.npy", saved(at(1e300)), "pose 1: a length of"),
+        ("a.npy", saved(at(1e300)), "pose 1: length"),
     ],
 )
 def test_what_is_no_array_of_poses_is_named(tmp_path, name, content, part):
@@ -145,10 +145,10 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        (f"{TUM}{TUM.replace('1.5', '2.5 1')}", ["line 2: 9 numbers, 8 as in the first line needed"]),
-        ("p[1, 2, 3, 0, 0, 1]\np[1, 2, 3, 0, 0]\n", ["line 2: 5 numbers, 6 as in the first line needed"]),
+        (f"{TUM}{TUM.replace('1.5', '2.5 1')}", ["line 2: 9 numbers, 8 as in the first one needed"]),
+        ("p[1, 2, 3, 0, 0, 1]\np[1, 2, 3, 0, 0]\n", ["line 2: 5 numbers, 6 as in the first one needed"]),
         ("p[1, 2, 3, 10, 20, 30]\n", ["Euler angles", "give --rotation, like"]),
-        (TUM + TUM, ["line 1 and line 2: both are of '1.5'"]),
+        (TUM + TUM, ["line 1 and line 2 are both '1.5'"]),
         (TUM.replace("0 1\n", "0.5 1\n"), ["line 1: quaternion of length 1.118, 1 ± 0.001 needed"]),
         (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
         (TUM.replace("0.3", "nan"), ["not finite"]),
@@ -157,7 +157,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         (f"{EULER},roll,pitch,yaw\n1,2,3,10,20,30\n", ["give --rotation, like rpy"]),
         (f"{EULER},q1,q2,q3,q4\n1,2,3,1,0,0,0\n", ["q1, q2, q3, q4 may be quaternions"]),
         (f"{EULER},euler_ZYX_1_deg,euler_ZYX_2_deg\n1,2,3,1,2\n", ["without euler_ZYX_3_deg; all 3 needed"]),
-        (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["both are of 'a'"]),
+        (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["are both 'a'"]),
         (f"x_mm,y_mm,z_m,{'rotvec_x_rad,rotvec_y_rad,rotvec_z_rad'}\n1,2,3,0,0,0\n", ["x, y and z in one unit needed"]),
         ("a: &a [1, 1]\nb: [*a, *a]\n", ["alias *a: write the values out"]),
         ("{" * 100_000, ["not YAML"]),
@@ -200,7 +200,7 @@ def test_bad_conventions_are_named(tmp_path, rotation, part):
         (([], ["tool=m"], []), "--length-unit tool=m: robot= or camera= needed"),
         (([], ["m", "mm"], []), "--length-unit mm: given twice"),
         (([], [], ["tool_from_base"]), "--poses-are tool_from_base: unknown; base_from_flange"),
-        (([], [], ["base_from_flange", "flange_from_base"]), "one of each of robot and camera at most"),
+        (([], [], ["base_from_flange", "flange_from_base"]), "one of each side at most"),
     ],
 )
 def test_bad_options_are_named(options, part):

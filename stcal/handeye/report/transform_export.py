@@ -10,8 +10,8 @@ import yaml
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import FRAMES, Setup
-from stcal.handeye.result import HandEye
+from stcal.handeye.data.pose_pairs import FRAMES, Setup
+from stcal.handeye.handeye_result import HandEye
 from stcal.io.poses.programs import (
     Static,
     fixed_joint,
@@ -25,7 +25,8 @@ from stcal.io.poses.programs import (
 )
 from stcal.io.toml import opencv_matrix
 
-CAMERA_FRAME = "camera_optical_frame"
+OPTICAL = "_optical_frame"
+CAMERA_FRAME = f"camera{OPTICAL}"
 """Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
 CAMERA_LINK = "camera_link"
 """Name in ROS of a camera frame with X along the line of sight, Y to the left and Z up."""
@@ -37,31 +38,26 @@ MOVE_GROUP = {"freehand_robot_movement": True, "move_group": "manipulator", "mov
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
-    """Returns the transforms that add the camera to a tree of frames. Empty names: flange or base, and
-    :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`. ``camera_frame`` : ``optical``, or ``link`` with the optical frame in
-    it.
+    """Returns the transforms that add the camera to a tree of frames, of the names of :func:`frame_names`.
 
     Raises InputError: a name is invalid, or the names are not all different.
     """
-    mount, *names = frame_names(result.setup, parent, child, camera_frame)
-    if camera_frame == "optical":
-        return [Static(mount, names[0], result.mount_from_camera)]
-    link, optical = names
+    mount, first, *below = frame_names(result.setup, parent, child, camera_frame)
+    if not below:
+        return [Static(mount, first, result.mount_from_camera)]
     mount_from_link = result.mount_from_camera @ LINK_FROM_OPTICAL.inverse()
-    return [Static(mount, link, mount_from_link), Static(link, optical, LINK_FROM_OPTICAL)]
+    return [Static(mount, first, mount_from_link), Static(first, below[0], LINK_FROM_OPTICAL)]
 
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
-    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame.
+    """Returns the names of the frames from the root; NAME_link has the child NAME_optical_frame. Empty names: flange or
+    base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`.
 
     Raises InputError: a name has a control character, or occurs twice.
     """
-    names = [parent or FRAMES[setup].mount]
-    if camera_frame == "optical":
-        names.append(child or CAMERA_FRAME)
-    else:
-        link = child or CAMERA_LINK
-        names += [link, f"{link.removesuffix('_link')}_optical_frame"]
+    link = child or CAMERA_LINK
+    below = [child or CAMERA_FRAME] if camera_frame == "optical" else [link, f"{link.removesuffix('_link')}{OPTICAL}"]
+    names = [parent or FRAMES[setup].mount, *below]
     for name in names:
         if not name.isprintable():
             raise InputError("E-FRAME-NAME", f"frames: {name!r} has control characters; give a name in letters")
@@ -106,51 +102,30 @@ def urdf_joint(transforms: list[Static]) -> str:
 
 def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
     """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
-    turn, place = _rotation(transforms[0]), _place(transforms[0])
-    content = {
-        "parameters": {
-            "eye_on_hand": result.setup == "eye-in-hand",
-            **MOVE_GROUP,
-            "namespace": f"/{name}/",
-            **_robot_frames(result, transforms[0]),
-        },
-        "transformation": {f"q{axis}": value for axis, value in turn.items()} | place,
-    }
-    return _commented_yaml(result, transforms, content)
+    turn, place, frames = _parts(result, transforms[0])
+    named = {"eye_on_hand": result.setup == "eye-in-hand", **MOVE_GROUP, "namespace": f"/{name}/", **frames}
+    transform = {f"q{axis}": value for axis, value in turn.items()} | place
+    return _commented_yaml(result, transforms, {"parameters": named, "transformation": transform})
 
 
 def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
     """Returns the file ``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
-    content = {
-        "parameters": {
-            "name": name,
-            "calibration_type": "eye_in_hand" if result.setup == "eye-in-hand" else "eye_on_base",
-            **_robot_frames(result, transforms[0]),
-            **MOVE_GROUP,
-        },
-        "transform": {"translation": _place(transforms[0]), "rotation": _rotation(transforms[0])},
-    }
+    turn, place, frames = _parts(result, transforms[0])
+    kind = "eye_in_hand" if result.setup == "eye-in-hand" else "eye_on_base"
+    named = {"name": name, "calibration_type": kind, **frames, **MOVE_GROUP}
+    content = {"parameters": named, "transform": {"translation": place, "rotation": turn}}
     return _commented_yaml(result, transforms, content)
 
 
-def _place(each: Static) -> dict[str, float]:
-    return dict(zip("xyz", metres(each.pose), strict=True))
-
-
-def _rotation(each: Static) -> dict[str, float]:
-    return dict(zip("xyzw", xyzw(each.pose), strict=True))
-
-
-def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
-    """Returns the names of all frames. The frame of the board, and the robot's frame without the camera, are unused."""
+def _parts(result: HandEye, first: Static) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
+    """Returns quaternion, place, and the names of all frames. The frame of the board, and the robot's frame without the
+    camera, are unused."""
     frames = FRAMES[result.setup]
     carries = {frames.mount: first.parent, frames.stand: frames.stand}
-    return {
-        "robot_base_frame": carries["base"],
-        "robot_effector_frame": carries["flange"],
-        "tracking_base_frame": first.child,
-        "tracking_marker_frame": "board",
-    }
+    robot = {"robot_base_frame": carries["base"], "robot_effector_frame": carries["flange"]}
+    tracking = {"tracking_base_frame": first.child, "tracking_marker_frame": "board"}
+    turn, place = dict(zip("xyzw", xyzw(first.pose), strict=True)), dict(zip("xyz", metres(first.pose), strict=True))
+    return turn, place, robot | tracking
 
 
 def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:

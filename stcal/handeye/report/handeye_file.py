@@ -6,27 +6,18 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 import stcal
-from stcal.handeye.data.pairs import FRAMES, Setup
-from stcal.handeye.judge.remarks import Word
+from stcal.handeye.choose import Way
+from stcal.handeye.data.pose_pairs import FRAMES, Setup
+from stcal.handeye.judge.remarks import Finding, Word
 from stcal.handeye.report.outcome import Outcome, judged
-from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared
 from stcal.io.json import Finite, Matrix, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 
-class FindingRow(Part):
-    title: str
-    word: Word
-    said: str
-    value: str
-    limit: str
-    remedy: str
-
-
-class VerdictPart(Part):
+class HandEyeVerdictPart(Part):
     word: Word
     sentence: Annotated[str, BeforeValidator(lambda said: said if isinstance(said, str) else said())]
-    findings: list[FindingRow]
+    findings: list[Finding]
 
 
 class BoardSize(Part):
@@ -97,19 +88,13 @@ class MethodRow(Part):
     splits: SplitErrors | None
 
 
-class Way(Part):
-    method: str
-    camera: bool
-    scale: bool
-
-
 class TriedRow(Part):
     candidate: Way
     mean_mm: Finite
     reason: str
 
 
-class ChoicePart(Part):
+class ChosenWayPart(Part):
     chosen: Way
     sentence: str
     tried: list[TriedRow]
@@ -129,13 +114,16 @@ class TimeOffsetPart(Part):
     speed_rad_s: float
 
 
+MEANS = "`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`"
+
+
 class HandEyeFile(ResultFile):
     """Result file of ``handeye``: mm, rad, px; null where there is no value."""
 
     format: Literal["stcal handeye 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
     where: str = Field(alias="from", description="names of the files")
-    verdict: VerdictPart = Field(
+    verdict: HandEyeVerdictPart = Field(
         description="`word`: `good`, `use with care` or `do not use`; a `sentence` with the reasons; `findings`, each "
         "with `title`, `word`, what was `said`, `value` and `limit`, `remedy`"
     )
@@ -174,16 +162,13 @@ class HandEyeFile(ResultFile):
         "`translation_mm` at the board's origin, by which the chain through this pose misses `Z`; with method "
         "`reprojection` `corner_rms_px`"
     )
-    outliers: list[str] = Field(
-        description="names of poses that contradict the others and were left out of the solution"
-    )
+    outliers: list[str] = Field(description="names of poses that contradict the others and were left out")
     left_out: list[NamedReason] = Field(description="`name`, `reason` of images and rows that did not take part")
     held_out: HeldOutMeans | None = Field(
         description="`splits`, `poses` in each, and means: `rotation_rad`, `translation_mm` of the board's origin; "
         "with images `board_mm`: the distance from each corner to the point where the camera's ray to it meets the "
         "board as placed by the robot, mean over the corners, and `pose_mm`: distance of the corners by the robot "
-        "from those by "
-        "the pose that the image gives alone; `agreeing`: the same means without `outliers`, null where there are none"
+        "from those by the pose that the image gives alone; `agreeing`: means without `outliers`, null without any"
     )
     motions: HeldOutMotionErrors | None = Field(
         None,
@@ -194,10 +179,9 @@ class HandEyeFile(ResultFile):
         None,
         description="with `--with-kinematics`: name of the `robot`, `parameters` by which its axes are off its file, "
         "small motions of their frames (`J2 rx`: rad, `J2 x`: mm), their `sigma`, and `plain`: as `held_out` "
-        "(`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`), on the same poses, "
-        "of the solution without them",
+        f"({MEANS}), on the same poses, of the solution without them",
     )
-    choice: ChoicePart | None = Field(
+    choice: ChosenWayPart | None = Field(
         None,
         description="where no method was named: the way of solving that was `chosen` by errors on poses held out "
         "(`method`, and whether `camera` and `scale` were solved for), a `sentence` on it, and all that were `tried`: "
@@ -214,9 +198,7 @@ class HandEyeFile(ResultFile):
         "`sigma_mm` of the worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
-    understood: list[str] = Field(
-        [], description="only of files of other programs: what each was taken for, a sentence each"
-    )
+    understood: list[str] = Field([], description="only of files of other programs: what each was taken for")
     splits: SplitErrors | None = Field(
         None,
         description="only in `--json`: `rows` of `poses` that each split held out, and the errors of each: "
@@ -225,9 +207,8 @@ class HandEyeFile(ResultFile):
     methods: list[MethodRow] = Field(
         [],
         description="only in `--json`, with `--method all`: `method`, `X` and `Z` (`flange_from_camera`, "
-        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with `splits`, `poses`, "
-        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`, and `splits`, with `rows`, as above; "
-        "`reason` where it fails",
+        f"`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with {MEANS}, and `splits`, with "
+        "`rows`, as above; `reason` where it fails",
     )
 
     @classmethod
@@ -239,43 +220,40 @@ class HandEyeFile(ResultFile):
             parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
             optional["arm"] = parts | {"plain": arm.plain and arm.plain.summary()}
         if whole:
-            optional |= {"splits": held_out, "methods": [_method(each, len(result.names)) for each in outcome.compared]}
-        return cls.model_validate(
-            {
-                "format": "stcal handeye 1",
-                "version": stcal.__version__,
-                "where": outcome.where,
-                "verdict": judged(outcome),
-                "setup": result.setup,
-                "method": result.method,
-                **result.transforms,
-                "covariance": result.covariance,
-                f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
-                "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": outcome.true_pitch_mm},
-                "camera": outcome.camera,
-                "sigma": result.sigma,
-                "estimated": result.estimated,
-                "corner_px_is_factor": outcome.own_sigmas,
-                "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
-                "poses": [_pose(result, i) for i in range(len(result.names))],
-                "outliers": outcome.outliers(),
-                "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
-                "held_out": held_out and held_out.summary(result.outliers),
-                "observability": result.observability,
-                "notes": outcome.all_notes(),
-                **{name: value for name, value in optional.items() if value},
-            }
-        )
+            optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
+        adjusted, poses = result.reprojection, []
+        for i, (name, out, off) in enumerate(zip(result.names, result.outliers, result.residuals, strict=True)):
+            row = {"name": name, "used": not out, "rotation_rad": off[:3], "translation_mm": off[3:]}
+            poses.append(row if adjusted is None else row | {"corner_rms_px": adjusted.rms_px(i)})
+        content = {
+            "format": "stcal handeye 1",
+            "version": stcal.__version__,
+            "where": outcome.where,
+            "verdict": judged(outcome),
+            "setup": result.setup,
+            "method": result.method,
+            **result.transforms,
+            "covariance": result.covariance,
+            f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
+            "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": outcome.true_pitch_mm},
+            "camera": outcome.camera,
+            "sigma": result.sigma,
+            "estimated": result.estimated,
+            "corner_px_is_factor": outcome.own_sigmas,
+            "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
+            "poses": poses,
+            "outliers": outcome.outliers(),
+            "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
+            "held_out": held_out and held_out.summary(result.outliers),
+            "observability": result.observability,
+            "notes": outcome.all_notes(),
+        }
+        return cls.model_validate(content | {name: value for name, value in optional.items() if value})
 
 
-def _pose(result: HandEye, i: int) -> dict:
-    off, adjusted = result.residuals[i], result.reprojection
-    row = {"name": result.names[i], "used": not result.outliers[i], "rotation_rad": off[:3], "translation_mm": off[3:]}
-    return row if adjusted is None else row | {"corner_rms_px": adjusted.rms_px(i)}
-
-
-def _method(each: Compared, count: int) -> dict:
+def _method(each: Compared) -> dict:
     result, held_out = each.result, each.held_out
-    bad, transforms = (np.zeros(count, bool), {}) if result is None else (result.outliers, result.transforms)
-    means = held_out and held_out.summary(bad)
-    return {"method": each.method, "reason": each.reason, "held_out": means, "splits": held_out, **transforms}
+    row = {"method": each.method, "reason": each.reason, "held_out": None, "splits": held_out}
+    if result is None:
+        return row
+    return row | {"held_out": held_out and held_out.summary(result.outliers), **result.transforms}

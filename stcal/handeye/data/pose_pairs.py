@@ -14,7 +14,6 @@ from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import LENGTHS, Table, read_table
 
-WHAT = "pose file"
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
 """Transforms that each row must hold, with the inverse that is accepted in place of each."""
 
@@ -29,22 +28,17 @@ class HandEyePoses(Brief):
 
     Parameters
     ----------
-    base_from_flange, camera_from_board : Poses
-        m poses each, mm.
-    base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6) arrays, optional
-        Rotation (rad) and translation (mm), left perturbation in the first frame, where they are known.
-    names : tuple of str
-        Name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given.
-    where : str
-        Source of the poses.
-    camera_from_board_common : (m, 6, k) array, optional
-        Errors that the poses of the board have in common, as :func:`stcal.sfm.measure` states them: pose i errs by
-        ``common[i] @ z`` with the same z, k independent normal numbers of σ 1, for all. The covariances contain them.
+    base_from_flange, camera_from_board : m poses each, mm
+    base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6), rotation (rad) and translation (mm), left
+        perturbation in the first frame, where they are known
+    names : name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given
+    where : source of the poses
+    camera_from_board_common : (m, 6, k), errors that the poses of the board have in common, as
+        :func:`stcal.sfm.measure` states them: pose i errs by ``common[i] @ z`` with the same z, k independent normal
+        numbers of σ 1, for all. The covariances contain them.
 
-    Raises
-    ------
-    InputError
-        Unequal lengths; a pair that occurs twice; a board that stands still to the last digit while the flange moves.
+    Raises InputError: unequal lengths; a pair that occurs twice; a board that stands still to the last digit while the
+    flange moves.
     """
 
     base_from_flange: Poses
@@ -59,10 +53,8 @@ class HandEyePoses(Brief):
         require_fields(self, "poses")
         m = len(self.base_from_flange)
         if len(self.camera_from_board) != m:
-            raise InputError(
-                "E-POSES-COUNT",
-                f"{self.where}: {m} poses of the flange and {len(self.camera_from_board)} of the board; pairs needed",
-            )
+            counts = f"{m} poses of the flange and {len(self.camera_from_board)} of the board"
+            raise InputError("E-POSES-COUNT", f"{self.where}: {counts}; pairs needed")
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
                 freeze(self, name, (m, 6, 6), name)
@@ -95,20 +87,18 @@ class HandEyePoses(Brief):
         """
         if unit not in LENGTHS:
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
-        factor, sides = LENGTHS[unit], []
+        sides = []
         for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
-            if isinstance(matrices, Poses):
-                sides.append(Poses(matrices.rotation, factor * matrices.translation))
-                continue
-            rigid = []
-            for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
-                name = names[i] if i < len(names) else f"pose {i + 1}"
-                try:
-                    rigid.append(Rigid.from_matrix(matrix))
-                except InputError as error:
-                    raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
-            poses = Poses.of(rigid)
-            sides.append(Poses(poses.rotation, factor * poses.translation))
+            if not isinstance(matrices, Poses):
+                rigid = []
+                for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
+                    try:
+                        rigid.append(Rigid.from_matrix(matrix))
+                    except InputError as error:
+                        name = names[i] if i < len(names) else f"pose {i + 1}"
+                        raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
+                matrices = Poses.of(rigid)
+            sides.append(Poses(matrices.rotation, LENGTHS[unit] * matrices.translation))
         return cls(*sides, names=tuple(names), where=where)
 
     def __len__(self) -> int:
@@ -126,20 +116,16 @@ class HandEyePoses(Brief):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
         flange, board = self.base_from_flange, self.camera_from_board
         first: dict[bytes, int] = {}
-        copies: list[tuple[int, int]] = []
-        for i in range(len(self)):
-            content = board.rotation[i].tobytes() + board.translation[i].tobytes()
-            if (j := first.setdefault(content, i)) != i:
-                copies.append((j, i))
+        same = ((first.setdefault(content, i), i) for i, content in enumerate(_bytes(board)))
+        copies = [(j, i) for j, i in same if j != i]
         for j, i in copies:
             pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
             moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
             turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
             if moved == 0 and turned < 1e-12:
                 more = f", and {len(copies) - 1} more pairs" if len(copies) > 1 else ""
-                every = f"{pair}{more} are identical poses"
                 out = "one of each" if more else "one of them"
-                raise InputError("E-POSES-IDENTICAL", f"{every}; take {out} out")
+                raise InputError("E-POSES-IDENTICAL", f"{pair}{more} are identical poses; take {out} out")
             raise InputError(
                 "E-POSES-IDENTICAL",
                 f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
@@ -151,13 +137,10 @@ class HandEyePoses(Brief):
 
         Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
         board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
-
-        Raises InputError: the poses of the flange were not read anew.
         """
-        flange, board = self.base_from_flange, self.camera_from_board
-        rows: dict[bytes, list[int]] = {}
-        for i in range(len(self)):
-            rows.setdefault(flange.rotation[i].tobytes() + flange.translation[i].tobytes(), []).append(i)
+        board, rows = self.camera_from_board, {}
+        for i, content in enumerate(_bytes(self.base_from_flange)):
+            rows.setdefault(content, []).append(i)
         copies = [same for same in rows.values() if len(same) > 1]
         if not copies:
             return
@@ -173,6 +156,10 @@ class HandEyePoses(Brief):
                 f"the board moved by up to {shift:.3g} mm and {np.degrees(turn):.3g}°; read the robot's pose anew with "
                 "each image",
             )
+
+
+def _bytes(poses: Poses) -> list[bytes]:
+    return [r.tobytes() + t.tobytes() for r, t in zip(poses.rotation, poses.translation, strict=True)]
 
 
 STALE = 0.2
@@ -202,23 +189,19 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    quaternions : {"wxyz", "xyzw"}
-        ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order of the columns.
+    path : the file
+    quaternions : {"wxyz", "xyzw"}, ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order
+        of the columns
 
     Returns
     -------
     HandEyePoses
         Poses in mm; pairs are named by their lines.
 
-    Raises
-    ------
-    InputError
-        Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copied
-        poses.
+    Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
+    line; copied poses.
     """
-    table = read_table(path, WHAT, quaternions)
+    table = read_table(path, "pose file", quaternions)
     sides = [read_side(table, *names) for names in SIDES]
     (flange, flange_covariance, _), (board, board_covariance, common) = sides
     names = tuple(f"line {line}" for line in table.lines)
@@ -230,10 +213,8 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
-        raise InputError(
-            "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: {fault}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
-        )
+        needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
+        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}")
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
     common = table.common_errors(covariance, names[0] + "_")
     return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
@@ -243,12 +224,15 @@ def inverted(
     poses: Poses, covariance: np.ndarray | None, common: np.ndarray | None
 ) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
     """Returns the inverses of poses, with their covariances (m, 6, 6) and common errors (m, 6, k), where known."""
-    carried = inverse_jacobian(poses)
-    return (
-        poses.inverse(),
-        None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
-        None if common is None else carried @ common,
-    )
+    return poses.inverse(), *carried(inverse_jacobian(poses), covariance, common)
+
+
+def carried(
+    jacobian: np.ndarray, covariance: np.ndarray | None, common: np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Returns covariances (m, 6, 6) and common errors (m, 6, k), where known, carried by derivatives (m, 6, 6)."""
+    moved = None if covariance is None else jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return moved, None if common is None else jacobian @ common
 
 
 def inverse_jacobian(poses: Poses) -> np.ndarray:
@@ -391,8 +375,7 @@ class Motions:
     @classmethod
     def consecutive(cls, loop: Loop) -> "Motions":
         """Returns the motions from each pose to the next."""
-        at = np.arange(len(loop) - 1)
-        return cls.between(loop, at, at + 1)
+        return cls.between(loop, np.arange(len(loop) - 1), np.arange(1, len(loop)))
 
     @classmethod
     def all(cls, loop: Loop) -> "Motions":

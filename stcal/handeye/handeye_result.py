@@ -7,8 +7,8 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import FRAMES, Setup, rms_of
-from stcal.handeye.judge.observability import Observability
+from stcal.handeye.data.pose_pairs import FRAMES, Setup, rms_of
+from stcal.handeye.judge.observable import Observability
 from stcal.handeye.judge.remarks import Verdict
 from stcal.handeye.methods.reprojection import Reprojection
 
@@ -19,44 +19,30 @@ class HandEye(Brief):
 
     Parameters
     ----------
-    method : str
-        Name of the method, one of :data:`~stcal.handeye.METHODS`.
-    setup : str
-        ``eye-in-hand`` or ``eye-to-hand``.
-    mount_from_camera, stand_from_board : Rigid
-        The two unknowns, mm. :mod:`stcal.handeye.data.pairs` defines mount and stand. See :attr:`transforms`.
-    residuals : (m, 6) array
-        Deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation (mm) at the
-        board's origin, in the axes of the stand.
-    names : tuple of str
-        Names of the poses.
-    outliers : (m,) bool array
-        Poses that were left out of the solution because they contradict the others.
-    covariance, stand_covariance : (6, 6) arrays, optional
-        Covariances of ``mount_from_camera`` and ``stand_from_board``: rotation (rad), translation (mm), left
-        perturbation. None if the method gives no covariance.
-    scale : float
-        The board's true size over its stated size, if it was solved for; else 1.
-    sigma_scale : float, optional
-        σ of the scale.
-    sigma : dict of str to float
-        σ by which poses or corners were weighted, if the method weights: ``robot_rad``, ``robot_mm``, ``camera_rad``,
-        ``camera_mm``, ``corner_px``, ``board_mm``. ``camera_factor`` is the factor on the σ that were stated with
-        camera_from_board. ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential`` (``camera_all``
-        if their covariance is stated) are the factors, 1 or more, by which the σ of the stated intrinsics were widened.
-    estimated : tuple of str
-        Keys of ``sigma`` that were estimated from the residuals.
-    reprojection : Reprojection, optional
-        Adjusted camera, board and robot, if corners were adjusted.
-    observability : Observability, optional
-        What the poses determine.
-    notes : tuple of str
-        Notes on the result, one line each.
-    common_covariance : (6, 6) array, optional
-        Part of ``covariance`` that comes from what the errors of the board's poses have in common, where that is
-        stated; more poses do not make it smaller.
-    judgement : Verdict, optional
-        Whether to use the result; None of a single method's solution, which was not judged. See :attr:`verdict`.
+    method : name of the method, one of :data:`~stcal.handeye.METHODS`
+    setup : ``eye-in-hand`` or ``eye-to-hand``
+    mount_from_camera, stand_from_board : the two unknowns, mm; see :attr:`transforms`
+    residuals : (m, 6), deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation
+        (mm) at the board's origin, in the axes of the stand
+    names : names of the poses
+    outliers : (m,) bool, poses that were left out of the solution because they contradict the others
+    covariance, stand_covariance : (6, 6), covariances of ``mount_from_camera`` and ``stand_from_board``: rotation
+        (rad), translation (mm), left perturbation. None if the method gives no covariance.
+    scale : the board's true size over its stated size, if it was solved for; else 1
+    sigma_scale : σ of the scale
+    sigma : σ by which poses or corners were weighted, if the method weights: ``robot_rad``, ``robot_mm``,
+        ``camera_rad``, ``camera_mm``, ``corner_px``, ``board_mm``. ``camera_factor`` is the factor on the σ that were
+        stated with camera_from_board. ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential``
+        (``camera_all`` if their covariance is stated) are the factors, 1 or more, by which the σ of the stated
+        intrinsics were widened.
+    estimated : keys of ``sigma`` that were estimated from the residuals
+    reprojection : adjusted camera, board and robot, if corners were adjusted
+    observability : what the poses determine
+    notes : notes on the result, one line each
+    common_covariance : (6, 6), part of ``covariance`` that comes from what the errors of the board's poses have in
+        common, where that is stated; more poses do not make it smaller
+    judgement : whether to use the result; None of a single method's solution, which was not judged. See
+        :attr:`verdict`.
     """
 
     method: str
@@ -93,10 +79,8 @@ class HandEye(Brief):
         ``sentence()`` adds the reasons, ``remedies()`` what to do. Raises InputError if nobody judged the result.
         """
         if self.judgement is None:
-            raise InputError(
-                "E-HANDEYE-NOT-JUDGED",
-                f"hand-eye: the solution of {self.method} alone has no verdict; handeye.handeye judges what it returns",
-            )
+            said = f"hand-eye: the solution of {self.method} alone has no verdict"
+            raise InputError("E-HANDEYE-NOT-JUDGED", f"{said}; handeye.handeye judges what it returns")
         return self.judgement
 
     @property
@@ -117,10 +101,8 @@ class HandEye(Brief):
 
     def _named(self, name: str) -> Rigid:
         if name not in self.transforms:
-            raise InputError(
-                "E-HANDEYE-NO-TRANSFORM",
-                f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}",
-            )
+            said = f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}"
+            raise InputError("E-HANDEYE-NO-TRANSFORM", said)
         return self.transforms[name]
 
     def widened(self, factor: float) -> "HandEye":

@@ -1,8 +1,4 @@
-"""Mistakes that poses show by themselves: conventions that are easily mixed up, and views of a board with two answers.
-
-A side may be inverted or mirrored, quaternions may be in another order, metres may be called millimetres, or rows may
-belong to other poses. A symmetric board may be numbered from another end, and a flat one seem tilted the other way.
-"""
+"""Mistakes that poses show by themselves: conventions that are mixed up, and views of a board with two answers."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,25 +14,23 @@ from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, carried
 from stcal.handeye.data.record import FRAMES
-from stcal.handeye.data.views import Views
-from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still, spoken
+from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.io.poses.rotations import INVERTED as CONJUGATED
 from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
 
 FAR_BETTER, BETTER = 30.0, 3.0
-"""Factors by which a variant must reduce the product of the median residuals in rotation and translation, and the
-median residual in translation, before the poses are refused."""
+"""Factors by which a refused reading exceeds a variant in the product of both median residuals, and in translation."""
 DOUBTFUL = 1.5
 """Factor by which the other setup must reduce the same product before a note says that it fits better."""
 WELL = np.radians(0.5), 5.0
 """Median residuals (rad, mm) up to which poses are not suspected."""
 LOST = 0.25
-"""Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
-nothing in common."""
+"""Share of the spread of the poses left unexplained, above which those of robot and camera have nothing in common."""
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -57,8 +51,8 @@ def check_conventions(
     turn, shift = as_read = _typical(loop, guess, with_scale)
     notes: tuple[str, ...] = ()
     if turn > WELL[0] or shift > WELL[1]:
-        size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm (median)"
-        contradict = f"{pairs.where}: the poses contradict each other by {size}"
+        size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm"
+        contradict = f"{pairs.where}: the poses contradict each other by {size} (median)"
         for still in of_still(pairs):
             if isinstance(still, Grave):
                 raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
@@ -68,16 +62,16 @@ def check_conventions(
             share = np.prod(np.maximum(again, 1e-12)) / np.prod(as_read)
             return float(f"{share:.3g}") if shift > BETTER * again[1] else np.inf  # equal but for rounding
 
-        readings = _readings(pairs, loop, setup, by_images, turn <= WELL[0])
-        if best := explain(readings, misfit, 1 / FAR_BETTER, ALIKE):
-            less = _typical(best[0][0].change(), guess, with_scale)
-            words = "; or ".join(each.words for each, _ in best)
-            but = f"{contradict}, but by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm"
-            raise InputError("E-HANDEYE-CONVENTION", f"{but} {words}")
-
         def apart(parts: tuple[Loop, Loop]) -> float:
             return float(np.max(np.divide([_typical(part, guess, with_scale, np.mean) for part in parts], as_read)))
 
+        def errs(reading: Candidate) -> tuple[float, float, str]:
+            less = _typical(reading.change(), guess, with_scale)
+            return *less, f"but by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm"
+
+        if best := explain(_readings(pairs, loop, setup, by_images, turn <= WELL[0]), misfit, 1 / FAR_BETTER, ALIKE):
+            words = "; or ".join(each.words for each, _ in best)
+            raise InputError("E-HANDEYE-CONVENTION", f"{contradict}, {errs(best[0][0])[2]} {words}")
         rows = range(LEAST_PART, len(loop) - LEAST_PART + 1)
         halves = [Candidate(pairs.names[row], partial(lambda row: (loop[:row], loop[row:]), row)) for row in rows]
         if best := explain(halves, apart, 1 / PART_BETTER):
@@ -89,44 +83,36 @@ def check_conventions(
             )
         inverted = _inverted(loop, setup, by_images)
         with suppress(DegenerateError):
-            less = _typical(inverted.change(), guess, with_scale)
+            *less, words = errs(inverted)
             if turn * shift > DOUBTFUL * less[0] * less[1] and shift > less[1]:
-                than = f"by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm {inverted.words}"
-                notes = (Grave(f"the poses contradict each other by {size}, but {than}"),)
+                notes = (Grave(f"the poses contradict each other by {size} (median), {words} {inverted.words}"),)
         spread = _differ(loop)
         if np.divide(_typical(loop, guess, True), spread).max() > LOST:
             remedy = "pair each pose of the board with that of the flange at the same moment"
             if radians := _as_of_radians(loop, by_images):
-                remedy = (
-                    f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that "
-                    f"ends in -rad; if not, {remedy}"
-                )
+                columns = f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that"
+                remedy = f"{columns} ends in -rad; if not, {remedy}"
             elif turn <= WELL[0]:
-                remedy = (
-                    "as rotations agree, rows and conventions of rotation are right: check units, signs and order of "
-                    "the columns of positions"
-                )
+                remedy = "as rotations agree, rows and conventions of rotation are right: check units, signs and "
+                remedy += "order of the columns of positions"
             else:
-                other = "check the camera file" if by_images else "look for another convention of rotations"
-                remedy += f", and {other}"
+                remedy += (
+                    ", and check the camera file" if by_images else ", and look for another convention of rotations"
+                )
+            what = "positions" if turn <= WELL[0] else "poses"
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if {'positions' if turn <= WELL[0] else 'poses'} of robot and camera did not belong together; "
-                f"{remedy}",
+                f"if {what} of robot and camera did not belong together; {remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
         robot, camera = (" in place of ".join(names) for names in FRAMES.values())
-        return (
-            *notes,
-            Grave(
-                "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
-                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or, if the "
-                "camera stood beside the robot, the camera's side alone, with --setup eye-to-hand; or the camera's "
-                "axes are those of OpenGL, y up and z backwards: change the signs of y and z of the board in its frame"
-            ),
-        )
+        said = "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
+        said += f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or, if the "
+        said += "camera stood beside the robot, the camera's side alone, with --setup eye-to-hand; or the camera's "
+        said += "axes are those of OpenGL, y up and z backwards: change the signs of y and z of the board in its frame"
+        return (*notes, Grave(said))
     if behind.any():
         return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
     return notes
@@ -141,9 +127,7 @@ ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
 by the names that --rotation has for them; the most frequent first."""
 
 
-def _readings(
-    pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, rotations_agree: bool
-) -> Iterator[Candidate]:
+def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, turns_agree: bool) -> Iterator[Candidate]:
     """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
     yield from _variants(loop, setup, by_images)
     for side, role in SIDES[: 1 if by_images else 2]:
@@ -152,11 +136,11 @@ def _readings(
             words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
             changed = partial(lambda *of: _with_stated(loop, of[0], _with_angles(*of[1:])), side, read, one, other)
             yield Candidate(words, changed, 1)
-        for names, places in other_axes(read.translation) if rotations_agree else ():
+        for names, places in other_axes(read.translation) if turns_agree else ():
             words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
             changed = partial(_with_stated, loop, side, Poses(read.rotation, places))
             yield Candidate(words, changed, 1)
-    if not rotations_agree:
+    if not turns_agree:
         opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
         other_loop, words = Loop.of(pairs, opposite), f"with --setup {opposite}"
         yield Candidate(words, lambda: other_loop, 2)
@@ -176,7 +160,7 @@ def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
 
 def _stated(loop: Loop, side: str) -> Poses:
     """Returns the poses of a side as their file states them."""
-    poses = _of_side(loop, side)
+    poses = loop.stand_from_mount if side == "robot" else loop.camera_from_board
     return poses.inverse() if side == "robot" and loop.inverted else poses
 
 
@@ -214,10 +198,9 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    yield Candidate(
-        f"with one side mirrored: if {states} left-handed poses, {remedy}",
-        lambda: replace(loop, camera_from_board=Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)),
-    )
+    seen = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
+    mirrored_board = partial(replace, loop, camera_from_board=seen)
+    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", mirrored_board)
     for which, late, robot_rows, board_rows in (
         ("below", "robot's", slice(1, None), slice(-1)),
         ("above", "board's", slice(-1), slice(1, None)),
@@ -239,40 +222,34 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
             continue
         yield Candidate(f"with the robot's {quaternions}, {own[0]}", partial(replace, by_robot))
         yield Candidate(f"with the board's {quaternions}, {own[1]}", partial(replace, loop, camera_from_board=board))
-        yield Candidate(
-            f"with all {quaternions}, {reading.remedy}", partial(replace, by_robot, camera_from_board=board)
-        )
+        both = partial(replace, by_robot, camera_from_board=board)
+        yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
 
 
 def _other_units(loop: Loop, by_images: bool) -> Iterator[Candidate]:
     """Yields the loop with either side's lengths in the other unit. Residuals show only the ratio of the units; lengths
     beyond :data:`HALL_MM` tell which side it is."""
+    places = {"robot": "stand_from_mount", "board": "camera_from_board"}
     for (side, _), (other, role) in (SIDES, SIDES[::-1]):
         factor, which, times = 1000.0, side, "times"
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
-        if np.median(np.linalg.norm(_of_side(loop, other).translation, axis=1)) > HALL_MM:
+        if np.median(np.linalg.norm(getattr(loop, places[other]).translation, axis=1)) > HALL_MM:
             factor, which, times = 1e-3, other, "divided by"
             unit = f"{role}=mm"
             remedy = f"if they are mm, name the columns x_mm …, or give --length-unit {unit} where none states a unit"
-        name, poses = "stand_from_mount" if which == "robot" else "camera_from_board", _of_side(loop, which)
-        scaled = {name: Poses(poses.rotation, factor * poses.translation)}
+        poses = getattr(loop, places[which])
+        scaled = {places[which]: Poses(poses.rotation, factor * poses.translation)}
         yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", partial(replace, loop, **scaled))
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:
     """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
-    small = []
-    for side, _ in SIDES[: 1 if by_images else 2]:
-        rotation = _of_side(loop, side).rotation
-        if Rotation.from_matrix(rotation @ rotation[0].T).magnitude().max() < RADIANS_AS_DEGREES:
-            small.append(f"the {side}")
-    return " and ".join(small)
-
-
-def _of_side(loop: Loop, side: str) -> Poses:
-    return loop.stand_from_mount if side == "robot" else loop.camera_from_board
+    rotations = {"the robot": loop.stand_from_mount.rotation}
+    rotations |= {} if by_images else {"the board": loop.camera_from_board.rotation}
+    turns = {side: Rotation.from_matrix(r @ r[0].T).magnitude().max() for side, r in rotations.items()}
+    return " and ".join(side for side, turn in turns.items() if turn < RADIANS_AS_DEGREES)
 
 
 def _differ(loop: Loop) -> tuple[float, float]:
@@ -324,18 +301,21 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         labels, cost = _settled(loop, variants, labels)
         if cost < least:
             best, least = labels, cost
+
+    def nearest(turn: Rigid) -> int:
+        return int(np.argmin([Rigid(symmetry.rotation.T @ turn.rotation).angle_rad() for symmetry in every]))
+
     # Label k of a view means C S_k. All views are turned by S_common⁻¹ from the right, so that most stay as they are.
     common_inverse = every[int(np.bincount(best).argmax())].inverse()
-    best = np.array([_nearest(every[k] @ common_inverse, every) for k in best])
+    best = np.array([nearest(every[k] @ common_inverse) for k in best])
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
-    covariance, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
-    carried = _carried(as_numbered, poses)
-    repaired = replace(
-        pairs,
-        camera_from_board=poses,
-        camera_from_board_covariance=None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
-        camera_from_board_common=None if common is None else carried @ common,
-    )
+    jacobian = np.tile(
+        np.eye(6), (len(poses), 1, 1)
+    )  # by errors of camera_from_board when its origin moves on the board
+    jacobian[:, 3:, :3] = -skew(poses.translation - as_numbered.translation)
+    errors = carried(jacobian, pairs.camera_from_board_covariance, pairs.camera_from_board_common)
+    names = ("camera_from_board", "camera_from_board_covariance", "camera_from_board_common")
+    repaired = replace(pairs, **dict(zip(names, (poses, *errors), strict=True)))
     if views is not None:
         turned = (view.turned(every[k].inverse()) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))
@@ -347,13 +327,11 @@ def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:
     hand, m = loop.stand_from_mount, len(loop)
     labels = np.zeros((m, m), int)
     for reference in range(m):
-        by_robot = _invariants(hand.inverse() @ hand[reference])
-        misfits = []
+        by_robot, misfits = _invariants(hand.inverse() @ hand[reference]), []
         for variant in variants:
-            by_camera = _invariants(variant @ variants[0][reference].inverse())
+            off = by_robot - _invariants(variant @ variants[0][reference].inverse())
             # Angles are multiplied by the distance of the board, so that both terms are in mm.
-            reach = np.linalg.norm(variant.translation, axis=1)
-            misfits.append(np.hypot((by_robot - by_camera)[:, 0] * reach, (by_robot - by_camera)[:, 1]))
+            misfits.append(np.hypot(off[:, 0] * np.linalg.norm(variant.translation, axis=1), off[:, 1]))
         labels[reference] = np.argmin(misfits, axis=0)
         labels[reference, reference] = 0
     return labels
@@ -363,8 +341,7 @@ def _invariants(motions: Poses) -> np.ndarray:
     """Returns angle (rad) and advance along the axis (mm) of motions, (m, 2), equal for A and B where AX = XB."""
     log = Rotation.from_matrix(np.array(motions.rotation)).as_rotvec()
     angle = np.linalg.norm(log, axis=1)
-    axis = log / np.maximum(angle, 1e-12)[:, None]
-    advance = np.abs((axis * motions.translation).sum(1))
+    advance = np.abs((log / np.maximum(angle, 1e-12)[:, None] * motions.translation).sum(1))
     return np.column_stack([angle, np.where(angle > 1e-3, advance, np.linalg.norm(motions.translation, axis=1))])
 
 
@@ -385,18 +362,6 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
     return labels, float(np.min(costs, axis=0).sum())
 
 
-def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:
-    angles = [Rigid(symmetry.rotation.T @ turn.rotation).angle_rad() for symmetry in every]
-    return int(np.argmin(angles))
-
-
-def _carried(seen: Poses, poses: Poses) -> np.ndarray:
-    """Returns the derivative (m, 6, 6) of errors of camera_from_board when its origin moves on the board."""
-    jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
-    jacobian[:, 3:, :3] = -skew(poses.translation - seen.translation)
-    return jacobian
-
-
 PUT_RIGHT = 0.2
 """Largest share of a pose's error of rotation that is left when it is tilted the other way. Of errors of any direction
 0.2³, one in a hundred, seem to be flips."""
@@ -413,16 +378,3 @@ def flipped(loop: Loop, x: Rigid, z: Rigid, outliers: np.ndarray) -> np.ndarray:
     other = replace(loop, camera_from_board=tilted(loop.camera_from_board))
     before, after = (np.linalg.norm(each.residuals(x, z)[:, :3], axis=1) for each in (loop, other))
     return outliers & (after < PUT_RIGHT * before)
-
-
-def flip_note(names: tuple[str, ...], flips: np.ndarray) -> tuple[str, ...]:
-    """Returns a note on the poses that are flipped, (m,)."""
-    if not flips.any():
-        return ()
-    shown = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
-    return (
-        Aside(
-            f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat target "
-            f"is, which its image hardly excludes: {shown}; --undo-flips takes that one, or give images"
-        ),
-    )

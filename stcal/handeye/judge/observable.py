@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import freeze
-from stcal.handeye.data.pairs import FRAMES, Loop, Setup
+from stcal.handeye.data.pose_pairs import FRAMES, Loop, Setup
 from stcal.io.table import LENGTHS, UNIT_WORDS
 
 UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}
@@ -28,8 +28,7 @@ LEAST_TURN = np.radians(5)
 """Smallest RMS rotation of a robot of four axes."""
 LEAST_POSES = 3
 MOST_PAIRS = 100_000
-"""Number of pairs of poses from which the principal axes are computed. More than 450 poses have more pairs; these are
-then drawn at random."""
+"""Number of pairs of poses from which the principal axes are computed, drawn at random from 450 poses on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,14 +104,10 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
         if fault:
             turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
-            raise DegenerateError(
-                "E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about its principal axes{fault}"
-            )
+            raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
     elif observability.useless:
-        slides = (
-            f"; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
-            f"{FRAMES[setup].camera} along that axis is determined"
-        )
+        slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
+        slides += f"{FRAMES[setup].camera} along that axis is determined"
         raise DegenerateError(
             "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"
         )
@@ -128,11 +123,8 @@ def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
     """Refuse a scale that is implausible or that the motions leave open; the DegenerateError says how far to move."""
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
-            raise DegenerateError(
-                "E-HANDEYE-BOARD-SCALE",
-                f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}; correct the unit "
-                "of its size, or of the poses",
-            )
+            said = f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}"
+            raise DegenerateError("E-HANDEYE-BOARD-SCALE", f"{said}; correct the unit of its size, or of the poses")
         return
     place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
     moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))

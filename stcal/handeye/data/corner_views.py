@@ -1,5 +1,6 @@
 """Views of the board: corners in images, and the board's pose in each image by itself."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Poses, Rigid, by_pose
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pose_pairs import HandEyePoses
 
 LEAST_CORNERS = 4
 SAME_COSINE, APART = 1 - 1e-9, 0.02
@@ -24,14 +25,12 @@ class View(Brief):
 
     Parameters
     ----------
-    xyz_board : (k, 3) array
-        Places on the board, mm; k ≥ 4, not all on a line.
-    xy_px : (k, 2) array
-        Places in the image, px, with lens distortion.
-    covariance : (k, 2, 2) array, optional
-        Covariances of ``xy_px``, px², known up to a common factor. Without it, all corners have equal weight.
-    normal : (k, 3) array, optional
-        Unit normals of the planes that the corners lie in, for several boards in one frame. Without it, Z for all.
+    xyz_board : (k, 3), places on the board, mm; k ≥ 4, not all on a line
+    xy_px : (k, 2), places in the image, px, with lens distortion
+    covariance : (k, 2, 2), covariances of ``xy_px``, px², known up to a common factor. Without it, all corners have
+        equal weight.
+    normal : (k, 3), unit normals of the planes that the corners lie in, for several boards in one frame. Without it, Z
+        for all.
     """
 
     xyz_board: np.ndarray
@@ -77,10 +76,8 @@ class Views(Brief):
 
     Parameters
     ----------
-    camera : Camera
-        Camera that took the views.
-    views : tuple of View
-        m views, in the order of the poses.
+    camera : camera that took the views
+    views : m views, in the order of the poses
     """
 
     camera: Camera
@@ -101,26 +98,15 @@ class Views(Brief):
         return sum(len(view) for view in self.views)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Resection:
-    """``covariance`` : (m, 6, 6) of the poses."""
-
-    camera_from_board: Poses
-    covariance: np.ndarray
-
-
-def resect(views: Views, names: tuple[str, ...]) -> Resection:
-    """Returns the pose of the board in each view, of least reprojection error. Raises DegenerateError naming the view:
-    fewer than four corners in it, or in all its planes, or all on a line."""
-    poses, normals, cost = [], [], 0.0
-    for view, name in zip(views.views, names, strict=True):
-        minimum = _pose_of(view, views.camera, name)
-        poses.append(minimum.state)
-        normals.append(minimum.linear.normal)
-        cost += minimum.linear.cost
+def resect(views: Views, names: tuple[str, ...]) -> tuple[Poses, np.ndarray]:
+    """Returns the pose of the board in each view, of least reprojection error, and the covariances (m, 6, 6). Raises
+    DegenerateError naming the view: fewer than four corners in it, or in all its planes, or all on a line."""
+    minima = [_pose_of(view, views.camera, name) for view, name in zip(views.views, names, strict=True)]
     redundancy = 2 * views.corners() - 6 * len(views)
-    variance = cost / redundancy if redundancy else 1.0
-    return Resection(Poses.of(poses), variance * np.linalg.inv(np.array(normals)))
+    cost = sum(minimum.linear.cost for minimum in minima)
+    normals = np.array([minimum.linear.normal for minimum in minima])
+    covariance = (cost / redundancy if redundancy else 1.0) * np.linalg.inv(normals)
+    return Poses.of([minimum.state for minimum in minima]), covariance
 
 
 @require_arguments
@@ -131,34 +117,20 @@ def pairs_of_views(
 
     Parameters
     ----------
-    base_from_flange : Poses
-        m poses, mm, as the robot states them.
-    views : Views
-        m views, in the same order.
-    names : tuple of str
-        Name of each pair in messages; ``pose 1`` … where no names are given.
-    where : str
-        Source of the views, for messages.
+    base_from_flange : m poses, mm, as the robot states them
+    views : m views, in the same order
+    names : name of each pair in messages; ``pose 1`` … where no names are given
+    where : source of the views, for messages
 
-    Returns
-    -------
-    HandEyePoses
-
-    Raises
-    ------
-    InputError
-        Unequal lengths.
-    DegenerateError
-        A view in which no pose can be found; the message names it.
+    Raises InputError: unequal lengths. Raises DegenerateError: a view in which no pose can be found; the message names
+    it.
     """
     if len(views) != len(base_from_flange):
-        raise InputError(
-            "E-POSES-COUNT",
-            f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed",
-        )
+        counts = f"{len(base_from_flange)} poses of the flange and {len(views)} views"
+        raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")
     names = names or tuple(f"pose {i}" for i in range(1, len(views) + 1))
-    resection = resect(views, names)
-    return HandEyePoses(base_from_flange, resection.camera_from_board, None, resection.covariance, names, where)
+    camera_from_board, covariance = resect(views, names)
+    return HandEyePoses(base_from_flange, camera_from_board, None, covariance, names, where)
 
 
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
@@ -173,17 +145,17 @@ def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.n
 
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
     if len(view) < LEAST_CORNERS:
-        raise DegenerateError(
-            "E-VIEW-CORNERS", f"{name}: {len(view)} corners of the board, {LEAST_CORNERS} needed; take the image out"
-        )
-    starts = _starts(view, camera.normalised_from_pixel(view.xy_px))
+        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {len(view)} corners, {LEAST_CORNERS} needed; take it out")
+    starts, seen = [], camera.normalised_from_pixel(view.xy_px)
+    for rows, board_from_plane in _planes(view):
+        xyz = board_from_plane.inverse() @ view.xyz_board[rows]
+        with suppress(DegenerateError):
+            starts.append(camera_from_plane(fit_homography(xyz[:, :2], seen[rows])) @ board_from_plane.inverse())
     if not starts:
-        fault = (
-            "the corners seen lie"
-            if view.normal is None
-            else "the corners seen of each board are fewer than four or lie"
+        seen_of_each = "of each board are fewer than four or " * (view.normal is not None)
+        raise DegenerateError(
+            "E-VIEW-CORNERS", f"{name}: the corners seen {seen_of_each}lie on a line; take the image out"
         )
-        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {fault} on a line; take the image out")
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():
@@ -193,19 +165,6 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
     minima = [minimise(start, linearise, Rigid.moved) for start in starts]
     best = min(minima, key=lambda minimum: (not minimum.converged, minimum.linear.cost))
     return best.required(name, "take the image out")
-
-
-def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
-    """Returns camera_from_board by the homography of each plane with four corners or more."""
-    starts = []
-    for rows, board_from_plane in _planes(view):
-        xyz = board_from_plane.inverse() @ view.xyz_board[rows]
-        try:
-            homography = fit_homography(xyz[:, :2], seen[rows])
-        except DegenerateError:
-            continue
-        starts.append(camera_from_plane(homography) @ board_from_plane.inverse())
-    return starts
 
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:

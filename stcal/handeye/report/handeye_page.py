@@ -1,24 +1,17 @@
-"""Report of a hand-eye calibration."""
+"""Report of a hand-eye calibration, with figures of residuals and of the coverage of the image."""
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.choose import Choice
-from stcal.handeye.data.pairs import FRAMES
-from stcal.handeye.judge.remarks import Aside, Verdict, spoken
-from stcal.handeye.report.figures import (
-    BAD,
-    GOOD,
-    by_robot,
-    enlargement,
-    image_coverage,
-    image_figure,
-    pose_bars,
-)
+from stcal.handeye.choose import ChosenWay
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
+from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.judge.remarks import Aside, spoken
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
-from stcal.handeye.result import HandEye
-from stcal.handeye.solve import FACTORS
-from stcal.handeye.validate import HeldOutMotions
+from stcal.handeye.solving import FACTORS
+from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
 from stcal.report.document import (
     Block,
     Document,
@@ -33,30 +26,39 @@ from stcal.report.document import (
     macro,
     page_only,
     plot,
-    sentence,
     subheading,
     tiles,
-    tone_of,
     verdict_word,
 )
+from stcal.report.svg import COLOURS, INK, Axes, Drawing, count_ticks, limits, round_below
 from stcal.report.text import HEADS, NONE, number, transform_rows
 
+DEGREE = np.degrees(1.0)
 ERRORS = {
-    "rotation_rad": ("rotation °", np.degrees(1.0), 4),
+    "rotation_rad": ("rotation °", DEGREE, 4),
     "translation_mm": ("board's origin mm", 1.0, 3),
     "board_mm": ("3-D at the board mm", 1.0, 3),
     "pose_mm": ("3-D by pose mm", 1.0, 3),
 }
 """Heads, unit factors and digits of the errors on held-out poses."""
+CELLS = 60
+"""Number of cells along the longer side of the image, in which views of the board are counted."""
+GOOD, BAD = COLOURS[0], COLOURS[1]
+BLUES = "#f7fbff #c6dbef #6baed6 #2171b5 #08306b"
+"""The ramp Blues of ColorBrewer, light to dark."""
+MOST_VECTORS = 1500
+"""Largest number of residuals that are drawn over the image."""
+LONGEST = 0.06
+"""Length at which the 95 % quantile of the residuals is drawn, as a share of the image's width."""
 SIGMA_NAMES = {
     "corner_px": ("corner in the image", "px", 1.0),
-    "robot_rad": ("robot, rotation", "°", np.degrees(1.0)),
+    "robot_rad": ("robot, rotation", "°", DEGREE),
     "robot_mm": ("robot, position", "mm", 1.0),
-    "camera_rad": ("board's pose, rotation", "°", np.degrees(1.0)),
+    "camera_rad": ("board's pose, rotation", "°", DEGREE),
     "camera_mm": ("board's pose, position", "mm", 1.0),
     "camera_factor": ("board's pose", "times its own σ", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
-    "arm_rad": ("axis of the arm, direction", "°", np.degrees(1.0)),
+    "arm_rad": ("axis of the arm, direction", "°", DEGREE),
     "arm_mm": ("axis of the arm, place", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
@@ -77,18 +79,6 @@ def means_text(means: dict[str, float]) -> str:
     return ", ".join(parts)
 
 
-def sigma_rows(outcome: Outcome) -> list[list[str]]:
-    """Returns one row per σ: the quantity, its σ with unit, and whether it was estimated or stated."""
-    rows = []
-    for name, value in outcome.result.sigma.items():
-        text, unit, factor = SIGMA_NAMES[name]
-        if name == "corner_px" and outcome.own_sigmas:
-            unit = "times its own σ"
-        how = "estimated" if name in outcome.result.estimated else "stated"
-        rows.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
-    return rows
-
-
 def outcome_report(outcome: Outcome) -> Document:
     """Returns the report of ``handeye``."""
     result, frames, found = outcome.result, FRAMES[outcome.result.setup], judged(outcome)
@@ -101,6 +91,13 @@ def outcome_report(outcome: Outcome) -> Document:
             held_out.append(f"held out, mean without the {len(bad)} left out above: {means_text(agreeing)}")
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
     asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
+    sigmas = []
+    for name, value in result.sigma.items():
+        text, unit, factor = SIGMA_NAMES[name]
+        unit = "times its own σ" if name == "corner_px" and outcome.own_sigmas else unit
+        how = "estimated" if name in result.estimated else "stated"
+        sigmas.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
+    judgements = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *(
@@ -113,7 +110,7 @@ def outcome_report(outcome: Outcome) -> Document:
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
         *held_out,
         outcome.sentence(),
-        Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
+        Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
         f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
         fold(
@@ -122,7 +119,11 @@ def outcome_report(outcome: Outcome) -> Document:
         ),
         *([subheading("To know"), bullets(asides)] if asides else []),
         *([subheading("What the files were taken for"), bullets(outcome.understood)] if outcome.understood else []),
-        _findings(found),
+        fold(
+            "What the verdict rests on",
+            Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judgements, css="text"),
+            CHANCE,
+        ),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
     rows = _pose_rows(result)
@@ -132,6 +133,7 @@ def outcome_report(outcome: Outcome) -> Document:
         fold(f"{len(rows)} poses", Table(heads, rows)),
     ]
     without = f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: " + ", ".join(map(spoken, bad))
+    reasons = [": ".join(filter(None, (each.said, each.remedy))) for each in found.reasons()]
     return Document(
         f"Hand-eye calibration: {frames.camera}",
         f"{outcome.where}: {result.setup}, {result.method}: {len(rows) - len(bad)} poses{without if bad else ''}",
@@ -147,13 +149,9 @@ def outcome_report(outcome: Outcome) -> Document:
             Section("Left out", [page_only(Table(["<image", "<reason"], outcome.left_out))]),
         ],
         banner=[
-            Printed([f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in found.remedies())]),
-            macro(
-                "judged",
-                found.word,
-                tone_of(found.word),
-                [sentence(": ".join(filter(None, (each.said, each.remedy)))) for each in found.reasons()],
-            ),
+            found.answer(),
+            Printed([f"what to do: {remedy}" for remedy in found.remedies()]),
+            bullets(reasons) if any(each.remedy for each in found.reasons()) else None,
         ],
     )
 
@@ -169,13 +167,6 @@ CHANCE = (
 )
 
 
-def _findings(found: Verdict) -> Block:
-    """Returns the findings that the verdict rests on, folded."""
-    rows = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
-    table = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], rows, css="text")
-    return fold("What the verdict rests on", table, CHANCE)
-
-
 def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
     """Returns a transform with σ, and its matrix, folded."""
     matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
@@ -183,19 +174,14 @@ def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Bl
     return [table, fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix))]
 
 
-def _tried(choice: Choice | None) -> list[Block]:
+def _tried(choice: ChosenWay | None) -> list[Block]:
     """Returns a table with a row per way of solving that was tried."""
     if choice is None:
         return []
-    rows = [
-        [
-            each.candidate.name,
-            number(each.mean_mm, 3),
-            str(len(each.error_mm)),
-            "taken" if each.candidate == choice.chosen else each.reason,
-        ]
-        for each in choice.tried
-    ]
+    rows = []
+    for each in choice.tried:
+        how = "taken" if each.candidate == choice.chosen else each.reason
+        rows.append([each.candidate.name, number(each.mean_mm, 3), str(len(each.error_mm)), how])
     return [
         Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
         page_only(
@@ -214,7 +200,7 @@ def _arm(arm: ArmFound | None) -> list[Block]:
     cells_of_axis: dict[str, list[str]] = {}
     for name, value in arm.parameters.items():
         axis, component = name.split()
-        unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
+        unit, factor, digits = ("°", DEGREE, 4) if component.startswith("r") else ("mm", 1.0, 3)
         text = f"{component} {number(value * factor, digits)} ± {number(arm.sigma[name] * factor, digits)} {unit}"
         cells_of_axis.setdefault(axis, []).append(text)
     width = max(len(cells) for cells in cells_of_axis.values())
@@ -233,17 +219,15 @@ def _methods(outcome: Outcome) -> list[Block]:
     """Returns a table with a row per method: mean errors on held-out poses, and distance from the result."""
     if not outcome.compared:
         return []
-    kinds = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
+    means = [each.held_out.means() if each.held_out else {} for each in outcome.compared]
+    kinds = [name for name in ERRORS if any(name in own for own in means)]
     inverse, rows = outcome.result.mount_from_camera.inverse(), []
-    for each in outcome.compared:
-        means = each.held_out.means() if each.held_out else {}
-        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
-        off = None if each.result is None else inverse @ each.result.mount_from_camera
-        far = (
-            [NONE, NONE]
-            if off is None
-            else [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
-        )
+    for each, own in zip(outcome.compared, means, strict=True):
+        far = [NONE, NONE]
+        if each.result is not None:
+            off = inverse @ each.result.mount_from_camera
+            far = [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
+        cells = [number(own.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
         rows.append([each.method, *cells, *far, each.reason])
     heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"]
     if not any(row[-1] for row in rows):
@@ -252,13 +236,11 @@ def _methods(outcome: Outcome) -> list[Block]:
         " 3-D at the board: the distance from each corner to the point where the camera's ray to it meets the board "
         "as placed by the robot; by pose: distance from the corners by the pose that the image gives alone."
     )
+    more = board if "board_mm" in kinds else ""
     return [
         f"means over the same {_splits_text(outcome)} held out; off: from {FRAMES[outcome.result.setup].camera} above",
         Table(heads, rows, css="text"),
-        page_only(
-            "Each time all methods solve with the others and predict where the board is."
-            f"{board if 'board_mm' in kinds else ''}"
-        ),
+        page_only(f"Each time all methods solve with the others and predict where the board is.{more}"),
     ]
 
 
@@ -266,16 +248,12 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
     """Returns a table with a row per held-out motion, and the means."""
     if motions is None:
         return []
-    shifts, turns = motions.translation_mm, np.degrees(motions.rotation_rad)
-    rows = [
-        [f"{first} → {second}", number(shift, 3), number(turn, 4)]
-        for (first, second), shift, turn in zip(motions.names, shifts, turns, strict=True)
-    ]
-    means = ["mean", number(shifts.mean(), 3), number(turns.mean(), 4)]
-    return [
-        f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}",
-        Table(["<motion held out", "mm", "°"], [*rows, means], css="text"),
-    ]
+    names = [*(" → ".join(pair) for pair in motions.names), "mean"]
+    errors = np.column_stack([motions.translation_mm, np.degrees(motions.rotation_rad)])
+    errors = [*errors, errors.mean(0)]
+    rows = [[name, number(mm, 3), number(deg, 4)] for name, (mm, deg) in zip(names, errors, strict=True)]
+    said = f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}"
+    return [said, Table(["<motion held out", "mm", "°"], rows, css="text")]
 
 
 def _coverage(outcome: Outcome) -> list[Block]:
@@ -310,10 +288,8 @@ def _turns(outcome: Outcome) -> list[Block]:
     seen = outcome.result.observability
     if seen is None:
         return []
-    rows = [
-        [str(i), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
-        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True), 1)
-    ]
+    turns = enumerate(zip(seen.axes, np.degrees(seen.turns_rad), strict=True), 1)
+    rows = [[str(i), *(number(v, 3) for v in axis), number(turn, 2)] for i, (axis, turn) in turns]
     return [
         Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
         "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
@@ -369,12 +345,76 @@ def _adjusted(outcome: Outcome) -> list[list[str]]:
 
 
 def _pose_rows(result: HandEye) -> list[list[str]]:
-    turn, shift = (np.linalg.norm(part, axis=1) for part in (result.residuals[:, :3], result.residuals[:, 3:]))
-    rows = []
-    for i, name in enumerate(result.names):
-        row = [name, number(np.degrees(turn[i]), 4), number(shift[i], 3)]
-        row += [number(v, 3) for v in result.residuals[i, 3:]]
-        if result.reprojection is not None:
-            row.append(number(result.reprojection.rms_px(i), 3))
+    adjusted, rows = result.reprojection, []
+    for i, (name, off) in enumerate(zip(result.names, result.residuals, strict=True)):
+        turn, shift = np.linalg.norm(off.reshape(2, 3), axis=1)
+        row = [name, number(np.degrees(turn), 4), *(number(v, 3) for v in (shift, *off[3:]))]
+        row += [] if adjusted is None else [number(adjusted.rms_px(i), 3)]
         rows.append([*row, "left out" if result.outliers[i] else ""])
     return rows
+
+
+def image_coverage(views: Views) -> np.ndarray:
+    """Returns the number (rows, columns) of photographs whose board, the convex hull of its corners, covers each cell
+    of the image."""
+    width, height = views.camera.width, views.camera.height
+    cell = max(width, height) / CELLS
+    columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
+    # Pixel centres are integers: the image reaches from -0.5 on.
+    x = (np.arange(columns) + 0.5) * width / columns - 0.5
+    y = (np.arange(rows) + 0.5) * height / rows - 0.5
+    middle = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    counts = np.zeros(len(middle), int)
+    for view in views.views:
+        try:
+            sides = ConvexHull(view.xy_px).equations
+        except QhullError:  # all corners on a line
+            continue
+        counts += (middle @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
+    return counts.reshape(rows, columns)
+
+
+def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
+    """Returns the corners (k, 2) px of each view by the robot's reported pose, NaN behind the camera."""
+    camera, adjusted = as_adjusted(result, views)
+    poses = poses_by_robot(result, Loop.of(pairs, result.setup))
+    return [camera.project(pose @ view.xyz_board) for view, pose in zip(adjusted, poses, strict=True)]
+
+
+def pose_bars(result: HandEye) -> Drawing:
+    """Draws each pose's residuals: rotation, board's origin, and corner RMS if corners were adjusted."""
+    turn, shift = np.linalg.norm(result.residuals.reshape(-1, 2, 3), axis=2).T
+    rows = {"rotation, °": np.degrees(turn), "origin, mm": shift}
+    if result.reprojection is not None:
+        rows["corners, px"] = np.array([result.reprojection.rms_px(i) for i in range(len(result.names))])
+    drawing = Drawing(9.4, 0.6 + 1.2 * len(rows))
+    for box, (label, values) in zip(drawing.panels(1, len(rows), gap=26), rows.items(), strict=True):
+        axes = Axes(drawing, box, (0.4, len(values) + 0.6), limits(values, low=0))
+        axes.frame("pose, in order", label, "y", count_ticks(1, len(values)))
+        for colour, rows_of in ((GOOD, ~result.outliers), (BAD, result.outliers)):
+            shown = np.flatnonzero(rows_of & np.isfinite(values))
+            bars = [((i + 0.6, i + 0.6, i + 1.4, i + 1.4), (0, values[i], values[i], 0)) for i in shown]
+            axes.lines(bars, fill=colour)
+    return drawing
+
+
+def image_figure(size: tuple[int, int], counts: np.ndarray, seen: np.ndarray, off: np.ndarray) -> Drawing:
+    """Draws how often the board covered the image, and enlarged residuals ``off`` (n, 2) of corners ``seen`` (n, 2)."""
+    width, height = size
+    drawing = Drawing(6.0, 5.25 * height / width + 0.6)
+    axes = Axes(drawing, drawing.panels()[0], (-0.5, width - 0.5), (height - 0.5, -0.5))
+    shown = np.where(counts > 0, counts, np.nan)
+    most = max(int(counts.max()), 1)
+    axes.shade(shown, (-0.5, -0.5, width - 0.5, height - 0.5), -most / 3, 2.5 * most, BLUES, smooth=False)
+    sample = np.sort(np.random.default_rng(0).permutation(len(seen))[:MOST_VECTORS])
+    seen, off = seen[sample], enlargement(off, width) * off[sample]
+    axes.lines(np.stack([seen, seen + off], axis=2), BAD, 0.8)
+    axes.marks(*seen.T, kind="dot", size=1.6, colour=INK)
+    axes.frame("x, px", "y, px")
+    return drawing
+
+
+def enlargement(off: np.ndarray, width: float) -> float:
+    """Returns a round factor, 1 or more, that makes residuals (n, 2) visible on an image of this width."""
+    usual = float(np.quantile(np.linalg.norm(off, axis=1), 0.95)) if len(off) else 0.0
+    return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0
