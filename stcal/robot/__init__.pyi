@@ -1,8 +1,8 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
+from .identification.identify import identify as identify
 from .identification.report import offsets_csv as offsets_csv
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
-from .identification.solve import identify as identify
 from .kinematics.file import load_robot as load_robot
 from .kinematics.file import robot_toml as robot_toml
 from .kinematics.file import save_robot as save_robot

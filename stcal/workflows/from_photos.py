@@ -44,7 +44,6 @@ from stcal.robot import (
 from stcal.robot.axes.model import AxesFile, AxesResult
 from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.identification.observability import predicted_at
 from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
 from stcal.robot.kinematics.file import require_robot_written
@@ -98,7 +97,7 @@ class FromPhotos:
         compensated, sigma = self.compensated, self.identified.predicted
         if compensated is None or sigma is None:
             return np.zeros(0)
-        at = predicted_at(sigma, self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
+        at = sigma.at(self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
         return np.where(compensated.found.usable, at, np.nan)
 
     def moves(self) -> np.ndarray:

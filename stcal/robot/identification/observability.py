@@ -1,8 +1,4 @@
-"""How well a set of poses determines a robot's parameters: observability indices O1 … O5, and the error that the
-identified robot is expected to have, where it was measured and elsewhere.
-
-Few rows, or rows of a small part of the joints' ranges, fit well but determine little; the covariance shows how little.
-"""
+"""How well a set of poses determines a robot's parameters: observability indices, and errors expected elsewhere."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +8,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import WIDTH, Kind, Observed, State, tip_jacobian, tool_width
+from stcal.robot.identification.adjustment import TOOL_WIDTH, WIDTH, Kind, Observed, State, tip_jacobian
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import chain_parameters
@@ -23,8 +19,7 @@ SEEN = 1e-9
 """Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""
 
 TOGETHER, MOST_BESIDE = 0.2, 2
-"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of parameters
-named beside the first."""
+"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of those."""
 
 MEANING = {
     "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
@@ -107,7 +102,7 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
     """Returns factors (k,) that bring all parameters to mm, angles as arcs at the reach with the longest tool."""
     tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
-    turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
+    turning += ([True] * (TOOL_WIDTH[observe] - 3) + [False] * 3) * len(tools)
     return np.where(turning, 1 / reach_mm(robot, tools), 1.0)
 
 
@@ -160,6 +155,15 @@ class Predicted:
         """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
         return rms(self.ranges_mm) / max(rms(self.here_mm), 1e-9)
 
+    def at(self, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
+        """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in
+        the residuals; nan for tools that were not measured."""
+        sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
+        if known.any():
+            known_targets = [name for name in targets if name in state.tools]
+            sigma[known] = np.hypot(_sigma(state, q[known], known_targets, kind, self.covariance), self.left_mm)
+        return sigma
+
 
 def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
     """Returns σ for the target of most rows, over the ranges of ``robot``; None for distances, which do not place the
@@ -185,16 +189,6 @@ def _sigma(
     """Returns σ (r,) of the position at joint values (r, n), mm."""
     place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
     return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
-
-
-def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
-    """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in the
-    residuals; nan for tools that were not measured."""
-    sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
-    if known.any():
-        known_targets = [name for name in targets if name in state.tools]
-        sigma[known] = np.hypot(_sigma(state, q[known], known_targets, kind, found.covariance), found.left_mm)
-    return sigma
 
 
 def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Held, Kind, State, moved, parameter_names
+from stcal.robot.identification.adjustment import Kind, State, moved, parameter_names
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, chain_parameters, elasticity_values, moved_chain
@@ -18,15 +18,12 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""
 MASS_KG = 100.0
-"""Usual mass of an arm of one metre. It grows with the square of the length, and falls to nothing from the first link
-to the last; arms on the market have 25 kg at 0.6 m, 116 kg at 1.2 m, 550 kg at 2.1 m. Compliances compensate its error,
-so that a factor of 3 does no harm."""
+"""Usual mass of an arm of one metre; it grows with the square of the length, and falls to nothing from the first link
+to the last. Compliances compensate its error, so that a factor of 3 does no harm."""
 BESIDE = 0.15
-"""Typical distance of a link's centre of mass from the middle of its two joints, in each direction, as a share of the
-arm's length."""
+"""Typical distance of a link's centre of mass from the middle of its two joints, as a share of the arm's length."""
 HEAVIER = 0.5
-"""σ of the factor by which an arm is heavier than usual. Without loads nothing shows this factor, and compliances
-compensate it. The torques of known masses give compliances a scale."""
+"""σ of the factor by which an arm is heavier than usual, which the torques of known masses show."""
 DOWN = np.array([0.0, 0.0, -1.0])
 SOME = 0.1
 """Share of a σ at which compliances start; at 0 moments would move nothing."""
@@ -130,13 +127,11 @@ def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray
 
 
 DIFFERENCE_MM = 1e-4
-"""Step of the derivatives by differences, in mm of movement of the tool: linear to a millionth, and far above
-rounding."""
+"""Step of the derivatives by differences, in mm of movement of the tool."""
 DOUBT = 1.0
-"""σ of the logarithm of the deviations' σ: the deviations of makes of robots are known within a factor of about e."""
+"""σ of the logarithm of the deviations' σ, which are known of makes of robots within a factor of about e."""
 COAXIAL_MM = 100.0
-"""Distance of parallel axes below which an error of length across them turns θ by more than zero positions err (0.5 mm
-over 5 mrad)."""
+"""Distance of parallel axes below which an error of 0.5 mm across them turns θ by more than zero positions err."""
 LENGTH, TWIST, ZERO = 0, 1, 2
 FIXED_LENGTH, FIXED_ANGLE = 8, 9
 FIXED_MM, FIXED_RAD = 1e-4, 1e-7
@@ -187,6 +182,16 @@ class Deviations:
 def dh_values(robot: Robot) -> np.ndarray:
     """Returns a, alpha, d, theta, beta of the rows, (n, 5)."""
     return np.array([astuple(row) for row in robot.rows], float)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Prior knowledge: ``value + jacobian @ step``, (p,), is 0 with ``sigma``; ``fixed`` : (p,) mask of conditions."""
+
+    value: np.ndarray
+    jacobian: np.ndarray
+    sigma: np.ndarray
+    fixed: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,18 +12,11 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.io.files import require_written
 from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
-from stcal.robot.identification.adjustment import (
-    Kind,
-    Observed,
-    Solution,
-    State,
-    Weighting,
-    residuals,
-)
+from stcal.robot.identification.adjustment import Kind, Observed, State, Weighting, position_errors, residuals
 from stcal.robot.identification.observability import ObservabilityIndices, Predicted
-from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed, dh_values
+from stcal.robot.identification.prior import Adjusted, Placed, dh_values
+from stcal.robot.identification.problem import Solution
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.identification.variances import Spread
 from stcal.robot.kinematics.file import WRITTEN_MM, RobotText, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
 
@@ -160,18 +153,6 @@ class Gain:
         return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjustment:
-    """A solution with its σ. ``notes`` : on iterations that did not converge."""
-
-    solution: Solution
-    weighting: Weighting
-    deviations: Deviations
-    rows: NominalRows
-    parts: Spread
-    notes: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Identified(Brief):
     """The identified robot, and how far to trust it; r observations, k parameters, n joints.
@@ -182,7 +163,7 @@ class Identified(Brief):
         The robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
     seen : Observed
         The r observations.
-    adjustment : Adjustment
+    adjustment : Solution
         Solution, weights and σ; what is used often is a property, too.
     names : tuple of str
         Names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about
@@ -226,7 +207,7 @@ class Identified(Brief):
     robot: Robot
     nominal: Robot
     seen: Observed
-    adjustment: Adjustment
+    adjustment: Solution
     names: tuple[str, ...]
     covariance: Array
     rank: int
@@ -257,12 +238,12 @@ class Identified(Brief):
     @property
     def state(self) -> State:
         """Chain and tools as identified."""
-        return self.adjustment.solution.state
+        return self.adjustment.state
 
     @property
     def weighting(self) -> Weighting:
         """σ of the observations."""
-        return self.adjustment.weighting
+        return self.adjustment.problem.weighting
 
     @property
     def sigma0(self) -> float:
@@ -272,12 +253,12 @@ class Identified(Brief):
     @property
     def weights(self) -> np.ndarray:
         """Huber weights (r,)."""
-        return self.adjustment.solution.weights
+        return self.adjustment.weights
 
     @property
     def residuals(self) -> np.ndarray:
         """Residuals (r, 6), (r, 3) or (r, 1), measured minus modelled, rad and mm, in the instrument's axes."""
-        return self.adjustment.solution.residuals
+        return self.adjustment.residuals
 
     @property
     def fitted_mm(self) -> np.ndarray:
@@ -464,11 +445,6 @@ def _stated_otherwise(result: Identified) -> str | None:
     if 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED:
         return None
     return f"{what} {ratio:.2g} times the σ that are stated: {remedy}"
-
-
-def position_errors(found: np.ndarray) -> np.ndarray:
-    """Returns the position errors (r,), mm."""
-    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
 
 
 def require_identified_written(path: Path | str, result: Identified) -> None:

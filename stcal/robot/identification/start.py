@@ -15,7 +15,8 @@ from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
-from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
+from stcal.robot.identification.adjustment import State, observed, residuals, tips_of
+from stcal.robot.identification.problem import USELESS_MM
 from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm

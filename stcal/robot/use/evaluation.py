@@ -22,14 +22,13 @@ from stcal.robot.identification.adjustment import (
     frame_motions,
     jacobian,
     observed,
-    only_of,
-    require_enough,
+    position_errors,
     residuals,
     tips_of,
     tool_motions,
 )
 from stcal.robot.identification.prior import Placed
-from stcal.robot.identification.result import Figures, PlacedPose, position_errors
+from stcal.robot.identification.result import Figures, PlacedPose
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements
@@ -222,7 +221,7 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
             )
     seen = observed(data, None if data.positions is None else "position")
     what = f"parameters of {' and '.join(sorted(fit))}"
-    require_enough(seen, _parameters(seen, fit), what, "or fit less (--refit)")
+    seen.require_more_than(_parameters(seen, fit), what, "or fit less (--refit)")
     states, wrong = _fitted(list(named.values()), data, seen, fit)
     found = tuple(
         _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
@@ -264,7 +263,7 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
     if measured.data.rotations is not None:
         whole = observed(measured.data, "pose")
         rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
-    good = only_of(measured, np.flatnonzero(~wrong))
+    good = measured[np.flatnonzero(~wrong)]
     fitted = _derivatives(state, base, good, fit)
     one, full = Weighting(1.0, 1.0), jacobian(state, good)
     seeks = np.concatenate([fitted, full], axis=2)

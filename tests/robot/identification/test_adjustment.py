@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification import adjustment
-from stcal.robot.identification.adjustment import Weighting, huber_limit, jacobian, moved, observed, residuals, solve
+from stcal.robot.identification import problem
+from stcal.robot.identification.adjustment import Weighting, jacobian, moved, observed, residuals
+from stcal.robot.identification.identify import identify
+from stcal.robot.identification.problem import Problem, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
@@ -35,7 +36,7 @@ def case():
 def test_it_ends_where_the_weighted_gradient_is_zero(case):
     """In units of its own σ, and of Huber's cost: weight times residual."""
     state, seen = case
-    found = solve(state, seen, WEIGHTING)
+    found = Problem(seen, WEIGHTING).solve(state)
     white = WEIGHTING.whiten(residuals(found.state, seen), seen)
     slope = WEIGHTING.whiten(jacobian(found.state, seen), seen)
     length = np.linalg.norm(white, axis=1)
@@ -49,7 +50,7 @@ def test_it_ends_where_the_weighted_gradient_is_zero(case):
 
 def test_the_covariance_is_the_inverse_of_the_whitened_normal_matrix(case):
     state, seen = case
-    found = solve(state, seen, WEIGHTING, robust=False)
+    found = Problem(seen, WEIGHTING, robust=False).solve(state)
     slope = WEIGHTING.whiten(jacobian(found.state, seen), seen).reshape(-1, len(found.units))
     sigma = np.sqrt(np.diag(found.inverse()))
     wanted = np.linalg.inv(slope.T @ slope + found.prior) / np.outer(sigma, sigma)
@@ -79,8 +80,8 @@ def test_what_is_common_to_all_observations_is_whitened_too():
 
 def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     state, seen = case
-    monkeypatch.setattr(adjustment, "MAX_STEPS", 1)
+    monkeypatch.setattr(problem, "MAX_STEPS", 1)
     count = jacobian(state, seen).shape[2]
     far = moved(state, np.full(count, 0.05), seen.kind)
     with fails_with("E-NO-MINIMUM … identification … 1"):
-        solve(far, seen, WEIGHTING)
+        Problem(seen, WEIGHTING).solve(far)

@@ -7,10 +7,10 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot import forward, read_measurements
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import DOWN, HEAVIER, MOMENT, usual
 from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Identified, IdentifiedFile, IdentifyOptions, require_identified_written
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import joint_frames

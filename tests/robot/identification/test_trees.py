@@ -18,9 +18,9 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips,
 )
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.report import Drawn, joints_figure
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames, moved_chain

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.adjust.components import Components, Equations
-from stcal.robot.identification.adjustment import MOST_BENT, Bent
-from stcal.robot.identification.variances import Relaxation, Spread
+from stcal.robot.identification.problem import MOST_BENT, Bent, Relaxation, Spread
 
 
 def regression(

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made, measured

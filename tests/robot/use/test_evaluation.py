@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
