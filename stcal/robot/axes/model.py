@@ -18,7 +18,6 @@ from stcal.robot.axes.checks import (
     chain_through,
     jacobian_by_axes,
     leave_one_out,
-    of_order,
     off_mm,
     pairs_of,
     remarks,
@@ -119,7 +118,7 @@ class AxesFile(ResultFile):
         description="RMS of all rows about it: encoders, gears and elasticity are in it"
     )
     pairs: list[Pair] = Field(
-        description="`joint` (from 0) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
+        description="`joint` (from 1) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
         "`distance_mm`, `distance_sigma_mm`: along the common normal, of near-parallel axes in the plane of their row; "
         "`normal_mm`, `foot_mm` and their σ `normal_sigma_mm`, `foot_sigma_mm`: the common normal, and its foot along "
         'the first axis from where that was measured; `refused`: why these must not be used, or `""`'
@@ -208,9 +207,9 @@ def robot_from_sweeps(
 
     row_sigma = sigma_of(jacobian_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
-    notes += [*remarks(data, fits, robot, nominal), *of_order(measured, robot)]
+    notes += remarks(measured, data, fits, robot, nominal)
     notes += [
-        f"joints {p.joint + 1} and {p.joint + 2}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
+        f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"
         for p in pairs
         if p.refused and not p.parallel

@@ -43,7 +43,7 @@ def _pair_cells(pair: Pair, spread: np.ndarray) -> list[str]:
 
 
 def _names(pair: Pair) -> str:
-    return f"{pair.joint + 1}–{pair.joint + 2}"
+    return f"{pair.joint}–{pair.joint + 1}"
 
 
 def axes_report(result: AxesResult, where: str) -> Document:
@@ -72,7 +72,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
         *(f"D-H value of joints {_names(p)} refused: {p.refused}" for p in result.pairs if p.refused),
         Table(
             pair_heads,
-            [_pair_cells(pair, spread[pair.joint]) for pair in result.pairs],
+            [_pair_cells(pair, spread[pair.joint - 1]) for pair in result.pairs],
             [("", 3), ("robust", 3), ("common normal", 5), ("", 1)],
         ),
         f"spread: largest less smallest value when each of {len(result.without_one.lines)} rows (with its reflectors) "
