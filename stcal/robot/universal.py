@@ -166,12 +166,9 @@ def load_universal(
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    nominal : Robot or path, optional
-        The arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
-    convention : {"standard", "modified"}
-        Convention of the rows of Denavit and Hartenberg.
+    path : the file.
+    nominal : the arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
+    convention : convention of the rows of Denavit and Hartenberg.
 
     Returns
     -------

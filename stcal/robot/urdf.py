@@ -76,16 +76,14 @@ def load_urdf(
 
     Parameters
     ----------
-    path : str or Path
-        URDF; a xacro file must be expanded before.
+    path : URDF; a xacro file must be expanded before.
     from_link : str
         The base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint, this link
         is the base, and the joint where it stands.
     to_link : str or sequence of str
         The tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
         ``tool_NAME`` as :func:`robot_urdf` writes them. Several are tools called like the links, on branches of a tree.
-    convention : {"standard", "modified"}
-        Of the Denavit–Hartenberg rows.
+    convention : of the Denavit–Hartenberg rows.
 
     Returns
     -------
@@ -383,8 +381,7 @@ def robot_urdf(robot: Robot) -> str:
 
     Parameters
     ----------
-    robot : Robot
-        What to write.
+    robot : what to write.
 
     Returns
     -------

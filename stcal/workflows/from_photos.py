@@ -265,28 +265,17 @@ def robot_from_photos(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of the photographs, and of folders of them.
-    camera : Camera
-        The camera that took them, or its file.
-    target : TargetCircles
-        The calibrated target, of :func:`stcal.sfm.read_target` or ``RunResult.circles()``.
-    design : TargetDesign
-        Its design.
-    joints : str or Path
-        Table of joint values with a column ``key`` that names the photograph of each row (CSV).
-    nominal : Robot
-        The arm as drawn, mm and rad; the model by which the controller commands it.
-    targets : str, Path or Table, optional
-        Poses or joint values to compensate.
-    board : BoardDesign, optional
-        The board whose dots are to be told apart, if it is in view.
-    key : str
-        Name of the column of photographs.
-    measure_options, options : MeasureOptions, IdentifyOptions
-        Options of measuring and of identifying; the defaults if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : folder of the photographs, and of folders of them.
+    camera : the camera that took them, or its file.
+    target : the calibrated target, of :func:`stcal.sfm.read_target` or ``RunResult.circles()``.
+    design : its design.
+    joints : table of joint values with a column ``key`` that names the photograph of each row (CSV).
+    nominal : the arm as drawn, mm and rad; the model by which the controller commands it.
+    targets : poses or joint values to compensate.
+    board : the board whose dots are to be told apart, if it is in view.
+    key : name of the column of photographs.
+    measure_options, options : options of measuring and of identifying; the defaults if None.
+    progress : called with (stage, done, total).
 
     Returns
     -------

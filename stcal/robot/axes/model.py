@@ -144,12 +144,9 @@ def robot_from_sweeps(
 
     Parameters
     ----------
-    data : Measurements
-        Positions of one or more reflectors in sweeps of single joints.
-    nominal : Robot
-        Convention, joint types, coupling, and approximate build of the arm.
-    still_rad : float
-        Change of a revolute joint's value up to which the joint stands still.
+    data : positions of one or more reflectors in sweeps of single joints.
+    nominal : convention, joint types, coupling, and approximate build of the arm.
+    still_rad : change of a revolute joint's value up to which the joint stands still.
     places : (k, 3) array, optional
         Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
         too: those of :func:`~stcal.robot.axes.sweeps.ring`, or points of a real target. If None, positions alone

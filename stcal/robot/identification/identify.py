@@ -96,12 +96,9 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 
     Parameters
     ----------
-    robot : Robot
-        The nominal robot: mm, rad. The search starts at it, and dimensions are expected to be near it.
-    data : Measurements
-        Joint values with the measurements made at them, in the instrument's frame.
-    options : IdentifyOptions, optional
-        σ, robustness, cross-validation.
+    robot : the nominal robot: mm, rad. The search starts at it, and dimensions are expected to be near it.
+    data : joint values with the measurements made at them, in the instrument's frame.
+    options : σ, robustness, cross-validation.
 
     Returns
     -------

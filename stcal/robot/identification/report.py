@@ -254,10 +254,8 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
 
     Parameters
     ----------
-    result : Identified
-        The robot as identified, of :func:`~stcal.robot.identify`.
-    nominal : Robot
-        The robot from which it was identified.
+    result : the robot as identified, of :func:`~stcal.robot.identify`.
+    nominal : the robot from which it was identified.
 
     Returns
     -------

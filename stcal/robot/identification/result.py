@@ -47,21 +47,15 @@ class IdentifyOptions:
 
     Parameters
     ----------
-    observe : {"pose", "position", "distance"}, optional
-        Kind of observation to use; if not given, the richest one that was measured.
-    sigma_mm, sigma_rad : float, optional
-        σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
-    robust : bool
-        Whether outliers weigh less (Huber), and gross errors nothing at all.
-    folds : int
-        Number of folds of the cross-validation; 0 for none.
+    observe : kind of observation to use; if not given, the richest one that was measured.
+    sigma_mm, sigma_rad : σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
+    robust : whether outliers weigh less (Huber), and gross errors nothing at all.
+    folds : number of folds of the cross-validation; 0 for none.
     repeats : int, optional
         Number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many, if not
         given.
-    seed : int
-        Seed of the divisions.
-    partial : bool
-        Keep nominal what the data do not determine, instead of refusing the data.
+    seed : seed of the divisions.
+    partial : keep nominal what the data do not determine, instead of refusing the data.
     adjust : {"all", "geometry", "zeros", "base,tool"}
         Dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone, or
         none. Dimensions that are fixed in the robot file stay in any case.
@@ -159,48 +153,30 @@ class Identified(Brief):
 
     Parameters
     ----------
-    robot, nominal : Robot
-        The robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
-    seen : Observed
-        The r observations.
-    adjustment : Solution
-        Solution, weights and σ; what is used often is a property, too.
+    robot, nominal : the robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
+    seen : the r observations.
+    adjustment : solution, weights and σ; what is used often is a property, too.
     names : tuple of str
         Names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about
         its y, rad; tool x: mm).
-    covariance : (k, k) array
-        Covariance of the parameters, rad and mm.
-    rank : int
-        Number of parameters that the data used determine.
-    ranks : dict of str to int
-        Number of parameters that these joint values determine, by kind of observation.
-    undetermined : tuple of str
-        Directions that were kept nominal, each named by its parameters.
-    nominal_mm : (r,) array
-        Errors with nominal axes, base and tools fitted.
-    held_out : HeldOutRows or None
-        Errors of the cross-validation.
-    predicted : Predicted or None
-        σ of the tool's position by the covariance; None for distances.
-    placed : tuple of Placed
-        Base and tools of the robot, with σ.
-    left : tuple of Finding or None
-        Effects found in the residuals; None if there are too few observations for a test.
-    dh_sigma : (n, 5) array
-        σ of a, alpha, d, theta, beta; mm, rad.
-    observability : ObservabilityIndices
-        Indices of the determined parameters.
+    covariance : (k, k) array: covariance of the parameters, rad and mm.
+    rank : number of parameters that the data used determine.
+    ranks : number of parameters that these joint values determine, by kind of observation.
+    undetermined : directions that were kept nominal, each named by its parameters.
+    nominal_mm : (r,) array: errors with nominal axes, base and tools fitted.
+    held_out : errors of the cross-validation.
+    predicted : σ of the tool's position by the covariance; None for distances.
+    placed : base and tools of the robot, with σ.
+    left : effects found in the residuals; None if there are too few observations for a test.
+    dh_sigma : (n, 5) array: σ of a, alpha, d, theta, beta; mm, rad.
+    observability : indices of the determined parameters.
     deviations : dict of str to float or None
         σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of the
         deflection of links at the usual torque, of gears and of hysteresis, rad.
-    elasticity_sigma : Elasticity or None
-        σ of the robot's elasticity where it was adjusted.
-    gain : Gain or None
-        Comparison of both models, where both were tried.
-    all_held_out : HeldOutRows or None
-        Errors of the cross-validation with all dimensions adjusted, where some are kept.
-    notes : tuple of str
-        Rows left out, and remarks on the result.
+    elasticity_sigma : σ of the robot's elasticity where it was adjusted.
+    gain : comparison of both models, where both were tried.
+    all_held_out : errors of the cross-validation with all dimensions adjusted, where some are kept.
+    notes : rows left out, and remarks on the result.
     """
 
     format: ClassVar = "stcal identified 1"

@@ -113,8 +113,7 @@ def load_robot(path: str | Path) -> Robot:
 
     Parameters
     ----------
-    path : str or Path
-        ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    path : ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
 
     Returns
     -------
@@ -213,10 +212,8 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 
     Parameters
     ----------
-    robot : Robot
-        What to write.
-    comments : sequence of str
-        Lines to stand at the top.
+    robot : what to write.
+    comments : lines to stand at the top.
 
     Returns
     -------
@@ -303,12 +300,9 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
 
     Parameters
     ----------
-    path : str or Path
-        File to write; an existing one is replaced.
-    robot : Robot
-        What to write.
-    comments : sequence of str
-        Lines to stand at the top.
+    path : file to write; an existing one is replaced.
+    robot : what to write.
+    comments : lines to stand at the top.
 
     Raises
     ------

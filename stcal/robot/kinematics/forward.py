@@ -26,14 +26,10 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints; where its base stands does not matter.
-    q : (m, n) or (n,) array
-        Values of the controller, rad or mm.
-    tool : str
-        Name of the tool.
-    payload_kg : float or (m,) array, optional
-        Mass at the flange; that of the robot if not given.
+    robot : an arm of n joints; where its base stands does not matter.
+    q : (m, n) or (n,) array: values of the controller, rad or mm.
+    tool : name of the tool.
+    payload_kg : float or (m,) array, optional: mass at the flange; that of the robot if not given.
 
     Returns
     -------

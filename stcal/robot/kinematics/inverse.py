@@ -230,17 +230,13 @@ def inverse(
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints; where its base stands does not matter.
-    poses : Poses
-        m transforms base_from_tool, mm.
+    robot : an arm of n joints; where its base stands does not matter.
+    poses : m transforms base_from_tool, mm.
     near : (m, n) or (n,) array, optional
         Reference values of the controller, rad or mm. Without it the first pose gets the branch nearest to the middle
         of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
-    tool : str
-        Name of the tool.
-    payload_kg : float, optional
-        Mass at the flange; that of the robot if not given.
+    tool : name of the tool.
+    payload_kg : mass at the flange; that of the robot if not given.
 
     Returns
     -------
@@ -282,12 +278,9 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints, at most six; where its base stands does not matter.
-    pose : Rigid
-        base_from_tool, mm.
-    tool : str
-        Name of the tool.
+    robot : an arm of n joints, at most six; where its base stands does not matter.
+    pose : base_from_tool, mm.
+    tool : name of the tool.
 
     Returns
     -------

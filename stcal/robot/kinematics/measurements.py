@@ -43,33 +43,22 @@ class Measurements(Brief):
 
     Parameters
     ----------
-    where : str
-        The file, for messages.
-    lines : sequence of int
-        (m,) its lines.
-    q : (m, n) array
-        Values of the controller, rad or mm.
-    targets : tuple of str
-        (m,) names of the reflector or target seen.
+    where : the file, for messages.
+    lines : (m,) its lines.
+    q : (m, n) array: values of the controller, rad or mm.
+    targets : (m,) names of the reflector or target seen.
     positions : (m, 3) array, optional
         Of the targets in the instrument's frame, mm; None where only distances were measured.
-    rotations : (m, 3, 3) array, optional
-        instrument_from_target, where poses were measured.
-    covariance : (m, 6, 6) array, optional
-        Of the poses, rad and mm, left perturbation.
+    rotations : (m, 3, 3) array, optional: instrument_from_target, where poses were measured.
+    covariance : (m, 6, 6) array, optional: of the poses, rad and mm, left perturbation.
     common : (m, 6, r) array, optional
         Common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r normal numbers z of
         σ 1 for all, and by itself.
-    distances : (m,) array, optional
-        Where only these were measured, mm.
-    from_row : (m,) array of int, optional
-        Row, from 0, at whose position each distance starts.
-    stations : tuple of str
-        (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
-    notes : tuple of str
-        On rows of the file that are not here, columns that were not read, and angles by their convention.
-    conditions : Conditions
-        What the flange carried, and from where joints came.
+    distances : (m,) array, optional: where only these were measured, mm.
+    from_row : (m,) array of int, optional: row, from 0, at whose position each distance starts.
+    stations : (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
+    notes : on rows of the file that are not here, columns that were not read, and angles by their convention.
+    conditions : what the flange carried, and from where joints came.
 
     Raises
     ------
@@ -218,17 +207,14 @@ def read_measurements(
 
     Parameters
     ----------
-    path : str or Path
-        Table (CSV; form: ``data_layout.md``).
-    robot : Robot
-        The robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
+    path : table (CSV; form: ``data_layout.md``).
+    robot : the robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
     rotation : str, optional
         Convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
         (``data_layout.md``).
-    payload_kg : float, optional
-        Mass at the flange in all rows, if there is no column ``payload_kg``.
+    payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------

@@ -43,16 +43,11 @@ class DHRow:
 
     Parameters
     ----------
-    a : float
-        Length of the common normal, mm.
-    alpha : float
-        Twist about it, rad.
-    d : float
-        Offset along the joint's axis, mm.
-    theta : float
-        Angle about the joint's axis where the joint's value is 0, rad.
-    beta : float
-        Second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
+    a : length of the common normal, mm.
+    alpha : twist about it, rad.
+    d : offset along the joint's axis, mm.
+    theta : angle about the joint's axis where the joint's value is 0, rad.
+    beta : second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
 
     Raises
     ------
@@ -90,12 +85,9 @@ class Joint:
 
     Parameters
     ----------
-    type : {"revolute", "prismatic"}
-        Whether it turns about its axis or slides along it.
-    lower, upper : float
-        Limits of the controller's value, rad or mm; unlimited where not given.
-    fixed : mapping of str to str
-        Dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
+    type : whether it turns about its axis or slides along it.
+    lower, upper : limits of the controller's value, rad or mm; unlimited where not given.
+    fixed : dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
 
     Raises
     ------
@@ -227,26 +219,17 @@ class Robot(Brief):
 
     Parameters
     ----------
-    name : str
-        For messages and reports.
-    convention : {"standard", "modified"}
-        Of all rows; see :class:`DHRow`.
-    rows : tuple of DHRow
-        One for each joint, from the base; mm, rad.
-    joints : tuple of Joint
-        One for each row: type and range.
+    name : for messages and reports.
+    convention : of all rows; see :class:`DHRow`.
+    rows : one for each joint, from the base; mm, rad.
+    joints : one for each row: type and range.
     coupling : (n, n) array, optional
         Kinematic joint values from the controller's, a regular matrix; the identity if not given.
-    world_from_base : Rigid
-        Base in the frame of the measuring instrument, mm.
-    tools : mapping of str to Rigid
-        flange_from_tool by name, mm; ``""`` is the tool if none is named.
-    elasticity : Elasticity, optional
-        Rigid if not given.
-    tree : Tree, optional
-        Every joint is carried by the one before it, and tools by the last one, if not given.
-    unusual_size : bool
-        True if unusually long or short links are not a mistake of units.
+    world_from_base : base in the frame of the measuring instrument, mm.
+    tools : flange_from_tool by name, mm; ``""`` is the tool if none is named.
+    elasticity : rigid if not given.
+    tree : every joint is carried by the one before it, and tools by the last one, if not given.
+    unusual_size : true if unusually long or short links are not a mistake of units.
 
     Raises
     ------

@@ -113,21 +113,15 @@ class Compensated(Brief):
     Parameters
     ----------
     targets : Targets
-    poses : Poses
-        Commanded base_from_tool.
-    found : Inverse
-        By the identified robot.
-    nominal : Inverse or None
-        By the nominal robot: what would be commanded without calibration.
+    poses : commanded base_from_tool.
+    found : by the identified robot.
+    nominal : by the nominal robot: what would be commanded without calibration.
     before_mm, before_rad : (m,) arrays
         Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
         robot.
-    identified : Robot
-        The identified robot, with the tools that were taken.
-    beyond : dict of int to str
-        Joints, and their values, of rows that only joint values beyond the limits reach.
-    doubts : tuple of str
-        Notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
+    identified : the identified robot, with the tools that were taken.
+    beyond : joints, and their values, of rows that only joint values beyond the limits reach.
+    doubts : notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
     """
 
     targets: Targets
@@ -222,12 +216,9 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
 
     Parameters
     ----------
-    identified : Robot
-        As it is; mm, rad.
-    targets : Targets or Poses
-        m commanded poses base_from_tool; of files from :func:`read_targets`.
-    nominal : Robot, optional
-        The model in its controller.
+    identified : as it is; mm, rad.
+    targets : m commanded poses base_from_tool; of files from :func:`read_targets`.
+    nominal : the model in its controller.
 
     Returns
     -------
@@ -347,10 +338,8 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
 
     Parameters
     ----------
-    result : Compensated
-        Of :func:`~stcal.robot.compensate`.
-    robot : Robot
-        The identified robot.
+    result : of :func:`~stcal.robot.compensate`.
+    robot : the identified robot.
 
     Returns
     -------

@@ -96,20 +96,13 @@ class DesignOptions:
 
     Parameters
     ----------
-    count : int
-        Poses to choose.
-    seed : int
-        Of the candidates and of the random sets.
-    observe : {"pose", "position"}
-        What the instrument measures.
-    candidates : int
-        Random poses to choose from, more than ``count``.
-    sigma_mm, sigma_rad : float
-        σ of the instrument, of one coordinate of a position, mm, and of an orientation, rad.
-    box : tuple of six floats, optional
-        Lowest x, y, z and highest x, y, z of the tool in the base, mm.
-    tool : str
-        Name of the tool that is measured.
+    count : poses to choose.
+    seed : of the candidates and of the random sets.
+    observe : what the instrument measures.
+    candidates : random poses to choose from, more than ``count``.
+    sigma_mm, sigma_rad : σ of the instrument, of one coordinate of a position, mm, and of an orientation, rad.
+    box : lowest x, y, z and highest x, y, z of the tool in the base, mm.
+    tool : name of the tool that is measured.
 
     Raises
     ------
@@ -158,10 +151,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 
     Parameters
     ----------
-    robot : Robot
-        The nominal robot, with joint limits; mm, rad.
-    options : DesignOptions, optional
-        How many poses, of how many candidates, for which instrument.
+    robot : the nominal robot, with joint limits; mm, rad.
+    options : how many poses, of how many candidates, for which instrument.
 
     Returns
     -------
@@ -320,10 +311,8 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
     Parameters
     ----------
-    result : PoseDesign
-        Of :func:`~stcal.robot.design`.
-    robot : Robot
-        The robot for which they were designed.
+    result : of :func:`~stcal.robot.design`.
+    robot : the robot for which they were designed.
 
     Returns
     -------

@@ -192,12 +192,9 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Parameters
     ----------
-    robots : dict of Robot
-        Robots by name; mm, rad.
-    data : Measurements
-        Joint values with the measurements made at them, in the instrument's frame.
-    refit : {"none", "base", "tool", "base-tool"}
-        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
+    robots : robots by name; mm, rad.
+    data : joint values with the measurements made at them, in the instrument's frame.
+    refit : what is fitted by least squares with each robot's own axes; the rest is as its file has it.
 
     Returns
     -------

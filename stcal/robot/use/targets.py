@@ -33,22 +33,14 @@ class Targets(Brief):
 
     Parameters
     ----------
-    where : str
-        The file, for messages.
-    lines : sequence of int
-        (m,) its lines.
-    tools : tuple of str
-        (m,) names.
-    poses : Poses or None
-        base_from_tool, mm; None where joint values command.
-    q : (m, n) array or None
-        Commanded joint values, or those whose branch is wanted, rad or mm.
-    names : dict
-        Of the columns :data:`NAMES` that are there, (m,) each.
-    notes : tuple of str
-        On columns that were not read, and angles by their convention.
-    conditions : Conditions
-        What the flange carries.
+    where : the file, for messages.
+    lines : (m,) its lines.
+    tools : (m,) names.
+    poses : base_from_tool, mm; None where joint values command.
+    q : (m, n) array or None: commanded joint values, or those whose branch is wanted, rad or mm.
+    names : of the columns :data:`NAMES` that are there, (m,) each.
+    notes : on columns that were not read, and angles by their convention.
+    conditions : what the flange carries.
     """
 
     where: str
@@ -118,16 +110,12 @@ def read_targets(
 
     Parameters
     ----------
-    path : str or Path or Table
-        Table (CSV; form: ``data_layout.md``).
-    robot : Robot
-        The robot with the tools of the targets, and with the joints if joint values are given.
+    path : table (CSV; form: ``data_layout.md``).
+    robot : the robot with the tools of the targets, and with the joints if joint values are given.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    rotation : str, optional
-        Convention of angles, if their columns do not name it; see :func:`read_measurements`.
-    payload_kg : float, optional
-        Mass at the flange in all rows, if there is no column ``payload_kg``.
+    rotation : convention of angles, if their columns do not name it; see :func:`read_measurements`.
+    payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------

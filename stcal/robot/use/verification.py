@@ -211,8 +211,7 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
 
     Parameters
     ----------
-    path : str or Path or Table
-        Table (CSV; form: ``data_layout.md``).
+    path : table (CSV; form: ``data_layout.md``).
 
     Returns
     -------
@@ -260,8 +259,7 @@ def verify(data: MeasuredPoses) -> Verification:
 
     Parameters
     ----------
-    data : MeasuredPoses
-        Commanded and measured positions of one or more sets, mm.
+    data : commanded and measured positions of one or more sets, mm.
 
     Returns
     -------
