@@ -142,20 +142,17 @@ def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) ->
 
 
 LIKELY, MANY = 2.0, 4
-"""Factor by which a mirror may fit worse than reversed joints and is preferred all the same, and number of reversed
-joints from which on they are not tried. A mirror explains all joints at once, and arms are symmetric."""
+"""Factor by which a mirror may fit worse than reversed joints, and number of these from which on they are not tried."""
 LIKE_SIZE = 2.0
 """Largest ratio of the distances between axes to the nominal ones, or of these to them; wrong units differ by more."""
 AGREES_RAD = np.radians(10.0)
-"""Largest difference of axes and joint zeros from a nominal robot; beyond it the robot is another one, or counts
-otherwise."""
+"""Largest difference of axes and joint zeros from a nominal robot that is the same, and counts alike."""
 MOVED_SHARE = 0.5
 """Share of the squared residuals beyond which a move along the order of the rows is named."""
 
 
 def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns cosines, moments and triple products of directed axes, which no motion changes, and their signs after a
-    mirror."""
+    """Returns cosines, moments and triple products of directed axes, and their signs after a mirror."""
     size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
     values, mirrored = [], []
     for i, k in combinations(range(len(z)), 2):
@@ -243,8 +240,7 @@ def off_mm(fit: AxisFit) -> dict[int, float]:
 
 
 def remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
-    """Returns remarks on the fitted axes, the robot that they make, and moves along the order of the rows as
-    ``measured``; ``data`` : with its virtual reflectors."""
+    """Returns remarks on the axes, their robot, and moves between the rows ``measured``, ``data`` with virtual ones."""
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
         for fit in fits
@@ -291,8 +287,7 @@ def remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], rob
 
 
 REFITTED = 200
-"""Largest number of rows of the sweeps for which each is left out by a new fit; of more rows each is left out by
-influence. For 600 rows the spread is 1 to 4 % less so."""
+"""Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

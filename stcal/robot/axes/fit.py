@@ -27,8 +27,7 @@ STANDS_STILL_MM = 1.0
 WEAK_RAD = 0.02
 """σ of a direction beyond which an axis is not known; its covariance is valid for small angles only."""
 MOTION = np.radians(2.0)
-"""Largest difference of the observed motion from the joint's values; for a sliding joint also the largest share of its
-way. Joints, gears and zero positions are true to hundredths of this."""
+"""Largest difference of the observed motion from the joint's values, or share of a sliding joint's way."""
 LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
 """Share of the largest arc below which residuals are too small to hide a gross error that bent the first axis."""
@@ -38,8 +37,7 @@ WEIGHTS_SETTLED = 1e-3
 SINGULAR, TINY = 1e-10, 1e-300
 """Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
 FIRST_SIZE = 0.05
-"""Size of an arc, as a share of the largest one, from which on it is used for the first axis and σ, by which the
-smaller arcs are judged."""
+"""Size of an arc, as a share of the largest, from which on it is used for the first axis."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,8 +18,7 @@ from stcal.robot.identification.adjustment import State, linear, moved, paramete
 from stcal.robot.identification.problem import Problem
 
 SUBSETS, SEED = 1000, 0
-"""Number of random subsets, each of as few rows as determine all parameters, and seed. With a quarter of 40 rows wrong,
-one subset in forty is clean."""
+"""Number of random subsets, and seed. With a quarter of 40 rows wrong, one in forty is clean."""
 KEPT_SUBSETS, FIRST_STEPS, STEPS = 20, 2, 50
 """Number of subsets that are followed to their end, and of concentration steps before and after their choice."""
 MOST_ROWS = 400
@@ -30,8 +29,7 @@ FALSE_ALARM = 1e-3
 """False-alarm probability of a set: that any row of a good set is called wrong."""
 TINY = 1e-300
 ROUNDS, SEARCHES = 6, 2
-"""Number of linear solutions, the third of which is practically exact; and number of searches. The second search uses σ
-of positions and orientations from the residuals of the first solution."""
+"""Number of linear solutions, the third of which is practically exact, and of searches, the second by better σ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -72,17 +72,15 @@ REPEATED = "joint values were measured several times: what the model lacks there
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before open parameters."""
 ROUNDED_RAD, BEYOND, BEYOND_MM = 2e-5, 20.0, 0.3
-"""Difference of a turn of the tool from that of the robot file, as rounding leaves it; and how many times what it does
-across the range of positions these must err, and by how much at least, for the orientations to be computed by the
-controller."""
+"""Difference of the turns of the tool from those of the robot file by rounding; and how many times what it does across
+the positions these must err, and by how much at least, for the controller to have computed the orientations."""
 COMPUTED = (
     "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
     "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
 )
 TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
-"""Number of divisions of the cross-validation for few rows, and largest number of few rows; one division does for
-more."""
+"""Number of divisions of the cross-validation for few rows, and largest number of few rows; more are divided once."""
 
 
 @require_arguments
@@ -192,8 +190,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 def _modelled(
     robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
 ) -> tuple[Solution, HeldOutRows | None, Gain | None]:
-    """Returns the solution by the requested model, or by the one that predicts better by more than chance; with its
-    held-out errors, and the gain if both were tried."""
+    """Returns the solution by the model asked for, or by the better one, with its held-out errors, and the gain."""
     rigid = _adjusted(first, seen, options, rows)
     if options.model == "rigid":
         return rigid, _cross_validated(rigid, options), None
@@ -358,8 +355,7 @@ def _place(measured: Observed) -> int:
 
 
 def _cross_validated(whole: Solution, options: IdentifyOptions) -> HeldOutRows | None:
-    """Returns errors of rows that took no part in the parameters; None if too few. If few, they do not count for σ and
-    gross errors either. Iterations start at the solution of all rows."""
+    """Returns errors of rows that took no part in the parameters, if few not in σ either; None if too few."""
     problem, measured = whole.problem, whole.problem.measured
     rows = len(measured)
     if min(options.folds, rows) < LEAST_FOLDS:

@@ -72,8 +72,7 @@ class ObservabilityIndices:
 
     @classmethod
     def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
-        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, parameters in mm, by its ``seen`` largest
-        singular values."""
+        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, by its ``seen`` largest singular values."""
         sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
         return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
 
@@ -90,8 +89,7 @@ def identification_jacobian(
     sigma_rad: float = 1.0,
     tool: str = "",
 ) -> np.ndarray:
-    """Returns the derivatives (m, r, k) of the measured values, over σ, at joint vectors (m, n) by all identified
-    parameters, in the world's axes. r is 6 (rotation over translation) or 3 (position)."""
+    """Returns the derivatives (m, 6 or 3, k) of the measured values, over σ, at joint vectors (m, n), in the world."""
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
     sigma = np.repeat([sigma_rad, sigma_mm], 3)
@@ -107,8 +105,7 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
 
 
 def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
-    """Returns names of directions (k, d), such as ``J2 y (with tool z)``, led by a parameter that is in no other
-    one."""
+    """Returns names of directions (k, d), ``J2 y (with tool z)``, each led by a parameter of its own."""
     lead, reduced = [], directions.copy()
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
@@ -133,11 +130,9 @@ def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...
 
 SAMPLES, SEED = 200, 0
 ELSEWHERE = 3.0
-"""Ratio of σ over the joints' ranges to σ at the measured rows, above which there is a warning: 40 rows over the middle
-60 % of all ranges have 1.6, over 30 % 3.5, eight rows 3."""
+"""Largest ratio of σ over the ranges to σ at the rows without a warning: 40 rows over 60 % of the ranges have 1.6."""
 FEW = 2.0
-"""Number of measured values per parameter below which σ are hardly estimated: of 40 simulated sets of eight poses (1.6)
-two gave a tenth of the true σ."""
+"""Number of measured values per parameter below which σ may come out at a tenth of the true ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,8 +161,7 @@ class Predicted:
 
 
 def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
-    """Returns σ for the target of most rows, over the ranges of ``robot``; None for distances, which do not place the
-    arm."""
+    """Returns σ for the target of most rows; None for distances, which do not place the arm."""
     if measured.kind == "distance":
         return None
     data, kind = measured.data, measured.kind
@@ -192,8 +186,7 @@ def _sigma(
 
 
 def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
-    """Returns random joint values (count, n), rad or mm; a joint without limits moves by half a turn, or by the reach
-    with ``tool``, to either side."""
+    """Returns random joint values (count, n); without limits, of half a turn, or the reach, to either side."""
     low, high = robot.limits().T
     half = np.where(robot.prismatic, reach_mm(robot, [tool]), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
@@ -201,8 +194,7 @@ def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """Returns the prediction, enlarged over the ranges by the effects found in the residuals, and notes on it: the
-    covariance takes the model as true."""
+    """Returns the prediction, enlarged over the ranges by the effects that the model lacks, and notes on it."""
     if found is None or not left:
         return found, ()
     effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
@@ -223,8 +215,7 @@ def doubts(
     names: list[str],
     tested: bool,
 ) -> tuple[str, ...]:
-    """Returns notes on rows that are few, or that cover a small part of the ranges. ``units`` : (k,) of about 1 mm of
-    the tool; ``tested`` : rows were held out."""
+    """Returns notes on few rows, or of a small part of the ranges; ``tested`` : rows were held out."""
     notes = []
     numbers = WIDTH[measured.kind] * len(measured)
     count = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters"

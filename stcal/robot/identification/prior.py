@@ -18,8 +18,7 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""
 MASS_KG = 100.0
-"""Usual mass of an arm of one metre; it grows with the square of the length, and falls to nothing from the first link
-to the last. Compliances compensate its error, so that a factor of 3 does no harm."""
+"""Usual mass of an arm of one metre; a factor of 3 does no harm, as compliances compensate it."""
 BESIDE = 0.15
 """Typical distance of a link's centre of mass from the middle of its two joints, as a share of the arm's length."""
 HEAVIER = 0.5
@@ -61,8 +60,7 @@ class UsualElasticity:
 
 
 def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
-    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show how heavy the arm
-    is."""
+    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show its mass."""
     n = len(chain)
     gears = np.array([PERIODIC] * (4 * n) + [HYSTERESIS] * (n if hysteresis else 0))
     moment, beside = _moments(chain)
@@ -74,9 +72,7 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
 
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
-    """Returns the state with elasticity to be adjusted, from the robot file or nearly rigid with gravity down. The
-    payload is the mass that all rows carried, if it was one; hysteresis is included if rows have approach
-    directions."""
+    """Returns the state with elasticity to be adjusted, that of the robot file, or nearly rigid with gravity down."""
     elasticity = state.chain.elasticity
     if elasticity is None or not elasticity.compliance.any():
         n, prior = len(state.chain), usual(state.chain)
@@ -113,8 +109,7 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray]:
-    """Returns the length, in mm, of the longest way from the first joint of a branch at the base to its end; and for
-    each joint (n,) the number of joints from it, itself included, to the farthest end."""
+    """Returns the longest way, mm, from base to an end, and the number (n,) of joints from each to its farthest end."""
     length, above = np.zeros(len(chain)), np.ones(len(chain))
     for i, end in ends.items():
         length[i] = np.linalg.norm(end.translation)
@@ -150,8 +145,7 @@ SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 
 
 def adjusted(text: str) -> Adjusted:
-    """Returns the option for ``text``, names with commas, with base and tool added; raises InputError: an unknown
-    name."""
+    """Returns the option for ``text``, names with commas; raises InputError: an unknown name."""
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
         raise InputError("E-OPTION-VALUE", f"--adjust {text}: base,tool, zeros, geometry or all needed")
@@ -330,8 +324,7 @@ class Placed:
 
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
-    """Returns base and tools as ``nominal``'s file form has them, stations, and starts of branches, with σ from the
-    ``covariance`` without elasticity. Positions tell no orientation of a tool, distances no base."""
+    """Returns base, tools, stations and starts of branches with σ; nan where the observations do not tell them."""
 
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)

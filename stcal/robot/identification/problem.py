@@ -50,11 +50,9 @@ USELESS_MM = 50.0
 """Largest σ of a determined direction (1 mm, or the rotation that moves the tool by 1 mm). Beyond it the nominal value
 is better. All parameters are held to their start by this σ, which determined directions do not feel."""
 ACCEPTED, ACCEPTED_ELASTIC = 1e-4, 0.05
-"""Largest predicted decrease of the cost, in σ², that is accepted when a descent has used up its steps: along a flat
-direction Huber weights halve every step. The second is of elastic arms, whose valleys are curved: 0.2 σ."""
+"""Largest predicted decrease of the cost, in σ², accepted after the last step, for rigid and elastic arms."""
 MOST_BENT = 2 / 3
-"""Largest share of the curvature along a direction that second derivatives may take away; variances become three times
-as large. Flatter valleys have two minima, and the curvature at one minimum does not describe the other."""
+"""Largest share of the curvature that second derivatives may take away: flatter valleys have two minima."""
 ROUNDING = 1e-13
 """Relative error by rounding in the square root of a normal matrix with unit diagonal and some hundred parameters."""
 NEAR, NEAR_STEPS = 1.0, 50
@@ -68,13 +66,11 @@ still gain the first by rounding; the second moves no parameter by more than 0.0
 LEAST = 1e-9
 """Smallest σ, in mm or rad: that of data without noise."""
 FARTHEST, NEAREST = 3.0, 0.7
-"""Largest change of log σ in a round, a factor of 20; and of σ of compliances, a factor of two, since their products
-with moments are nonlinear."""
+"""Largest change of log σ in a round; the second of compliances, whose products with moments are nonlinear."""
 QUIETER = -2.5
 """Second start of the search for log σ of the data: few data may be explained by noise alone, or by dimensions."""
 GROSS = 0.5
-"""Weight below which an observation is a gross error, not noise (normal errors are never so large), and does not count
-for σ."""
+"""Weight below which an observation is a gross error, and does not count for σ: normal errors are never so large."""
 MOSTLY_GOOD = 0.5
 """Smallest share of good observations; where fewer would be good, nothing is called an error."""
 NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 1.0, 1.0]) / 6
@@ -148,8 +144,7 @@ class Problem:
         return Solution(self, state, errors, weights, normal, gradient, units, cost, zero, zero)
 
     def solve(self, state: State) -> "Solution":
-        """Returns the state of least cost, from a start about which prior knowledge is linear; raises
-        ConvergenceError."""
+        """Returns the state of least cost, from a start about which priors are linear; raises ConvergenceError."""
         measured, first = self.measured, self.at(state)
         held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
         conditions, count = np.zeros_like(first.normal), 0
@@ -225,8 +220,7 @@ class Solution:
     notes: tuple[str, ...] = ()
 
     def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns eigenvalues (j,) and directions (j, j), in columns, of the normal matrix with conditions, over axes
-        and tools, and a mask (j,) of determined ones. Elasticity is left out, as there is prior knowledge of it."""
+        """Returns eigenvalues (j,), directions (j, j) in columns, and a mask of determined ones, without elasticity."""
         rigid = slice(len(self.units) - self.state.elastic_count)
         known = self.normal[rigid, rigid] + self.conditions[rigid, rigid]
         values, directions = np.linalg.eigh(known * self.units[rigid, None] * self.units[rigid])
@@ -247,8 +241,7 @@ class Solution:
         return len(parameter_names(self.state, kind)) - UNSEEN[kind] - self.count
 
     def fixed(self, directions: np.ndarray) -> np.ndarray:
-        """Returns the normal matrix (k, k) that holds parameters at their start: weakly, but firmly along
-        ``directions`` (j, d)."""
+        """Returns the normal matrix that holds parameters at their start, firmly along ``directions`` (j, d)."""
         padded = np.pad(directions, ((0, self.state.elastic_count), (0, 0)))
         fixed = np.eye(len(padded)) / USELESS_MM**2 + padded @ padded.T / STAYS_MM**2
         return fixed / self.units[:, None] / self.units
@@ -262,8 +255,7 @@ class Solution:
         return replace(self, problem=problem, residuals=errors, weights=weights)
 
     def curvature(self) -> np.ndarray | None:
-        """Returns the part (k, k) of the normal matrix that second derivatives by compliance and moment subtract:
-        without it descents take hundreds of steps. None for rigid arms and distances."""
+        """Returns what second derivatives take from the normal matrix (k, k); None for rigid arms and distances."""
         state, measured, weighting = self.state, self.problem.measured, self.problem.weighting
         if not state.elastic or measured.kind == "distance":
             return None
@@ -336,15 +328,13 @@ class Solution:
         return projector @ covariance @ projector.T
 
     def places(self) -> np.ndarray | None:
-        """Returns the number (r,) of the joint values of each row; None if no values are repeated, and for
-        distances."""
+        """Returns the number (r,) of the joint values of each row; None if none are repeated, and for distances."""
         rows = np.round(self.problem.measured.data.q, SAME_DIGITS)
         first, place = np.unique(rows, axis=0, return_inverse=True)
         return None if self.problem.measured.kind == "distance" or len(first) == len(rows) else place.ravel()
 
     def _by_places(self, covariance: np.ndarray) -> np.ndarray:
-        """Returns the covariance where joint values were measured several times: what the model lacks there is one
-        error, not several."""
+        """Returns the covariance where at repeated joint values the model errs once, not several times."""
         place = self.places()
         if place is None:
             return covariance
@@ -450,8 +440,7 @@ class Spread:
 
 
 def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (m, width) and weights (m,) for a standard normal distribution: the product rule, or in many
-    dimensions the cubature of degree three (Arasaratnam & Haykin 2009)."""
+    """Returns points (m, width) and weights (m,) of a product rule, or a cubature (Arasaratnam & Haykin 2009)."""
     if width > MOST_PRODUCT:
         away = np.sqrt(width) * np.eye(width)
         return np.vstack([away, -away]), np.full(2 * width, 0.5 / width)

@@ -235,8 +235,7 @@ LENGTH_AT, ANGLE_AT = DIMENSIONS.index("d"), DIMENSIONS.index("theta")
 
 
 def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns joint values that the controller should have at its present 0, their σ, and a mask of determined ones,
-    (n,). Rows have θ + Δ where nominal ones have θ; with the coupling C, that is q + C⁻¹ Δ."""
+    """Returns the controller's values at its present 0, their σ, and a mask (n,) of determined ones: q + C⁻¹ Δθ."""
     at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
     joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
     change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]

@@ -23,9 +23,7 @@ from stcal.robot.kinematics.model import Elasticity, Robot
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
-"""Number of standard errors by which the held-out errors of one model must be below those of the other. Rows of one
-fold share the error of their solution, so that a standard error of independent rows is too small: for rigid arms 2
-would do for 95 %."""
+"""Standard errors by which one model must predict better; rows of one fold share the error of their solution."""
 OUTLIER_WEIGHT = 0.5
 """Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
 
@@ -33,8 +31,7 @@ OUTLIER_WEIGHT = 0.5
 NO_GAIN = 0.95
 """Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
 LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
-"""Common relative change of all lengths, its probability by chance among changes of the same size, and number of
-lengths that were adjusted, from which on and down to which the scale is named."""
+"""Common relative change of all lengths, its probability by chance, and number of adjusted lengths for a note."""
 FAR_FROM_STATED = 3.0
 """Factor between the σ that residuals show and those that are stated from which on it is told."""
 MEDIAN_OF_NORMAL = 0.6745
@@ -359,8 +356,7 @@ OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
 
 
 def misgivings(result: Identified) -> tuple[str, ...]:
-    """Returns notes on stated σ that residuals contradict, no gain over the nominal robot, or lengths that differ by
-    one factor."""
+    """Returns notes on contradicted σ, no gain over the nominal robot, or lengths that differ by one factor."""
     notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
     if result.held_out is not None:
         before, after = (result.errors[key].rms for key in ("nominal", "held_out"))

@@ -30,12 +30,10 @@ SETTLED, REGULAR = 1e-5, 1e-10
 """Largest predicted decrease of the last step, as a share of the squared misfit, which is compared with others; and
 smallest damping, which keeps what these positions leave open at its start, as the point of a tool that never turned."""
 NEARLY = 1e-3
-"""Share of the squared misfit that the next step may still be predicted to remove: of a wrong robot file the valley is
-flat, and the misfit shows it."""
+"""Share of the squared misfit that the next step may still gain: of a wrong robot file the valley is flat."""
 STILL_MM = 0.01
 QUARTERS_DEG, ZERO_STEP_DEG = (90, -90, 180), 30
-"""Errors of a joint's zero that conventions of a robot's home position cause, and step at which others are looked for:
-between two steps there is one minimum."""
+"""Errors of a joint's zero by conventions of the home position, and step at which others are looked for."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
@@ -328,8 +326,7 @@ def _late(robot: Robot, data: Measurements) -> Iterator[Case]:
 
 
 def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
-    """Yields the rows up to the first at which the instrument, the base or the target seems to stand elsewhere, if the
-    rows between such changes all fit by themselves."""
+    """Yields the rows before instrument, base or target moved, if the rows between moves all fit by themselves."""
     if data.positions is None or robot.tree is not None:
         return
     starts = [0]

@@ -31,8 +31,7 @@ LEAST_SHARE, LEAST_MM, LEAST_RAD = 0.01, 1e-3, 1e-6
 LEAST_FREEDOM = 10
 """Smallest number of degrees of freedom that allows a test."""
 NEW, SAME = 1e-3, 1e-9
-"""Share of a motion that must be left after the parameters absorb theirs; and share below which a remainder is
-rounding."""
+"""Share of a motion that must be left beside the parameters, and share below which a remainder is rounding."""
 SHARED = 4
 """Number of distances from one position from which on the error of this position counts as a parameter."""
 TURNS = {1: "once a turn", 2: "twice a turn"}
@@ -239,8 +238,7 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
 
 
 def _shared(state: State, measured: Observed) -> np.ndarray:
-    """Returns shifts (r, w, c) of positions from which several distances start. The error of such a position is in all
-    of its distances, which looks like an effect of place."""
+    """Returns shifts (r, w, c) of positions from which several distances start: each is in all of its distances."""
     starts = [row for row in np.unique(measured.second) if (measured.second == row).sum() >= SHARED]
     if measured.kind != "distance" or not starts:
         return np.zeros((len(measured), WIDTH[measured.kind], 0))
@@ -300,8 +298,7 @@ def _moved_meanwhile(rows: _Rows, order: list[_Effect], explained: np.ndarray, t
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
-    """Returns the jump or the drift along the order of the rows beside all parameters of an arm, each row of the same
-    σ; None if there is none beyond chance, or it explains no more than ``share`` of the squares."""
+    """Returns the jump or drift along the rows, of equal σ; None without one of more than ``share`` of the squares."""
     order, rows = _order(state, measured), _Rows(residuals(state, measured), Weighting(1.0, 1.0), measured)
     found = _moved_meanwhile(rows, order, jacobian(state, measured), len(order))
     return found.finding if found is not None and found.finding.share > share else None

@@ -35,8 +35,7 @@ OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
 MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
 WRITTEN_MM = 1e-5
-"""Largest difference of a place, mm, between a written robot file and what was reported: decimals of angles in degrees
-move a tool by 1e-11 mm, and a chain of 60 joints by less than 1e-7 mm."""
+"""Largest difference, mm, between a written robot file and what was reported: far above that of decimals."""
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 

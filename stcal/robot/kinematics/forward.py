@@ -15,10 +15,7 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot, warn_of_degre
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
-"""Number of joint vectors processed at a time.
-
-Their frames, 96 bytes each, stay in a processor's cache of a megabyte.
-"""
+"""Number of joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache."""
 
 
 def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
@@ -194,8 +191,7 @@ def _elasticity(chain: Chain) -> Elasticity:
 def _walk(
     chain: Chain, joints: Sequence[int], q: np.ndarray, conditions: Conditions = USUAL, visit=None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns axes (3 axes, 3 components, m) and origin (3, m) after ``joints``; ``visit`` gets frames before each
-    motion."""
+    """Returns axes (3, 3, m) and origin (3, m) after ``joints``; ``visit`` gets frames before each motion."""
     m = len(q)
     give = None
     if chain.elasticity is not None:
@@ -238,8 +234,7 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
 
 
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Returns the derivative (m, 6, k) of ``tip``, world_from_tool, by :func:`chain_parameters`, in the world's
-    axes."""
+    """Returns the derivative (m, 6, k) of ``tip`` by :func:`chain_parameters`, in the world's axes."""
     rotation, origin = joint_frames(chain, q, conditions)
     joint, component = np.array(chain_parameters(chain)).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
@@ -285,8 +280,7 @@ def elasticity_jacobian(
 def elasticity_curvature(
     chain: Chain, q: np.ndarray, tip: Poses, targets: Sequence[str], pull: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
-    """Returns the second derivative (9 n, 9 n) of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s
-    motions; only products of compliance and moment have one."""
+    """Returns the second derivative (9 n, 9 n) of ``pull`` (m, 6) times the tool's motions by elasticity."""
     elasticity, n = _elasticity(chain), len(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     z = rotation[..., 2]

@@ -23,8 +23,7 @@ LONGEST = 1.0
 LEAST_DAMPING = 1e-14
 """Smallest damping; it keeps the normal equations regular where the Jacobian is singular."""
 ORIENTATION_WEIGHT = 0.03
-"""Weight of the orientation for arms of fewer than six joints, whose position has priority. The position error that
-remains is removed by :func:`_position_exact`."""
+"""Weight of the orientation for arms of fewer than six joints, whose position has priority."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,8 +73,7 @@ class InverseProblem:
 
 
 def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
-    """Returns an upper bound of the distance from first joint to the origin of any of the tools, mm: the sum of all
-    links and travels."""
+    """Returns an upper bound, mm, of the distance from the first joint to any of the tools: all links and travels."""
     whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
     links = []
     for tool in tools:
@@ -87,8 +85,7 @@ def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
 
 
 def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-    """Returns unitless joint vectors (m, n) of least error from starts q, a local minimum where a pose is out of
-    reach."""
+    """Returns unitless joint vectors (m, n) of least error from starts q, also where a pose is out of reach."""
     q = q.copy()
     if not len(q):
         return q
@@ -167,11 +164,9 @@ WITHIN_MM, WITHIN_RAD = 1e-9, 1e-12
 LIMIT_SLACK = 1e-9
 """Largest excess over joint limits that counts as rounding, rad (or shares of the reach)."""
 SINGULAR = 1e-5
-"""Smallest singular value (no unit) below which joint values are not determined. At a fold the error is the square of
-what the joints are off, so that an error of 1e-12 leaves 1e-6: the joints cannot be found nearer to the fold."""
+"""Smallest singular value (no unit) below which joint values are not determined, as an error of 1e-12 leaves 1e-6."""
 POOL, STARTS = 4096, 96
-"""Number of joint vectors over the range, and number of the nearest of them that are starts for each pose. Of 2738
-branches of 600 poses of five arms, found with 600 starts, 96 missed none, 48 three, 32 twenty-eight."""
+"""Joint vectors over the range, and nearest that are starts: 96 miss none of 2738 branches."""
 SAME_BRANCH = 1e-4
 """Distance of joint vectors, rad, below which they are one solution."""
 SHORT = 0.1
@@ -327,8 +322,7 @@ def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple
 def _by_search(
     problem: InverseProblem, poses: Poses, rest: np.ndarray, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None
 ) -> Inverse:
-    """Returns all joint vectors, after a search over all branches for the poses ``rest``: the nearest to ``near`` (m,
-    n), or if that is None to the solution of the previous pose."""
+    """Returns all joint vectors, the poses ``rest`` searched: nearest to ``near`` (m, n), or to the solution before."""
     beyond, last = np.zeros(len(poses), bool), problem.middle
     for start in range(0, len(rest), GROUP):
         part = rest[start : start + GROUP]
@@ -352,8 +346,7 @@ def _refuse_redundant(problem: InverseProblem) -> None:
 
 
 def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
-    """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), converged or not, ignoring
-    limits."""
+    """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), ignoring limits."""
     n, m = len(problem.unit), len(poses)
     low, high = problem.bounds.T
     whole = np.minimum(np.pi, (high - low) / 2)  # of more than a turn one turn is enough
@@ -377,8 +370,7 @@ def _embedded(poses: Poses, reach: float) -> np.ndarray:
 def _nearest(
     problem: InverseProblem, pose: Poses, solutions: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray | None, bool]:
-    """Returns the solution nearest to ``near`` within the limits or None, and whether only solutions beyond them
-    reach."""
+    """Returns the nearest solution within the limits or None, and whether only solutions beyond them reach."""
     turned, inside = _turned(problem, solutions, near)
     count = len(turned)
     many = Poses(np.repeat(pose.rotation, count, 0), np.repeat(pose.translation, count, 0))
@@ -429,8 +421,7 @@ def _is_nearest(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> np.
 
 
 def _nearest_around(problem: InverseProblem, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Returns the solutions nearest to ``near`` among q (m, n) and neighbouring branches. Branches meet along the
-    right singular vector of the smallest singular value, so starts on either side along it find a neighbour."""
+    """Returns the solutions nearest to ``near`` among q and neighbours, which are along the weakest direction."""
     if not len(q):
         return q
     weakest = np.linalg.svd(problem.jacobian(q))[2][:, q.shape[1] - 1]

@@ -474,8 +474,7 @@ class Chain:
         return total
 
     def branch(self, carrier: int) -> "Chain":
-        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, as they bend this
-        one."""
+        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, and bend it."""
         if self.grown is None:
             return self
         return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))
@@ -511,8 +510,7 @@ def across(row: DHRow) -> Rigid:
 
 
 def mh80() -> Robot:
-    """Returns an arm with the size, reach (2061 mm) and joint ranges of Yaskawa's Motoman MH80, from its data sheet; J3
-    is not coupled, and the tool is at the flange."""
+    """Returns an arm of the size and ranges of Yaskawa's Motoman MH80, from its data sheet, J3 not coupled."""
     rows = ((145, -90, 540, 0), (870, 0, 0, -90), (210, -90, 0, 0), (0, 90, 1025, 0), (0, -90, 0, 0), (0, 0, 175, 0))
     ranges = ((-180, 180), (-90, 155), (-80, 90), (-360, 360), (-125, 125), (-360, 360))
     return Robot(

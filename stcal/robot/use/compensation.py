@@ -42,9 +42,7 @@ ISOLATED = 6
 def _stayed(
     robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None, inverse: Inverse, known: np.ndarray
 ) -> tuple[Inverse, dict[int, str]]:
-    """Returns solutions in the configuration of the commanding joint values ``near`` (m, n), where these are ``known``
-    (m,), and by row the limits that prevent it. A row whose nearest solution is beyond the limits gets status ``limit``
-    and joint values there."""
+    """Returns solutions in the configuration of ``near`` (m, n) where ``known`` (m,), and by row limits against it."""
     if near is None or not known.any() or len(robot.rows) > ISOLATED:
         return inverse, {}
     away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
@@ -90,10 +88,7 @@ def _beyond(robot: Robot, q: np.ndarray) -> str:
 
 
 FAR_RAD = np.radians(1.0)
-"""Largest usual motion of a joint, as arms are made to milliradians.
-
-A joint moves by more only if others cannot move.
-"""
+"""Largest usual motion of a joint, as arms are made to milliradians."""
 AMPLIFIED = 10.0
 """Ratio of a joint's motion to the error of the pose, in rad, from which the arm is near a singular pose."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)

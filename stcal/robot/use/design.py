@@ -202,10 +202,7 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 
 
 def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarray:
-    """Returns the derivative (m, 3, k) of the tool's position by all parameters.
-
-    The tool's rotation does not move it.
-    """
+    """Returns the derivative (m, 3, k) of the tool's position by all parameters; its rotation does not move it."""
     positions = identification_jacobian(robot, q, "position", tool=options.tool)
     if options.observe == "position":
         return positions
@@ -252,8 +249,7 @@ def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
-    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ; returns them and the number of
-    exchanges. The greedy choice starts with almost no information; then poses are exchanged until nothing helps."""
+    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ; returns them and the exchanges."""
     k = rows.shape[2]
     mean = np.einsum("mri,mrj->ij", rows, rows) / len(rows)
     start = 1e-6 * np.trace(mean) / k * np.eye(k)

@@ -36,8 +36,7 @@ from stcal.robot.kinematics.model import Robot
 
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5
-"""False-alarm probability of one row in a set with normal errors. An error beyond ``SURELY`` times this limit is always
-gross, as residuals of a model have longer tails than noise: 8 σ for 50 positions."""
+"""False-alarm probability per row, and factor on its limit, as a model's residuals have longer tails than noise."""
 LEAST_MM = 1e-3
 """Error below which a row is never wrong, as no instrument shows less."""
 ROUNDS = 5

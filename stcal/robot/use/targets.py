@@ -206,8 +206,7 @@ USUAL_SHARE = 0.01
 SAMPLE = 50
 """Number of joint vectors at which two robots are compared."""
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
-"""Share and number of targets out of reach from which another convention is tried, and the number that it must all
-bring within reach. By chance each is, half the time, so that one of six conventions is in 2 of 100 sets of 8."""
+"""Share and number of targets out of reach from which others are tried, and number that these must all reach."""
 INVERSE = "poses were inverse (base seen from the tool); give the tool in the base's frame"
 
 
@@ -269,8 +268,7 @@ def _rms(shift: np.ndarray) -> float:
 
 
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
-    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row within 5 % of the reach
-    and 11°."""
+    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row."""
 
     def misfit(case: tuple[Poses, np.ndarray]) -> float:
         off = case[0].difference(poses_of(robot, targets, case[1]))
@@ -300,8 +298,7 @@ def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
-    """Returns a note on joint values that miss poses by (m, 6), unless all rows have the same, as to choose a
-    branch."""
+    """Returns a note on joint values that miss poses by (m, 6), unless they only choose a branch."""
     mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
     away = (mm > FITS * reach) | (rad > TURNED_RAD)
     if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):

@@ -24,14 +24,11 @@ WHAT = "measured positions"
 SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
-"""Largest RMS deviation of measured from commanded distances of all pairs, as a share and in mm. Arms err by under 1 %
-of their 2 m. Another robot's model, or rows in another order, cause more."""
+"""Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
-"""Largest share of the poses that may be named as not where they were commanded, and number of poses up to which all
-are compared with all."""
+"""Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
 OFF, OFF_MM, LEAST_TO_COMPARE = 6.0, 0.1, 6
-"""How many times as much as that of most poses one's typical distance error must be, and how large, to name the pose;
-and smallest number of poses in which that is looked for."""
+"""Ratio of a pose's typical error to that of most, its size, and number of poses, from which on the pose is named."""
 NO_BETTER, WORSE = 0.8, 1.2
 """How many times as much as the first set another errs about as it does, and more than it does."""
 MOST_OF_IT = 0.75
@@ -39,10 +36,7 @@ MOST_OF_IT = 0.75
 LEAST_SPREAD_MM = 20.0
 """Largest commanded distance below which the unit is doubted."""
 SCALE_WITHIN = 0.005
-"""Largest relative difference of scale.
-
-Arms are off by parts of a thousand; more indicates another unit or other poses.
-"""
+"""Largest relative difference of scale; more is another unit, or other poses."""
 
 
 BySet = Annotated[str, "set"]
