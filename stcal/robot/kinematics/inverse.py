@@ -128,7 +128,7 @@ def inverse(
     assumption", Computing 74, 2005.
     """
     m, n = len(poses), len(robot.rows)
-    problem = _Problem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
+    problem = InverseProblem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
     if near is None:
         problem.refuse_redundant()
         return problem.searched(poses, np.arange(m), np.zeros((m, n)), np.zeros(m, bool), None)
@@ -165,7 +165,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     InputError
         The arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
-    problem = _Problem.of(robot, tool)
+    problem = InverseProblem.of(robot, tool)
     problem.refuse_redundant()
     poses = Poses.of([pose])
     solutions, inside = problem.turned(problem.every_solution(poses)[0], problem.middle)
@@ -187,7 +187,7 @@ def _as_good(error_rad: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class InverseProblem:
     """An arm with a tool, in unitless joint values. ``unit`` : (n,) rad or mm of a unitless 1; ``reach`` : mm;
     ``bounds`` : (n, 2); ``middle`` : (n,) of the bounds, 0 if unlimited; ``turns`` : (n,) whether 2π more is the same
     position; ``few`` : whether fewer than six joints carry the tool."""
@@ -202,7 +202,7 @@ class _Problem:
     few: bool
 
     @classmethod
-    def of(cls, robot: Robot, tool: str) -> "_Problem":
+    def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
         reach, sliding, chain = reach_mm(robot, [tool]), robot.prismatic, robot.chain()
         unit = np.where(sliding, reach, 1.0)
         bounds = robot.limits() / unit[:, None]
