@@ -77,11 +77,9 @@ def load_urdf(
     Parameters
     ----------
     path : URDF; a xacro file must be expanded before.
-    from_link : str
-        The base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint, this link
-        is the base, and the joint where it stands.
-    to_link : str or sequence of str
-        The tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
+    from_link : the base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint,
+        this link is the base, and the joint where it stands.
+    to_link : the tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
         ``tool_NAME`` as :func:`robot_urdf` writes them. Several are tools called like the links, on branches of a tree.
     convention : of the Denavit–Hartenberg rows.
 

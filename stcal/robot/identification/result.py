@@ -48,16 +48,13 @@ class IdentifyOptions:
     sigma_mm, sigma_rad : σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
     robust : whether outliers weigh less (Huber), and gross errors nothing at all.
     folds : number of folds of the cross-validation; 0 for none.
-    repeats : int, optional
-        Number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many, if not
-        given.
+    repeats : number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many,
+        if not given.
     seed : seed of the divisions.
     partial : keep nominal what the data do not determine, instead of refusing the data.
-    adjust : {"all", "geometry", "zeros", "base,tool"}
-        Dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone, or
-        none. Dimensions that are fixed in the robot file stay in any case.
-    model : {"rigid", "elastic", "auto"}
-        ``elastic``: links bend under gravity and gears have periodic errors. ``auto`` takes the elastic model if it
+    adjust : dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone,
+        or none. Dimensions that are fixed in the robot file stay in any case.
+    model : ``elastic``: links bend under gravity and gears have periodic errors. ``auto`` takes the elastic model if it
         predicts held-out rows better by more than chance, else the rigid one.
 
     Raises
@@ -153,9 +150,8 @@ class Identified(Brief):
     robot, nominal : the robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
     seen : the r observations.
     adjustment : solution, weights and σ; what is used often is a property, too.
-    names : tuple of str
-        Names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about
-        its y, rad; tool x: mm).
+    names : names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2
+        about its y, rad; tool x: mm).
     covariance : (k, k) array: covariance of the parameters, rad and mm.
     rank : number of parameters that the data used determine.
     ranks : number of parameters that these joint values determine, by kind of observation.
@@ -167,9 +163,8 @@ class Identified(Brief):
     left : effects found in the residuals; None if there are too few observations for a test.
     dh_sigma : (n, 5) array: σ of a, alpha, d, theta, beta; mm, rad.
     observability : indices of the determined parameters.
-    deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of the
-        deflection of links at the usual torque, of gears and of hysteresis, rad.
+    deviations : σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ
+        of the deflection of links at the usual torque, of gears and of hysteresis, rad.
     elasticity_sigma : σ of the robot's elasticity where it was adjusted.
     gain : comparison of both models, where both were tried.
     all_held_out : errors of the cross-validation with all dimensions adjusted, where some are kept.

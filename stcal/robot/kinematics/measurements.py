@@ -211,8 +211,7 @@ def read_measurements(
     robot : the robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    rotation : str, optional
-        Convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
+    rotation : convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
         (``data_layout.md``).
     payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
 
