@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -85,12 +86,10 @@ class Measurements(Brief):
         freeze(self, "q", (None, None), "joint values")
         m = len(self.q)
         object.__setattr__(self, "stations", self.stations or ("",) * m)
-        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
+        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None), "distances": ()}
         for name, shape in shapes.items():
             if getattr(self, name) is not None:
                 freeze(self, name, (m, *shape), name)
-        if self.distances is not None:
-            freeze(self, "distances", (m,), "distances")
         if self.from_row is not None:
             freeze(self, "from_row", (m,), "rows", int)
 
@@ -227,20 +226,20 @@ def read_measurements(
         open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
-    q = joint_values(table, robot)
-    targets, conditions = targets_of(table), read_conditions(table, payload_kg, len(robot.rows))
-    own = (PAYLOAD, *approach_columns(len(robot.rows)))
+    joints = len(robot.rows)
+    own = (PAYLOAD, *approach_columns(joints))
+    q, targets = joint_values(table, robot), targets_of(table)
+    base: dict[str, Any] = {"conditions": read_conditions(table, payload_kg, joints)}
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
-        said += unread(table, (*columns, *own))
-        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said, conditions=conditions)
-        if "station" in table:
-            data = replace(data, stations=tuple(table.text("station")))
         if poses is not None:
             covariance = table.pose_covariances()
-            data = replace(
-                data, rotations=poses.rotation, covariance=covariance, common=table.common_errors(covariance)
-            )
+            common = table.common_errors(covariance)
+            base |= {"rotations": poses.rotation, "covariance": covariance, "common": common}
+        if "station" in table:
+            base["stations"] = tuple(table.text("station"))
+        notes = said + unread(table, (*columns, *own))
+        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=notes, **base)
         within(table, "position", data.points(), "mm")
         for rows in data.by_station().values():
             _in_reach(data[rows], robot)
@@ -258,15 +257,14 @@ def read_measurements(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
         )
     from_row = _from_rows(table)
-    if len(itself := np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM))):
-        i = int(itself[0])
+    for i in np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM)).tolist():
         raise InputError(
             "E-MEASURED-DISTANCES",
             f"{table.where}: line {table.lines[i]}: the distance of a position from itself is {distances[i]:.4g} mm, "
             "0 needed: distances start at the first row, which is missing, or at the row that column from_row names",
         )
-    seen = {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
-    return Measurements(table.where, table.lines, q, targets, **seen, conditions=conditions)
+    base |= {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
+    return Measurements(table.where, table.lines, q, targets, **base)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
@@ -276,11 +274,10 @@ def targets_of(table: Table) -> tuple[str, ...]:
 
 def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
     """Refuses values (m,) or (m, k) beyond possible ones."""
-    bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
-    if len(bad):
+    for row in np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1)).tolist():
         raise InputError(
             "E-VALUE-TOO-FAR",
-            f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
+            f"{table.where}: line {table.lines[row]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
             "remove the line",
         )
 
@@ -288,20 +285,19 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
 def _in_reach(data: Measurements, robot: Robot) -> None:
     """Refuses positions farther from the middle one than arm and tool allow."""
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
-    reach = reach_mm(robot, robot.tools)
-    worst = int(away.argmax())
-    if (usual := float(np.median(away))) > 2 * reach + LONGEST_TOOL_MM:
-        raise InputError(
-            "E-MEASURED-REACH",
-            f"{data.where}: positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches "
-            f"{reach:.4g} mm; correct the unit of x, y, z: are these mm, in columns of another unit?",
+    reach, usual, worst = reach_mm(robot, robot.tools), float(np.median(away)), int(away.argmax())
+    if away[worst] <= 2 * reach + LONGEST_TOOL_MM:
+        return
+    said = (
+        f"line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, robot {robot.name} "
+        f"reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
+    )
+    if usual > 2 * reach + LONGEST_TOOL_MM:
+        said = (
+            f"positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches {reach:.4g} mm; "
+            "correct the unit of x, y, z: are these mm, in columns of another unit?"
         )
-    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
-        raise InputError(
-            "E-MEASURED-REACH",
-            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, "
-            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z",
-        )
+    raise InputError("E-MEASURED-REACH", f"{data.where}: {said}")
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
@@ -309,11 +305,9 @@ def _usable(data: Measurements, table: Table) -> Measurements:
     undecided = np.zeros(len(data), bool)
     if STATUS in table:
         undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
-    rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
     names = np.unique(data.targets, return_inverse=True)[1]
-    mass = data.conditions.payload_kg
-    carried = np.zeros(len(data)) if mass is None else mass
-    every = np.column_stack([data.q, names, data.points(), rotations, carried])
+    more = [each for each in (data.rotations, data.conditions.payload_kg) if each is not None]
+    every = np.column_stack([data.q, names, data.points(), *(each.reshape(len(data), -1) for each in more)])
     copies = np.ones(len(data), bool)
     copies[np.unique(every, axis=0, return_index=True)[1]] = False
     reasons = {
@@ -341,17 +335,17 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
             f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file",
         )
     columns = []
-    for i, joint in enumerate(robot.joints, 1):
-        units = ANGLES if joint.type == "revolute" else LENGTHS
+    for i, sliding in enumerate(robot.prismatic, 1):
+        units, unit = (LENGTHS, "mm") if sliding else (ANGLES, "rad")
         values = table.quantity(f"q{i}", units)
         far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
-        if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
+        if not sliding and len(far) and table.unit(f"q{i}", units) == "rad":
             raise InputError(
                 "E-JOINT-VALUE",
                 f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
                 f"if these are degrees call the column q{i}_deg",
             )
-        within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
+        within(table, f"q{i}", values, unit)
         columns.append(values)
     return np.column_stack(columns)
 
