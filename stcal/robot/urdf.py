@@ -30,13 +30,18 @@ PLACED_BY = {"origin": ("xyz", "rpy"), "axis": ("xyz",)}
 MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
+SAME_MM, SAME_RAD = 1e-9, 1e-12
+"""Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
+
+
 def link_of(tool: str) -> str:
-    """Name of a tool's link."""
+    """Returns the name of a tool's link."""
     return f"{TOOL}_{tool}" if tool else TOOL
 
 
-SAME_MM, SAME_RAD = 1e-9, 1e-12
-"""Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
+def few(names: Sequence[str], most: int = 12) -> str:
+    """Returns the first names of many, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -110,7 +115,7 @@ def load_urdf(
     given = [to_link] if isinstance(to_link, str) else list(to_link)
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
-            raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {_few(links)}")
+            raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {few(links)}")
     farthest = max(joints.values(), key=_far, default=None)
     if farthest is not None and _far(farthest) > MOST_LINK_MM:
         raise InputError(
@@ -159,14 +164,9 @@ def _require_chain(path: list[UrdfJoint], start: str, end: str, where: str) -> N
             "E-URDF-LINKS", f"{where}: no joint from {start} to {end} moves; other --from-link or --to-link needed"
         )
     for joint in moving:
-        if joint.kind not in MOVING:
-            raise InputError(
-                "E-URDF-JOINT", f"{where}: joint {joint.name} is {joint.kind}; fixed, {', '.join(MOVING)} are read"
-            )
-        if joint.mimics:
-            raise InputError(
-                "E-URDF-JOINT", f"{where}: joint {joint.name} mimics {joint.mimics}; joints of their own needed"
-            )
+        known = f"is {joint.kind}; fixed, {', '.join(MOVING)} are read" if joint.kind not in MOVING else ""
+        if reason := known or (f"mimics {joint.mimics}; joints of their own needed" if joint.mimics else ""):
+            raise InputError("E-URDF-JOINT", f"{where}: joint {joint.name} {reason}")
 
 
 def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
@@ -346,28 +346,24 @@ def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, st
     if not branches and TOOL0 in ends:
         return {"": TOOL0}
     every = [link for link in joints if link not in below] if branches else ends
-    raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
+    raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {few(every)}")
 
 
 def _path(joints: dict[str, UrdfJoint], start: str, end: str, where: str) -> list[UrdfJoint]:
-    found: list[UrdfJoint] = []
+    path: list[UrdfJoint] = []
     while end != start:
-        if end not in joints or len(found) > len(joints):
+        if end not in joints or len(path) > len(joints):
             raise InputError(
                 "E-URDF-LINKS",
                 f"{where}: no joints lead from link {start} to the tool; other --from-link, --to-link needed",
             )
-        found.append(joints[end])
-        end = joints[end].parent
-    return found[::-1]
+        path.insert(0, joints[end])
+        end = path[0].parent
+    return path
 
 
 def _far(joint: UrdfJoint) -> float:
     return float(np.linalg.norm(joint.parent_from_child.translation))
-
-
-def _few(names: list[str], most: int = 12) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def robot_urdf(robot: Robot) -> str:

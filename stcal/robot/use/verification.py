@@ -19,6 +19,7 @@ from stcal.io.json import Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
+from stcal.robot.urdf import few
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
@@ -136,7 +137,7 @@ class Verification(Brief):
     def warnings(self) -> list[str]:
         """Returns warnings of missing poses and of doubtful sets."""
         found = [
-            f"set {name}: missing poses, left out of all sets ({len(poses)}): {_few(poses)}"
+            f"set {name}: missing poses, left out of all sets ({len(poses)}): {few(poses)}"
             for name, poses in self.missing.items()
             if poses
         ]
@@ -321,7 +322,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     good = np.setdiff1d(np.arange(len(names)), wrong)
     if not len(wrong) or len(wrong) > MOST_ELSEWHERE * len(names) or missed[np.ix_(good, good)].max() > MISSES_MM:
         return ""
-    listed = _few([name for i, name in enumerate(names) if i in wrong])
+    listed = few([name for i, name in enumerate(names) if i in wrong])
     if len(wrong) == 2:
         exchanged = measured.copy()
         exchanged[wrong] = measured[wrong[::-1]]
@@ -354,8 +355,3 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
         scale=product / commanded_squares,
         elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
     )
-
-
-def _few(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(names[:most])
-    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
