@@ -160,8 +160,8 @@ def axes(
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot import load_robot, read_measurements, robot_from_sweeps
     from stcal.robot.axes.model import AxesFile
-    from stcal.robot.axes.report import axes_report
     from stcal.robot.axes.sweeps import ring
+    from stcal.robot.robot_report import axes_report
 
     nominal = load_robot(robot_file)
     source = joined.table(sweeps, "SWEEPS")
@@ -244,8 +244,8 @@ def identify(
     from stcal.robot import IdentifyOptions, load_robot, offsets_csv, read_measurements, robot_toml
     from stcal.robot import identify as identified_from
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.report import identified_report
     from stcal.robot.identification.result import IdentifiedFile, require_identified_written
+    from stcal.robot.identified_report import identified_report
 
     nominal = load_robot(robot_file)
     source = joined.table(data_file, "DATA", quaternions=quaternions)
@@ -286,7 +286,7 @@ def evaluate(
     """Compare robot files on new measurements, and tell what their residuals depend on."""
     from stcal.robot import evaluate as evaluated
     from stcal.robot import load_robot, read_measurements
-    from stcal.robot.use import report as shown
+    from stcal.robot import robot_report as shown
     from stcal.robot.use.evaluation import EvaluationFile
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
@@ -320,8 +320,8 @@ def verify(
 ) -> None:
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
+    from stcal.robot.robot_report import verification_figure, verification_report
     from stcal.robot.use import verification
-    from stcal.robot.use.report import verification_figure, verification_report
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
@@ -356,8 +356,8 @@ def compensate(
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
     from stcal.robot import load_robot, read_targets
+    from stcal.robot.robot_report import compensation_report
     from stcal.robot.use import compensation
-    from stcal.robot.use.report import compensation_report
 
     identified = load_robot(robot_file)
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
@@ -392,8 +392,8 @@ def design(
 ) -> None:
     """Choose the measurement poses that determine the robot's parameters best."""
     from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.robot_report import design_report
     from stcal.robot.use import design as pose_design
-    from stcal.robot.use.report import design_report
 
     options = pose_design.DesignOptions(
         count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target

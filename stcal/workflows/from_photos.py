@@ -42,14 +42,13 @@ from stcal.robot import (
     robot_toml,
 )
 from stcal.robot.axes.model import AxesFile, AxesResult
-from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
+from stcal.robot.identified_report import identified_report
 from stcal.robot.kinematics.file import require_robot_written
 from stcal.robot.kinematics.measurements import joint_values, targets_of
+from stcal.robot.robot_report import axes_report, compensation_report
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
-from stcal.robot.use.report import compensation_report
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
 from stcal.sfm.measurement.report import (
     IMAGE,

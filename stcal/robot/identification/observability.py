@@ -117,13 +117,10 @@ def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...
         reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
         lead.append(int(i))
     named = []
-    for i, direction in zip(lead, reduced.T, strict=True):
-        strong = [
-            k
-            for k in np.argsort(-np.abs(direction))
-            if k != i and abs(direction[k]) > TOGETHER * np.abs(direction).max()
-        ]
-        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+    for i, direction in zip(lead, np.abs(reduced.T), strict=True):
+        order = np.argsort(-direction)
+        strong = [names[k] for k in order if k != i and direction[k] > TOGETHER * direction.max()]
+        beside = " and ".join(strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
         named.append(f"{names[i]} (with {beside})" if beside else names[i])
     return tuple(named)
 
@@ -216,18 +213,13 @@ def doubts(
     tested: bool,
 ) -> tuple[str, ...]:
     """Returns notes on few rows, or of a small part of the ranges; ``tested`` : rows were held out."""
-    notes = []
     numbers = WIDTH[measured.kind] * len(measured)
-    count = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters"
+    count, notes = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters", []
+    few = "σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
     if not tested:
-        notes.append(
-            f"{count}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "
-            "as many"
-        )
-    elif numbers < FEW * len(names):
-        notes.append(
-            f"{count}: σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
-        )
+        few = "none can be held out to test the result, and errors of the same rows say nothing; measure twice as many"
+    if not tested or numbers < FEW * len(names):
+        notes.append(f"{count}: {few}")
     if found is not None and found.elsewhere() > ELSEWHERE:
         sizes, directions = np.linalg.eigh(covariance / units[:, None] / units)
         worst = directions_named(directions[:, -1:], names)[0]

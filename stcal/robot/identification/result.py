@@ -26,8 +26,6 @@ BEYOND_CHANCE = 2.5
 """Standard errors by which one model must predict better; rows of one fold share the error of their solution."""
 OUTLIER_WEIGHT = 0.5
 """Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
-
-
 NO_GAIN = 0.95
 """Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
 LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
@@ -386,7 +384,7 @@ def misgivings(result: Identified) -> tuple[str, ...]:
 
 def _stated_otherwise(result: Identified) -> str | None:
     """Returns a note on stated σ that are far from what the residuals show, None where they are not."""
-    sigma = result.weighting
+    sigma, kind = result.weighting, result.seen.kind
     few = np.count_nonzero(result.weights < OUTLIER_WEIGHT)
     remedy = "check --sigma-mm and --sigma-rad, or covariances, and their units; or leave them out, to have σ estimated"
     if 2 * few > len(result.weights):
@@ -394,24 +392,14 @@ def _stated_otherwise(result: Identified) -> str | None:
             f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small: "
             f"{remedy}"
         )
-    if sigma.given:
-        ratio, what = sigma.factor, "residuals are"
-    else:
-        white = sigma.factor * sigma.whiten(result.residuals, result.seen)
-        columns = replace(sigma, estimated=()).columns(white.shape[1])
-        size = {
-            name: float(np.median(np.abs(white[:, own]))) / MEDIAN_OF_NORMAL
-            for name, own in columns.items()
-            if name not in sigma.estimated
-        }
-        if not size:
-            return None
-        name = max(size, key=lambda each: abs(np.log(max(size[each], 1e-12))))
-        ratio, what = size[name], f"residuals of {'orientations' if name == 'rad' else result.seen.kind + 's'} are"
-        what = what.replace("poses", "positions")
-    if 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED:
-        return None
-    return f"{what} {ratio:.2g} times the σ that are stated: {remedy}"
+    ratios = {"residuals": sigma.factor}
+    if not sigma.given:
+        medians = replace(sigma, estimated=()).medians(sigma.factor * sigma.whiten(result.residuals, result.seen))
+        names = {"rad": "residuals of orientations", "mm": f"residuals of {kind}s".replace("poses", "positions")}
+        ratios = {names[n]: v / MEDIAN_OF_NORMAL for n, v in medians.items() if n not in sigma.estimated}
+    far = {what: ratio for what, ratio in ratios.items() if not 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED}
+    what = max(far, key=lambda each: abs(np.log(max(far[each], 1e-12))), default="")
+    return f"{what} are {far[what]:.2g} times the σ that are stated: {remedy}" if far else None
 
 
 def require_identified_written(path: Path | str, result: Identified) -> None:

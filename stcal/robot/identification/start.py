@@ -270,10 +270,10 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
         for size, level in enumerate(levels)
         for what, cure, variant, guess in level
     )
-    found = explain(cases, lambda case: _fitting(*case, tools)[0], min(EXPLAINS * misfit / extent, FITS))
+    found = explain(cases, lambda case: _fitting(case, tools)[0], min(EXPLAINS * misfit / extent, FITS))
     words = []
     for each, _ in found[:MOST_NAMED]:
-        far = _not_there(each.change()[1], _fitting(*each.change(), tools)[1])
+        far = _not_there(each.change()[1], _fitting(each.change(), tools)[1])
         words.append(", and ".join(filter(None, (each.words, far))))
     cause = "check D-H rows and convention, the order and zero of joints, coupling, and units"
     raise InputError("E-IDENTIFY-MISFIT", says + (f"it would fit if {', or if '.join(words)}" if words else cause))
@@ -286,8 +286,9 @@ def _thinned(data: Measurements) -> Measurements:
     return data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
 
 
-def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
+def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
     """Returns the RMS misfit as a share of the spread, and a mask (m,) of rows that are far off and take no part."""
+    robot, data = case
     near = np.ones(len(data), bool)
     for _ in range(TRIMS):
         used = data if near.all() else data[near]

@@ -132,13 +132,10 @@ class DesignOptions:
                 f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed, "
                 "1e-9 to 1e4 mm and 1e-12 to 4 rad",
             )
-        if self.box is not None and (
-            len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
-        ):
-            shown = ",".join(f"{v:g}" for v in self.box)
+        if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
             raise InputError(
                 "E-DESIGN-OPTIONS",
-                f"design: box {shown}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
+                f"design: box {_shown(self.box)}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
             )
 
 
@@ -187,7 +184,10 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         )
     chosen, exchanges = choose(rows, options.count)
     sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
-    predict = _prediction(robot, q[:TEST_POSES], options) * scale @ basis
+    predict = identification_jacobian(robot, q[:TEST_POSES], "position", tool=options.tool)
+    if options.observe == "pose":  # the tool's rotation does not move it
+        predict = np.insert(predict, [predict.shape[2] - 3] * 3, 0.0, axis=2)
+    predict = predict * scale @ basis
     return PoseDesign(
         q=q[chosen],
         poses=forward(robot, q[chosen], options.tool),
@@ -199,14 +199,6 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         random_sigma_mm=float(np.median([_predicted_mm(rows[s], predict) for s in sets])),
         exchanges=exchanges,
     )
-
-
-def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarray:
-    """Returns the derivative (m, 3, k) of the tool's position by all parameters; its rotation does not move it."""
-    positions = identification_jacobian(robot, q, "position", tool=options.tool)
-    if options.observe == "position":
-        return positions
-    return np.insert(positions, [positions.shape[2] - 3] * 3, 0.0, axis=2)
 
 
 def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) -> np.ndarray:
@@ -222,23 +214,26 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
     low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
     high = np.where(np.isfinite(high), high, low + 2 * np.pi)
     batches: list[np.ndarray] = []
-    count, drawn = 0, 0
+    count, drawn, box = 0, 0, options.box
     while count < options.candidates:
-        if options.box is not None and drawn >= DRAWS * options.candidates:
-            shown = ",".join(f"{v:g}" for v in options.box)
+        if box is not None and drawn >= DRAWS * options.candidates:
             raise InputError(
                 "E-DESIGN-BOX",
-                f"design: of {drawn} random joint vectors {count} bring the tool into the box {shown} mm, "
+                f"design: of {drawn} random joint vectors {count} bring the tool into the box {_shown(box)} mm, "
                 f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates",
             )
         q = rng.uniform(low, high, (options.candidates, len(low)))
         drawn += len(q)
-        if options.box is not None:
+        if box is not None:
             at = forward(robot, q, options.tool).translation
-            q = q[((at >= options.box[:3]) & (at <= options.box[3:])).all(axis=1)]
+            q = q[((at >= box[:3]) & (at <= box[3:])).all(axis=1)]
         batches.append(q)
         count += len(q)
     return np.concatenate(batches)[: options.candidates]
+
+
+def _shown(box: tuple[float, ...]) -> str:
+    return ",".join(f"{v:g}" for v in box)
 
 
 def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:

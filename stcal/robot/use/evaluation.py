@@ -218,7 +218,7 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
     seen = observed(data, None if data.positions is None else "position")
     what = f"parameters of {' and '.join(sorted(fit))}"
     seen.require_more_than(_parameters(seen, fit), what, "or fit less (--refit)")
-    states, wrong = _fitted(list(named.values()), data, seen, fit)
+    states, wrong = _fitted(list(named.values()), seen, fit)
     found = tuple(
         _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
     )
@@ -230,66 +230,51 @@ def _parameters(measured: Observed, fit: Fit) -> int:
     return base + (3 * len(set(measured.data.targets)) if "tool" in fit else 0)
 
 
-def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
+def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
     """Returns the states of all robots, and a mask (r,) of rows (never of distances) that none explains: not fitted."""
-    wrong = np.zeros(len(measured), bool)
-    freedom = WIDTH[measured.kind] * len(measured) - _parameters(measured, fit)
+    wrong, width, targets = np.zeros(len(measured), bool), WIDTH[measured.kind], np.array(measured.data.targets)
+    freedom = width * len(measured) - _parameters(measured, fit)
     for _ in range(ROUNDS):
-        kept = data if measured.kind == "distance" else data[~wrong]
+        kept = measured[~wrong].data
         states = [start(robot, kept, fit) for robot in robots]
         errors = np.array([position_errors(residuals(state, measured)) for state in states])
-        share = freedom / WIDTH[measured.kind] / len(measured)
-        sigma = min(robust_sigma(each[~wrong], WIDTH[measured.kind], share) for each in errors)
-        limit = SURELY * sigma * length_limit(WIDTH[measured.kind], FALSE_ALARM / len(measured))
-        now = errors.min(0) > max(limit, LEAST_MM)
-        if freedom < LEAST_FREEDOM or (now == wrong).all() or set(_targets(measured, ~now)) < set(_targets(measured)):
+        sigma = min(robust_sigma(each[~wrong], width, freedom / width / len(measured)) for each in errors)
+        now = errors.min(0) > max(SURELY * sigma * length_limit(width, FALSE_ALARM / len(measured)), LEAST_MM)
+        left_out = set(targets[measured.first]) - set(targets[measured.first[~now]])
+        if freedom < LEAST_FREEDOM or (now == wrong).all() or left_out:
             break
         wrong = now
     return states, wrong
 
 
-def _targets(measured: Observed, among: np.ndarray | slice = slice(None)) -> list[str]:
-    return np.array(measured.data.targets, object)[measured.first[among]].tolist()
-
-
 def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
     base = state.chain.gap(0) @ replace(robot, world_from_base=Rigid()).chain().gap(0).inverse()
-    found = residuals(state, measured)
-    rotation = np.zeros(0)
+    in_base, rotation = residuals(state, measured), np.zeros(0)
     if measured.data.rotations is not None:
         whole = observed(measured.data, "pose")
         rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
     good = measured[np.flatnonzero(~wrong)]
-    fitted = _derivatives(state, base, good, fit)
-    one, full = Weighting(1.0, 1.0), jacobian(state, good)
-    seeks = np.concatenate([fitted, full], axis=2)
-    in_base = found
-    if found.shape[1] == 3:
-        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
-        in_base = np.einsum("nji,nj->ni", np.array(stations), found) @ base.rotation
-    placed = _placed(state, base, residuals(state, good), fitted, fit, measured.kind != "distance")
-    return Evaluated(
-        replace(robot, world_from_base=base, tools=state.tools),
-        state,
-        in_base,
-        ~wrong,
-        rotation,
-        placed,
-        left(state, base, good, one, fitted),
-        left(state, base, good, one, seeks),
-    )
-
-
-def _derivatives(state: State, base: Rigid, measured: Observed, fit: Fit) -> np.ndarray:
-    """Returns the derivatives (r, w, k) by the base (rotation about its origin, translation) and the tools' points."""
-    parts = [np.zeros((len(measured), WIDTH[measured.kind], 0))]
-    tip = tips_of(state, measured.data)
-    if "base" in fit and measured.kind != "distance":
-        parts.append(as_seen(state, measured, tip, frame_motions(tip, base.translation)))
+    tip, parts = tips_of(state, good.data), [np.zeros((len(good), WIDTH[good.kind], 0))]
+    if "base" in fit and good.kind != "distance":
+        parts.append(as_seen(state, good, tip, frame_motions(tip, base.translation)))
     if "tool" in fit:
-        tools = (tool_motions(tip, measured.data.targets, name, measured.kind) for name in state.tools)
-        parts += [as_seen(state, measured, tip, moves) for moves in tools]
-    return np.concatenate(parts, axis=2)
+        tools = (tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools)
+        parts += [as_seen(state, good, tip, moves) for moves in tools]
+    fitted, one = np.concatenate(parts, axis=2), Weighting(1.0, 1.0)
+    seeks = np.concatenate([fitted, jacobian(state, good)], axis=2)
+    if in_base.shape[1] == 3:
+        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
+        in_base = np.einsum("nji,nj->ni", np.array(stations), in_base) @ base.rotation
+    return Evaluated(
+        robot=replace(robot, world_from_base=base, tools=state.tools),
+        state=state,
+        residuals=in_base,
+        good=~wrong,
+        rotation_rad=rotation,
+        placed=_placed(state, base, residuals(state, good), fitted, fit, good.kind != "distance"),
+        left=left(state, base, good, one, fitted),
+        beyond=left(state, base, good, one, seeks),
+    )
 
 
 def _placed(

@@ -19,8 +19,8 @@ from stcal.robot.identification.adjustment import (
     tips,
 )
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.report import Drawn, joints_figure
 from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identified_report import Drawn, joints_figure
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames, moved_chain
