@@ -48,26 +48,24 @@ def convert(
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    to_xml = out.suffix.lower() in XML
+    from_xml, to_xml = _is_xml(source), out.suffix.lower() in XML
     made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
-    if (from_link or to_link) and (made is not None or not _is_xml(source)):
+    if (from_link or to_link) and (made is not None or not from_xml):
         raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
     if made is not None:
         robot, comment = made.robot, f"From {source.name}, calibration of Universal Robots."
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", made.notes)
-    elif _is_xml(source) == to_xml:
-        raise InputError(
-            "E-OPTION-FILES",
-            f"{source}, {out}: both are {'URDF' if to_xml else 'robot files'}; one of each needed",
-        )
-    elif not to_xml:
+    elif from_xml == to_xml:
+        both = "URDF" if to_xml else "robot files"
+        raise InputError("E-OPTION-FILES", f"{source}, {out}: both are {both}; one of each needed")
+    elif from_xml:
         urdf = load_urdf(source, from_link, to_link or "", convention)
-        robot, joints = urdf.robot, ", ".join(urdf.joints)
-        comment = f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."
-        say(f"robot {robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
+        robot, way = urdf.robot, f"{urdf.from_link} to {urdf.to_link}: {', '.join(urdf.joints)}"
+        comment = f"From {source.name}, {way}."
+        say(f"robot {robot.name}: {len(urdf.joints)} joints from {way}")
         print_each(f"note: {source}", urdf.notes)
         tool = robot.tools.get("")
         if tool is not None and max(*map(abs, tool.translation.tolist()), tool.angle_rad()) > 1e-6:
@@ -80,9 +78,8 @@ def convert(
         if convention != "standard":
             raise InputError("E-OPTION-NEEDS", "--convention: only for reading a URDF; leave it out")
         robot, comment = load_robot(source), ""
-        ends = (
-            f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
-        )
+        tools = f"{len(robot.tools)} tools"
+        ends = f"flange, and {tools}" if robot.tree is None else f"{tools} on branches"
         say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
         if coupled(robot):
             say(

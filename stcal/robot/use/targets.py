@@ -14,6 +14,7 @@ from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.observability import over_ranges
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
@@ -168,32 +169,23 @@ def read_targets(
     )
 
 
-def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
-    """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
-    mass = targets.conditions.payload_kg
-    masses = [None] * len(targets) if mass is None else mass.tolist()
-    rows: dict[tuple[str, float | None], list[int]] = {}
-    for row, pair in enumerate(zip(targets.tools, masses, strict=True)):
-        rows.setdefault(pair, []).append(row)
-    return [(*pair, np.array(own)) for pair, own in rows.items()]
-
-
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
     """Returns base_from_tool of joint values (m, n), with each row's tool and load."""
-    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
-    for name, mass, rows in rows_alike(targets):
-        part = forward(robot, q[rows], name, mass)
-        rotation[rows], translation[rows] = part.rotation, part.translation
-    return Poses(rotation, translation)
+    arm = State(replace(robot, world_from_base=Rigid()).chain(), {name: robot.tool(name) for name in targets.tools})
+    return tips(arm, q, targets.tools, targets.conditions)
 
 
 def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
     """Returns joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
-    m = len(poses)
+    m, mass = len(poses), targets.conditions.payload_kg
+    alike: dict[tuple[str, float | None], list[int]] = {}
+    for row, pair in enumerate(zip(targets.tools, [None] * m if mass is None else mass.tolist(), strict=True)):
+        alike.setdefault(pair, []).append(row)
     q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
     error_mm, error_rad = np.empty(m), np.empty(m)
-    for name, mass, rows in rows_alike(targets):
-        part = inverse(robot, poses[rows], None if near is None else near[rows], name, mass)
+    for (name, kg), own in alike.items():
+        rows = np.array(own)
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name, kg)
         q[rows], status[rows] = part.q, part.status
         error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
     return Inverse(q, tuple(status), error_mm, error_rad)
@@ -284,17 +276,17 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
 
 def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
     """Yields frequent mistakes with the poses and the joint values that were meant."""
-    for unit in UNITS:
-        meant = Poses(poses.rotation, LENGTHS[unit] * poses.translation)
-        yield Candidate(f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …", partial(tuple, (meant, q)))
-    yield Candidate(INVERSE, lambda: (poses.inverse(), q))
     turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
-    yield Candidate(
-        "joint values were radians in columns of degrees; call the columns q1_rad …", lambda: (poses, turned)
-    )
-    for names, places in other_axes(poses.translation):
-        words = f"x, y, z were {names}; correct order and signs of the columns of positions"
+    meant = [(f"lengths were {UNIT_WORDS[u]}; call the columns x_{u} …", LENGTHS[u] * poses.translation) for u in UNITS]
+    meant += [
+        (f"x, y, z were {names}; correct order and signs of the columns of positions", places)
+        for names, places in other_axes(poses.translation)
+    ]
+    for words, places in meant:
         yield Candidate(words, partial(tuple, (Poses(poses.rotation, places), q)))
+    yield Candidate(INVERSE, lambda: (poses.inverse(), q))
+    radians = "joint values were radians in columns of degrees; call the columns q1_rad …"
+    yield Candidate(radians, lambda: (poses, turned))
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
@@ -335,11 +327,9 @@ def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str,
     poses = targets.poses[some]
     guesses = {f"quaternions were {each.held}; {each.remedy}": each.poses(poses) for each in READINGS}
     guesses[INVERSE] = poses.inverse()
-    for reason, meant in guesses.items():
-        # Most guesses fail at once: a pose out of reach takes a third of a second.
-        if all(
-            joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]).usable[0] for i in range(len(some))
-        ):
+    for reason, meant in guesses.items():  # most fail at once: a pose out of reach takes a third of a second
+        tried = (joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]) for i in range(len(some)))
+        if all(each.usable[0] for each in tried):
             return (
                 f"{len(lost)} of {len(inverse)} poses are out of reach; {len(some)} of {len(some)} of these that were "
                 f"tried would be within if {reason}",
