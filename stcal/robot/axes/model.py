@@ -102,21 +102,16 @@ class AxesFile(ResultFile):
     format: Literal["stcal axes 1"] = Field(description="the file's form and its version")
     robot: RobotText = Field(description="text of the robot file")
     fits: list[AxisPart] = Field(
-        description="of each joint in order, all joints at zero: `world_from_axis`, z along positive motion; "
-        "`covariance` of rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by the noise of its own sweeps; "
-        "`rms_mm` of a coordinate of the residuals, `sigma_mm` of a coordinate, `redundancy`; `span` of the joint's "
-        "values, rad or mm; reflectors of its `arcs`, their `radii` and `heights`, mm"
+        description="of each joint, all joints at zero: `world_from_axis`, z along positive motion; `covariance` of "
+        "rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by its own noise; `rms_mm` of a coordinate of the "
+        "residuals, `sigma_mm`, `redundancy`; `span`, rad or mm; reflectors of its `arcs`, `radii` and `heights`, mm"
     )
     off: list[dict[ByLine, float]] = Field(description="by joint, rows off their arcs and left out, mm")
-    covariance: Matrix = Field(
-        description="of all axes together, in the order of `fits`, with what each inherits from those before"
-    )
+    covariance: Matrix = Field(description="of all axes together, with what each inherits from those before")
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     row_sigma: Matrix = Field(description="their σ; 0: kept from the robot given")
     tools: dict[ByName, Pose] = Field(description="flange_from_target, mm")
-    tool_spread_mm: dict[ByName, float] = Field(
-        description="RMS of all rows about it: encoders, gears and elasticity are in it"
-    )
+    tool_spread_mm: dict[ByName, float] = Field(description="RMS about it: encoders, gears and elasticity are in it")
     pairs: list[Pair] = Field(
         description="`joint` (from 1) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
         "`distance_mm`, `distance_sigma_mm`: along the common normal, of near-parallel axes in the plane of their row; "
@@ -124,13 +119,9 @@ class AxesFile(ResultFile):
         'the first axis from where that was measured; `refused`: why these must not be used, or `""`'
     )
     without_one: LeaveOneOutRows = Field(
-        description="`lines` of the rows left out (with all reflectors), `distance`, `normal` of each pair without "
-        "them, mm, signed as `a`"
+        description="`lines` of the rows left out, `distance`, `normal` of each pair without them, mm, signed as `a`"
     )
-    notes: list[str] = Field(
-        description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short; columns that "
-        "were not read, angles by their convention"
-    )
+    notes: list[str] = Field(description="rows, reflectors and arcs not used, columns not read, conventions of angles")
 
 
 @one_thread()

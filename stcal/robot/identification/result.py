@@ -291,37 +291,34 @@ class IdentifiedFile(ResultFile):
     observed: str = Field(validation_alias=AliasPath("seen", "used"), description="kind of observation used")
     rank: int = Field(description="parameters determined by the data used")
     ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
-    undetermined: list[str] = Field(
-        description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
-    )
+    undetermined: list[str] = Field(description="directions kept nominal (`--partial`): `J2 y (with tool z and J1 x)`")
     notes: list[str] = Field(description="rows left out, columns not read, and remarks on the result")
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
     gain: Gain | None = Field(
-        description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
-        "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
+        description="where both were tried: RMS errors of held-out rows, `rigid_mm` and `elastic_mm`; mean by which "
+        "elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
     elasticity_sigma: ElasticityValues | None = Field(
-        description="σ of the elasticity in the robot file, a row for each joint: `compliance` (rad/Nm) about its axis "
-        "and across it, `moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
+        description="σ of the elasticity, a row for each joint: `compliance` (rad/Nm) about its axis and across it, "
+        "`moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
     )
     weighting: Weighting = Field(
-        description="σ of one coordinate, `sigma_mm`, and of one component of a rotation, `sigma_rad`, or `given` by "
-        "the rows' covariances; `factor`: σ₀ by which these are multiplied; `estimated`: which of them"
+        description="σ of a coordinate, `sigma_mm`, and of a rotation, `sigma_rad`, or `given` by covariances; "
+        "`factor`: σ₀ by which these are multiplied; `estimated`: which of them"
     )
     deviations: dict[str, float | None] = Field(
-        description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
-        "`axis_rad`, `across_rad`: of what links give way by at the usual torque, `periodic_rad`: of gears, "
-        "`hysteresis_rad`; null where it has none"
+        description="σ of this robot about nominal: `length_mm`, `twist_rad`, `zero_rad`, links by gravity `axis_rad`, "
+        "`across_rad`, gears `periodic_rad`, `hysteresis_rad`; null where it has none"
     )
     errors: dict[ByName, Figures] = Field(
         description="position errors, mm: `rows`, `mean`, `median`, `rms`, `p95`, `max` of `nominal` (base and tools "
-        "fitted), `identified`, `held_out`, `all_held_out` (were all dimensions adjusted); and the same of the "
-        "predicted `sigma` of the tool's position, and `sigma_over_ranges` of the joints, there with what is in `left`"
+        "fitted), `identified`, `held_out`, `all_held_out` (were all dimensions adjusted); and of the predicted "
+        "`sigma` of the tool's position, and `sigma_over_ranges` of the joints, with what is in `left`"
     )
     observability: ObservabilityIndices = Field(
         description="`o1` … `o5` (Borm & Menq; `o2` Driels & Pathre; `o3` Nahvi, Hollerbach & Hayward; `o4` Nahvi & "
-        "Hollerbach; `o5` Sun & Hollerbach) of the Jacobian over σ, an angle being the arc that it makes at the arm's "
-        "whole length; 1/mm, `o2` without unit; 1/`o3` is the σ in mm of the combination that is seen worst"
+        "Hollerbach; `o5` Sun & Hollerbach) of the Jacobian over σ, an angle being its arc at the arm's whole length; "
+        "1/mm, `o2` without unit"
     )
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
@@ -337,10 +334,9 @@ class IdentifiedFile(ResultFile):
     fitted_mm: Vector = Field(description="their errors")
     weights: Vector = Field(description="their weights; below a half: outliers")
     left: list[Finding] | None = Field(
-        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
-        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
-        "number of tests, `line` of the first row after a jump along their order (null: no jump), `advice`; null where "
-        "rows are too few to tell"
+        description="what the residuals go with: `what` in words, `joint` and `turns` (0: none), `effect_mm`, "
+        "`effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the number of tests, "
+        "`line` of the first row after a jump, `advice`; null where rows are too few to tell"
     )
 
 

@@ -373,20 +373,14 @@ class CompensationFile(ResultFile):
         Shape((None, 4, 4)),
         BeforeValidator(lambda poses: poses.matrix() if isinstance(poses, Poses) else poses),
     ] = Field(description="commanded base_from_tool, mm")
-    joints: list[dict[str, float] | None] = Field(
-        description="joint values to command, by column name; null where the pose is not reached"
-    )
+    joints: list[dict[str, float] | None] = Field(description="joint values by column name; null if not reached")
     found: Reached = Field(description="`status` of each pose, and what remains: `error_mm`, `error_rad`")
     nominal_joints: list[dict[str, float] | None] | None = Field(description="the same of the nominal robot")
     nominal: Reached | None = Field(description="the same of the nominal robot: `status`, `error_mm`, `error_rad`")
-    before_mm: Vector = Field(
-        description="error of the nominal joint values by the identified robot, where `nominal.status` is reached"
-    )
+    before_mm: Vector = Field(description="error of the nominal joint values by the identified robot, where reached")
     before_rad: Vector = Field(description="the same of the orientation")
     notes: list[str] = Field(
-        validation_alias="remarks",
-        description="columns that were not read, angles by their convention; doubts of targets and robots, and rows "
-        "that are not simply reached",
+        validation_alias="remarks", description="columns not read, doubts of targets and robots, rows hardly reached"
     )
 
 

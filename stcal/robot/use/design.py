@@ -47,17 +47,11 @@ class DesignFile(ResultFile):
     seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
     exchanges: int = Field(description="single poses exchanged after the greedy choice")
     chosen: ObservabilityIndices = Field(
-        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as `identify --json` has them"
+        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as of `identify`"
     )
-    random: list[ObservabilityIndices] = Field(
-        description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many poses"
-    )
-    sigma_mm: float = Field(
-        description="σ per axis of the position that the identified robot predicts, RMS over random poses"
-    )
-    random_sigma_mm: Finite = Field(
-        description="the same, median of the random sets (null where they leave parameters open)"
-    )
+    random: list[ObservabilityIndices] = Field(description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many")
+    sigma_mm: float = Field(description="σ per axis of positions that the identified robot predicts, RMS")
+    random_sigma_mm: Finite = Field(description="median of the random sets (null where they leave parameters open)")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)

@@ -144,24 +144,18 @@ class Evaluation:
         return [line for line, wrong in zip(self.lines, self.wrong, strict=True) if wrong]
 
 
+FINDING = "`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`"
+
+
 class EvaluatedRobot(Part):
     name: str
     position_mm: Figures
     good_mm: Figures
     orientation_rad: Figures | None
     placed: list[PlacedPose] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
-    left: list[Finding] | None = Field(
-        description="what the residuals go with, `what`, `joint`, `turns`, `effect_mm`, `effect_rad`, "
-        "`share`, `p`, `line`, `advice`; null where rows are too few to tell"
-    )
-    beyond: list[Finding] | None = Field(
-        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`) of "
-        "what parameters identified from these rows would leave"
-    )
-    residuals: Matrix = Field(
-        description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "
-        "distance"
-    )
+    left: list[Finding] | None = Field(description=f"what the residuals go with: {FINDING}; null of too few rows")
+    beyond: list[Finding] | None = Field(description=f"what an identification from these rows would leave: {FINDING}")
+    residuals: Matrix = Field(description="of each row: measured minus modelled position in the base, or distance, mm")
 
 
 class EvaluationFile(ResultFile):
@@ -171,9 +165,7 @@ class EvaluationFile(ResultFile):
     refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
     observed: str = Field(description="positions or distances")
     lines: list[int] = Field(description="of the data file, of each row")
-    wrong_lines: list[int] = Field(
-        description="those that no robot explains (wrong, or something all models lack); nothing was fitted to them"
-    )
+    wrong_lines: list[int] = Field(description="those that no robot explains; nothing was fitted to them")
     best: str = Field(description="the robot that is better than all others by more than chance; empty: none is")
     robots: list[EvaluatedRobot] = Field(
         description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "

@@ -104,9 +104,8 @@ class VerificationFile(ResultFile):
     distance_mm: Vector = Field(description="commanded distances of the others from it")
     sets: list[SetResult] = Field(
         description="`name`; `error_mm` measured minus commanded; `mean_mm`, `std_mm` (sample), `max_mm` of their "
-        "absolute values; `pairs_rms_mm` of the errors of all pairs, `pairs_mm` of their commanded distances (RMS); "
-        "`scale` measured over commanded distances of all pairs by least squares; `elsewhere`: the poses that alone "
-        "are not where they were commanded, in words"
+        "absolute values; `pairs_rms_mm`, `pairs_mm` RMS of errors and of commanded distances of all pairs, `scale` of "
+        "measured over commanded ones; `elsewhere`: poses that alone are not where they were commanded"
     )
     missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
     warnings: Texts = Field(description="what to look at")
