@@ -32,7 +32,7 @@ from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.prior import SHOWN
 from stcal.robot.identification.result import Figures
-from stcal.robot.identified_report import Drawn, left_lines, placed_table, residual_plot
+from stcal.robot.identified_report import left_lines, placed_table, residual_plot
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
@@ -447,7 +447,7 @@ def evaluation_report(result: Evaluation) -> Document:
         robots += [
             subheading(each.name),
             *(f"{each.name}: {line}" for line in (*left_lines(each.left), *_beyond(each))),
-            residual_plot(Drawn(each.state, seen, found, each.good, colour), each.left or ()),
+            residual_plot(each.state, seen, found, each.good, each.left or (), colour),
             page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
             page_only(placed_table(each.placed)),
         ]

@@ -46,9 +46,7 @@ class DesignFile(ResultFile):
     parameters: int = Field(description="of the robot and its tool")
     seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
     exchanges: int = Field(description="single poses exchanged after the greedy choice")
-    chosen: ObservabilityIndices = Field(
-        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as of `identify`"
-    )
+    chosen: ObservabilityIndices = Field(description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses")
     random: list[ObservabilityIndices] = Field(description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many")
     sigma_mm: float = Field(description="σ per axis of positions that the identified robot predicts, RMS")
     random_sigma_mm: Finite = Field(description="median of the random sets (null where they leave parameters open)")
