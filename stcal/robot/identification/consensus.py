@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.robust import ratio_limit
 from stcal.robot.identification.adjustment import State, linear, moved, parameter_units
-from stcal.robot.identification.problem import Problem
+from stcal.robot.identification.problem import ArmProblem
 
 SUBSETS, SEED = 1000, 0
 """Number of random subsets, and seed. With a quarter of 40 rows wrong, one in forty is clean."""
@@ -33,15 +33,15 @@ ROUNDS, SEARCHES = 6, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
+class _Linearised:
     """``white`` : (r, w) residuals over σ; ``slope`` : (r, w, k) derivatives by parameters of about 1 mm."""
 
     white: np.ndarray
     slope: np.ndarray
 
-    def of(self, rows: np.ndarray) -> "_Rows":
+    def of(self, rows: np.ndarray) -> "_Linearised":
         """Returns the problem of these rows alone."""
-        return _Rows(self.white[rows], self.slope[rows])
+        return _Linearised(self.white[rows], self.slope[rows])
 
     def solved(self, masks: np.ndarray) -> np.ndarray:
         """Returns the steps (s, k) that solve the rows of each mask (s, r)."""
@@ -68,7 +68,7 @@ class _Rows:
         return ((self.slope @ inverse) * self.slope).sum(2)
 
 
-def agreeing(problem: Problem, state: State) -> np.ndarray:
+def agreeing(problem: ArmProblem, state: State) -> np.ndarray:
     """Returns a mask (r,) of the observations that agree with a solution near ``state``, linear about it; all agree if
     too few are redundant. Their σ need only be known up to a common factor."""
     measured, weighting = problem.measured, problem.weighting
@@ -79,7 +79,7 @@ def agreeing(problem: Problem, state: State) -> np.ndarray:
         if step:
             medians = weighting.medians(weighting.whiten(errors, measured))
             weighting = weighting.with_values({n: weighting.value(n) * (value or 1.0) for n, value in medians.items()})
-        rows = _Rows(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
+        rows = _Linearised(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
         r, w, k = rows.slope.shape
         half = (r + k // w + 1) // 2 + 1
         if half >= r:
@@ -93,7 +93,7 @@ def agreeing(problem: Problem, state: State) -> np.ndarray:
     return good
 
 
-def _trimmed(problem: _Rows, half: int) -> np.ndarray:
+def _trimmed(problem: _Linearised, half: int) -> np.ndarray:
     """Returns a mask (r,) of the rows of the best half."""
     rng, count = np.random.default_rng(SEED), len(problem.white)
     rows = np.sort(rng.permutation(count)[:MOST_ROWS])
@@ -124,7 +124,7 @@ def _smallest(squares: np.ndarray, wanted: int) -> np.ndarray:
     return masks
 
 
-def _tested(problem: _Rows, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
+def _tested(problem: _Linearised, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
     """Returns the rows that fit the solution of the good rows within chance, repeated. ``half`` : number of good rows
     if they are the smallest; ``kinds`` : columns with one σ each, estimated from the good rows."""
     r, w, _ = problem.slope.shape

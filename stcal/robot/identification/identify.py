@@ -36,7 +36,7 @@ from stcal.robot.identification.observability import (
     widened,
 )
 from stcal.robot.identification.prior import NominalRows, bending, placed
-from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, Problem, Relaxation, Solution, mostly
+from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, ArmProblem, ArmSolution, Relaxation, mostly
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Gain,
@@ -189,7 +189,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 
 def _modelled(
     robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
-) -> tuple[Solution, HeldOutRows | None, Gain | None]:
+) -> tuple[ArmSolution, HeldOutRows | None, Gain | None]:
     """Returns the solution by the model asked for, or by the better one, with its held-out errors, and the gain."""
     rigid = _adjusted(first, seen, options, rows)
     if options.model == "rigid":
@@ -252,9 +252,9 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
-def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Solution:
+def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> ArmSolution:
     """Solves with the observations that agree, and estimates σ: at first by medians, which outliers do not move."""
-    problem = Problem(seen, _weighting(state, seen, options), options.robust, rows)
+    problem = ArmProblem(seen, _weighting(state, seen, options), options.robust, rows)
     good = np.ones(len(seen), bool)
     if options.robust:
         good = mostly(agreeing(problem, state))
@@ -268,7 +268,7 @@ def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: Nomi
     return _without_errors(replace(problem, weighting=weighting), state, good)
 
 
-def _without_errors(problem: Problem, state: State, good: np.ndarray, rounds: int = VARIANCE_ROUNDS) -> Solution:
+def _without_errors(problem: ArmProblem, state: State, good: np.ndarray, rounds: int = VARIANCE_ROUNDS) -> ArmSolution:
     """Solves, removes gross errors, and solves again until their set (``good`` is the first) stays the same. Huber
     weights bound an outlier's pull, but no covariance shows it."""
     for _ in range(OUTLIER_ROUNDS + 1):
@@ -283,7 +283,7 @@ def _without_errors(problem: Problem, state: State, good: np.ndarray, rounds: in
     return replace(solution, notes=(*solution.notes, note))
 
 
-def _settled(problem: Problem, state: State, rounds: int) -> Solution:
+def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
     """Solves and estimates σ in turns."""
     relaxation = Relaxation()
     for _ in range(rounds):
@@ -298,7 +298,7 @@ def _settled(problem: Problem, state: State, rounds: int) -> Solution:
     return replace(solution, problem=problem, notes=(note,) if change > VARIANCE_UNSETTLED else ())
 
 
-def _undetermined(solution: Solution, names: list[str], partial: bool) -> tuple[str, ...]:
+def _undetermined(solution: ArmSolution, names: list[str], partial: bool) -> tuple[str, ...]:
     """Returns names of the directions that the data leave open, beyond those that distances never show."""
     measured, (_, directions, determined) = solution.problem.measured, solution.spectrum()
     expected = UNSEEN[measured.kind]
@@ -323,10 +323,10 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
     tip, none = tips_of(state, data), dict.fromkeys(("covariance", "common", "distances", "from_row"))
     exact = replace(data, positions=tip.translation, rotations=tip.rotation, **none)
     seen = {kind: observed(exact, kind) for kind in get_args(Kind)}
-    return {kind: Problem(own, TYPICAL, robust=False).at(state).rank() - _place(own) for kind, own in seen.items()}
+    return {kind: ArmProblem(own, TYPICAL, robust=False).at(state).rank() - _place(own) for kind, own in seen.items()}
 
 
-def _observability(robot: Robot, solution: Solution, rank: int) -> ObservabilityIndices:
+def _observability(robot: Robot, solution: ArmSolution, rank: int) -> ObservabilityIndices:
     state, weighting, measured = solution.state, solution.problem.weighting, solution.problem.measured
     scale = parameter_scale(robot, measured.kind, state.tools)
     rows = weighting.whiten(jacobian(state, measured)[:, :, : len(scale)], measured) * scale
@@ -354,7 +354,7 @@ def _place(measured: Observed) -> int:
     return directions
 
 
-def _cross_validated(whole: Solution, options: IdentifyOptions) -> HeldOutRows | None:
+def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRows | None:
     """Returns errors of rows that took no part in the parameters, if few not in σ either; None if too few."""
     problem, measured = whole.problem, whole.problem.measured
     rows = len(measured)

@@ -99,7 +99,7 @@ def mostly(good: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class ArmProblem:
     """Observations of an arm with their σ, and what is known of the arm before.
 
     ``rows`` : its nominal dimensions, which it has to within ``deviations``; None if nothing is known; ``robust`` :
@@ -117,11 +117,11 @@ class Problem:
         """Length of an observation's whitened residual beyond which it weighs less."""
         return huber_limit(self.measured.kind) if self.robust else np.inf
 
-    def of(self, good: np.ndarray) -> "Problem":
+    def of(self, good: np.ndarray) -> "ArmProblem":
         """Returns the problem of the rows of a mask (r,) alone."""
         return self if good.all() else replace(self, measured=self.measured[good])
 
-    def scaled(self, change: np.ndarray) -> "Problem":
+    def scaled(self, change: np.ndarray) -> "ArmProblem":
         """Returns the problem after a ``change`` (p,) of the logarithms of its σ: of measurements, then dimensions."""
         assert self.rows is not None
         names = [name for name in FIELDS if name in self.weighting.estimated]
@@ -130,7 +130,7 @@ class Problem:
         sigma[np.intersect1d(self.rows.groups, np.arange(len(sigma)))] *= np.exp(change[len(names) :])
         return replace(self, weighting=self.weighting.with_values(new), deviations=Deviations(*sigma.tolist()))
 
-    def at(self, state: State) -> "Solution":
+    def at(self, state: State) -> "ArmSolution":
         """Returns the observations alone, linearised about a state."""
         errors, derivative = linear(state, self.measured)
         units = parameter_units(derivative)
@@ -141,9 +141,9 @@ class Problem:
         weighted = flat * np.repeat(weights, white.shape[1])[:, None]
         cost, normal = float(huber_cost(length, self.limit).sum()), weighted.T @ flat
         gradient, zero = -weighted.T @ white.ravel(), np.zeros_like(normal)
-        return Solution(self, state, errors, weights, normal, gradient, units, cost, zero, zero)
+        return ArmSolution(self, state, errors, weights, normal, gradient, units, cost, zero, zero)
 
-    def solve(self, state: State) -> "Solution":
+    def solve(self, state: State) -> "ArmSolution":
         """Returns the state of least cost, from a start about which priors are linear; raises ConvergenceError."""
         measured, first = self.measured, self.at(state)
         held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
@@ -195,7 +195,7 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class ArmSolution:
     """A problem linearised about a state.
 
     ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber weights; ``normal``, ``gradient`` : (k, k) normal matrix of
@@ -205,7 +205,7 @@ class Solution:
     they were estimated; ``notes`` : on iterations that did not converge.
     """
 
-    problem: Problem
+    problem: ArmProblem
     state: State
     residuals: np.ndarray
     weights: np.ndarray
@@ -246,7 +246,7 @@ class Solution:
         fixed = np.eye(len(padded)) / USELESS_MM**2 + padded @ padded.T / STAYS_MM**2
         return fixed / self.units[:, None] / self.units
 
-    def among(self, measured: Observed) -> "Solution":
+    def among(self, measured: Observed) -> "ArmSolution":
         """Returns the solution beside all observations, of which those of the problem are a part."""
         problem = replace(self.problem, measured=measured)
         errors = residuals(self.state, measured)

@@ -15,7 +15,7 @@ from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
 from stcal.robot.identification.adjustment import Kind, Observed, State, Weighting, position_errors, residuals
 from stcal.robot.identification.observability import ObservabilityIndices, Predicted
 from stcal.robot.identification.prior import Adjusted, Placed, dh_values
-from stcal.robot.identification.problem import Solution
+from stcal.robot.identification.problem import ArmSolution
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.file import WRITTEN_MM, RobotText, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
@@ -173,7 +173,7 @@ class Identified(Brief):
     robot: Robot
     nominal: Robot
     seen: Observed
-    adjustment: Solution
+    adjustment: ArmSolution
     names: tuple[str, ...]
     covariance: Array
     rank: int

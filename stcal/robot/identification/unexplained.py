@@ -89,7 +89,7 @@ def left(
     if explained is None:
         explained = jacobian(state, measured)
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
-    rows = _Rows(residuals(state, measured), weighting, measured)
+    rows = _Weighted(residuals(state, measured), weighting, measured)
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
     tests = len(candidates) + len(order)
     good = np.ones(len(rows.errors), bool) if weights is None else weights >= GROSS
@@ -109,7 +109,7 @@ def left(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
+class _Weighted:
     """Residuals (r, w) of observations, with their weights."""
 
     errors: np.ndarray
@@ -168,7 +168,7 @@ class _Rest:
     effects: list[tuple[_Effect, np.ndarray]]
 
     @classmethod
-    def of(cls, rows: _Rows, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray) -> "_Rest":
+    def of(cls, rows: _Weighted, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray) -> "_Rest":
         """Returns the residuals that the motions ``explained`` (r, w, k) leave."""
 
         def white(values: np.ndarray) -> np.ndarray:
@@ -274,7 +274,7 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     return order
 
 
-def _moved_meanwhile(rows: _Rows, order: list[_Effect], explained: np.ndarray, tests: int) -> _Found | None:
+def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarray, tests: int) -> _Found | None:
     """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
     motions = [rows.white(each.motions) for each in order]
     changes = changes_along(rows.white(rows.errors), rows.white(explained), motions)
@@ -299,7 +299,7 @@ def _moved_meanwhile(rows: _Rows, order: list[_Effect], explained: np.ndarray, t
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
     """Returns the jump or drift along the rows, of equal σ; None without one of more than ``share`` of the squares."""
-    order, rows = _order(state, measured), _Rows(residuals(state, measured), Weighting(1.0, 1.0), measured)
+    order, rows = _order(state, measured), _Weighted(residuals(state, measured), Weighting(1.0, 1.0), measured)
     found = _moved_meanwhile(rows, order, jacobian(state, measured), len(order))
     return found.finding if found is not None and found.finding.share > share else None
 

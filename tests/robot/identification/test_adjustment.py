@@ -9,7 +9,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import problem
 from stcal.robot.identification.adjustment import Weighting, jacobian, moved, observed, residuals
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.problem import Problem, huber_limit
+from stcal.robot.identification.problem import ArmProblem, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
@@ -36,7 +36,7 @@ def case():
 def test_it_ends_where_the_weighted_gradient_is_zero(case):
     """In units of its own σ, and of Huber's cost: weight times residual."""
     state, seen = case
-    found = Problem(seen, WEIGHTING).solve(state)
+    found = ArmProblem(seen, WEIGHTING).solve(state)
     white = WEIGHTING.whiten(residuals(found.state, seen), seen)
     slope = WEIGHTING.whiten(jacobian(found.state, seen), seen)
     length = np.linalg.norm(white, axis=1)
@@ -50,7 +50,7 @@ def test_it_ends_where_the_weighted_gradient_is_zero(case):
 
 def test_the_covariance_is_the_inverse_of_the_whitened_normal_matrix(case):
     state, seen = case
-    found = Problem(seen, WEIGHTING, robust=False).solve(state)
+    found = ArmProblem(seen, WEIGHTING, robust=False).solve(state)
     slope = WEIGHTING.whiten(jacobian(found.state, seen), seen).reshape(-1, len(found.units))
     sigma = np.sqrt(np.diag(found.inverse()))
     wanted = np.linalg.inv(slope.T @ slope + found.prior) / np.outer(sigma, sigma)
@@ -84,4 +84,4 @@ def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     count = jacobian(state, seen).shape[2]
     far = moved(state, np.full(count, 0.05), seen.kind)
     with fails_with("E-NO-MINIMUM … identification … 1"):
-        Problem(seen, WEIGHTING).solve(far)
+        ArmProblem(seen, WEIGHTING).solve(far)
