@@ -257,8 +257,7 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
 
     Returns
     -------
-    str
-        CSV in mm and degrees, with σ (form: ``data_layout.md``).
+    str : CSV in mm and degrees, with σ (form: ``data_layout.md``).
     """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)

@@ -377,8 +377,7 @@ def evaluated_csv(result: Evaluation) -> str:
 
     Returns
     -------
-    str
-        CSV in mm and degrees (form: ``data_layout.md``).
+    str : CSV in mm and degrees (form: ``data_layout.md``).
     """
     data, robots, seen = result.seen.data, result.robots, result.seen.first
     turned = data.rotations is not None

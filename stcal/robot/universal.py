@@ -163,13 +163,11 @@ def load_universal(
 
     Returns
     -------
-    UniversalRobot
-        ``robot``, mm and rad, from the controller's base.
+    UniversalRobot : ``robot``, mm and rad, from the controller's base.
 
     Raises
     ------
-    InputError
-        Another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
+    InputError : another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
     """
     found = read_universal(Path(path), nominal, convention)
     if found is None:

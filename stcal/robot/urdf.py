@@ -90,14 +90,12 @@ def load_urdf(
 
     Returns
     -------
-    UrdfRobot
-        Its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
+    UrdfRobot : its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
 
     Raises
     ------
-    InputError
-        Unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic others,
-        several links that may be the tool.
+    InputError : unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic
+        others, several links that may be the tool.
     """
     where = f"{WHAT} {path}"
     try:
@@ -379,13 +377,11 @@ def robot_urdf(robot: Robot) -> str:
 
     Returns
     -------
-    str
-        XML, in metres and rad; every number reads back to the same double but for the last bit.
+    str : XML, in metres and rad; every number reads back to the same double but for the last bit.
 
     Raises
     ------
-    InputError
-        An elastic robot, or a name with control characters, which XML cannot hold.
+    InputError : an elastic robot, or a name with control characters, which XML cannot hold.
     """
     for name in (robot.name, *robot.tools):
         if not name.isprintable():

@@ -278,13 +278,11 @@ def robot_from_photos(
 
     Returns
     -------
-    FromPhotos
-        All results, mm and rad, in the camera's frame.
+    FromPhotos : all results, mm and rad, in the camera's frame.
 
     Raises
     ------
-    StcalError
-        One of its subclasses, from the step that failed, with a one-line message that says what to do.
+    StcalError : one of its subclasses, from the step that failed, with a one-line message that says what to do.
     """
     # Both are read before the work, as both may be refused.
     values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)

@@ -145,18 +145,14 @@ def robot_from_sweeps(
 
     Returns
     -------
-    AxesResult
-        Axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
+    AxesResult : axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
 
     Raises
     ------
-    ConvergenceError
-        The fit of an axis reaches no minimum.
-    InputError
-        Several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of another
-        build; no orientations where they are asked for.
-    DegenerateError
-        Axes that their arcs do not determine.
+    ConvergenceError : the fit of an axis reaches no minimum.
+    InputError : several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of
+        another build; no orientations where they are asked for.
+    DegenerateError : axes that their arcs do not determine.
 
     References
     ----------

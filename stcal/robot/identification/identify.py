@@ -100,19 +100,15 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 
     Returns
     -------
-    Identified
-        The robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Its notes name
+    Identified : the robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Its notes name
         iterations of the σ that did not converge.
 
     Raises
     ------
-    ConvergenceError
-        The adjustment reaches no minimum.
-    DegenerateError
-        A joint or a target never moved, too few observations, or directions that the data do not determine (kept
-        nominal with ``partial``).
-    InputError
-        The nominal robot does not fit the data.
+    ConvergenceError : the adjustment reaches no minimum.
+    DegenerateError : a joint or a target never moved, too few observations, or directions that the data do not
+        determine (kept nominal with ``partial``).
+    InputError : the nominal robot does not fit the data.
 
     References
     ----------

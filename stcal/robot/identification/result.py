@@ -57,9 +57,8 @@ class IdentifyOptions:
 
     Raises
     ------
-    InputError
-        A choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two
-        folds.
+    InputError : a choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer
+        than two folds.
     """
 
     observe: Kind | None = None

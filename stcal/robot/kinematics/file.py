@@ -122,14 +122,12 @@ def load_robot(path: str | Path) -> Robot:
 
     Returns
     -------
-    Robot
-        Lengths in mm, angles in rad.
+    Robot : lengths in mm, angles in rad.
 
     Raises
     ------
-    InputError
-        Unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix that does
-        not fit, quaternions that are not unit; the message names the file and the place.
+    InputError : unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix
+        that does not fit, quaternions that are not unit; the message names the file and the place.
     """
     if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
         raise InputError(
@@ -222,8 +220,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 
     Returns
     -------
-    str
-        TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    str : TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
     """
     lines = [f"# {comment}" for comment in comments]
     lines += [
@@ -301,8 +298,7 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
 
     Raises
     ------
-    InputError
-        It cannot be written.
+    InputError : it cannot be written.
     """
     save(Path(path), robot_toml(robot, comments))
     require_robot_written(path, robot)

@@ -30,13 +30,11 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
     Returns
     -------
-    Poses
-        m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
+    Poses : m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
 
     Raises
     ------
-    InputError
-        Joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
+    InputError : joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
     values = _joint_vectors(q, robot)
     return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
@@ -58,8 +56,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
     Raises
     ------
-    InputError
-        Joint values of another shape or not finite; an unknown tool.
+    InputError : joint values of another shape or not finite; an unknown tool.
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)

@@ -113,14 +113,12 @@ def inverse(
 
     Returns
     -------
-    Inverse
-        Joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
+    Inverse : joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
 
     Raises
     ------
-    InputError
-        ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown tool;
-        a mass that no arm carries.
+    InputError : ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown
+        tool; a mass that no arm carries.
 
     References
     ----------
@@ -157,13 +155,11 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
 
     Returns
     -------
-    Inverse
-        Joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
+    Inverse : joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
 
     Raises
     ------
-    InputError
-        The arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
+    InputError : the arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
     problem = InverseProblem.of(robot, tool)
     problem.refuse_redundant()

@@ -63,8 +63,7 @@ class Measurements(Brief):
 
     Raises
     ------
-    InputError
-        Arrays of other shapes, or with values that are not finite.
+    InputError : arrays of other shapes, or with values that are not finite.
     """
 
     where: str
@@ -119,8 +118,7 @@ class Measurements(Brief):
 
         Raises
         ------
-        InputError
-            Neither positions nor poses, or arrays of other shapes.
+        InputError : neither positions nor poses, or arrays of other shapes.
         """
         if poses is not None:
             positions, rotations = poses.translation, poses.rotation
@@ -216,14 +214,12 @@ def read_measurements(
 
     Returns
     -------
-    Measurements
-        In the instrument's frame; mm, rad.
+    Measurements : in the instrument's frame; mm, rad.
 
     Raises
     ------
-    InputError
-        Missing columns, bad rows, joint values of another unit or number than the robot's, angles whose convention is
-        open, masses that no arm carries; the message names the line.
+    InputError : missing columns, bad rows, joint values of another unit or number than the robot's, angles whose
+        convention is open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     joints = len(robot.rows)

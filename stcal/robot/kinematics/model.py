@@ -51,8 +51,7 @@ class DHRow:
 
     Raises
     ------
-    InputError
-        A value that is no finite number.
+    InputError : a value that is no finite number.
 
     References
     ----------
@@ -91,8 +90,7 @@ class Joint:
 
     Raises
     ------
-    InputError
-        Another type, limits that are swapped or no numbers, a dimension that no row has.
+    InputError : another type, limits that are swapped or no numbers, a dimension that no row has.
     """
 
     type: JointType = "revolute"
@@ -141,8 +139,7 @@ class Elasticity:
 
     Raises
     ------
-    InputError
-        Arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
+    InputError : arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
     """
 
     compliance: np.ndarray
@@ -233,9 +230,8 @@ class Robot(Brief):
 
     Raises
     ------
-    InputError
-        Another convention; rows and joints of other types, or of different numbers, or none; lengths that are not mm; a
-        coupling matrix of another shape, or a singular one; elasticity of another number of joints.
+    InputError : another convention; rows and joints of other types, or of different numbers, or none; lengths that are
+        not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
     """
 
     name: str
@@ -299,13 +295,11 @@ class Robot(Brief):
 
         Raises
         ------
-        InputError
-            Arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        InputError : arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
 
         Warns
         -----
-        InputNote
-            Limits of many turns, which seem to be degrees.
+        InputNote : limits of many turns, which seem to be degrees.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):

@@ -169,15 +169,13 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
 
     Returns
     -------
-    Compensated
-        Joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of reach raise
-        no error.
+    Compensated : joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of
+        reach raise no error.
 
     Raises
     ------
-    InputError
-        Joint values without poses need the nominal robot; robots of different joints, or too far apart to be one; an
-        unknown tool; poses to which their joint values lead in another unit or convention only.
+    InputError : joint values without poses need the nominal robot; robots of different joints, or too far apart to be
+        one; an unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if isinstance(targets, Poses):
         targets = Targets.from_poses(targets)
@@ -330,8 +328,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
 
     Returns
     -------
-    str
-        CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    str : CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
     columns = joint_columns(robot)
     names = result.targets.names

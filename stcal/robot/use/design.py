@@ -145,15 +145,12 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 
     Returns
     -------
-    PoseDesign
-        Joint vectors with their poses base_from_tool, and their observability beside random ones.
+    PoseDesign : joint vectors with their poses base_from_tool, and their observability beside random ones.
 
     Raises
     ------
-    InputError
-        A prismatic joint without limits, or no poses in the box.
-    DegenerateError
-        So few poses that the parameters cannot be determined.
+    InputError : a prismatic joint without limits, or no poses in the box.
+    DegenerateError : so few poses that the parameters cannot be determined.
 
     References
     ----------
@@ -299,8 +296,7 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
     Returns
     -------
-    str
-        CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
+    str : CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
     """
     rows: list[Sequence] = [["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)]]
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):

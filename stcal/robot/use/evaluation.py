@@ -194,10 +194,8 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Raises
     ------
-    InputError
-        A robot of other joints, or that does not fit the data; a tool that it does not have.
-    DegenerateError
-        Too few rows for what is fitted, or positions that do not show it.
+    InputError : a robot of other joints, or that does not fit the data; a tool that it does not have.
+    DegenerateError : too few rows for what is fitted, or positions that do not show it.
     """
     fit: Fit = frozenset(part for part in ("base", "tool") if part in refit.split("-"))
     named = {name: replace(robot, name=name) for name, robot in robots.items()}

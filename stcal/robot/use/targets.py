@@ -120,14 +120,12 @@ def read_targets(
 
     Returns
     -------
-    Targets
-        base_from_tool, mm; joint values, rad or mm.
+    Targets : base_from_tool, mm; joint values, rad or mm.
 
     Raises
     ------
-    InputError
-        Neither poses nor joint values, positions without orientation, angles whose convention is open, bad rows, masses
-        that no arm carries; the message names the line.
+    InputError : neither poses nor joint values, positions without orientation, angles whose convention is open, bad
+        rows, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)

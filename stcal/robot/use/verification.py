@@ -209,13 +209,11 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
 
     Returns
     -------
-    MeasuredPoses
-        Positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
+    MeasuredPoses : positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
 
     Raises
     ------
-    InputError
-        Missing columns, bad rows, or a pose twice in one set; the message names the line.
+    InputError : missing columns, bad rows, or a pose twice in one set; the message names the line.
     """
     table = read_table(path, WHAT)
     commanded, measured = table.points("commanded_"), table.points()
@@ -257,13 +255,11 @@ def verify(data: MeasuredPoses) -> Verification:
 
     Returns
     -------
-    Verification
-        Mean, standard deviation and maximum of each set's distance errors, mm.
+    Verification : mean, standard deviation and maximum of each set's distance errors, mm.
 
     Raises
     ------
-    InputError
-        Fewer than three poses in common, or one pose commanded to different places.
+    InputError : fewer than three poses in common, or one pose commanded to different places.
     """
     rows: dict[str, dict[str, int]] = {}
     for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
