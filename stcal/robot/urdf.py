@@ -18,7 +18,7 @@ from stcal.io.table import pose_values
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
-from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
+from stcal.robot.kinematics.model import Chain, Convention, DHRow, Joint, JointType, Robot, Tree
 
 WHAT = "URDF"
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
@@ -216,8 +216,9 @@ def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
         carriers[tool], tools[tool] = last, passed
     joints, n = tuple(_limited(joint) for joint in moving), len(moving)
     bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=Tree(mounts, carriers))
-    placed, grown = Poses.of(gaps), Grown(Tree(mounts, carriers), (Rigid(),) * n)
-    chain = Chain(placed.rotation, placed.translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
+    placed = Poses.of(gaps)
+    branches = bare.tree, (Rigid(),) * n
+    chain = Chain(placed.rotation, placed.translation, Rigid(), bare.prismatic, np.eye(n), None, *branches)
     robot, q = robot_from_chain(chain, tools, bare), fixed_values(n)
     for tool, pose in tools.items():
         require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
@@ -413,14 +414,12 @@ def robot_urdf(robot: Robot) -> str:
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
             shown = {end: repr(float(value)) for end, value in ends.items()}
             ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-    if chain.grown is None:
+    if chain.tree is None:
         _fixed(root, f"link_{len(chain)}", FLANGE, chain.last_from_flange)
     for name, tool in robot.tools.items():
-        if chain.grown is None:
-            _fixed(root, FLANGE, link_of(name), tool)
-        else:
-            carrier = chain.carrier(name)
-            _fixed(root, f"link_{carrier + 1}", link_of(name), chain.grown.ends[carrier] @ tool)
+        carrier = chain.carrier(name)
+        at = (FLANGE, tool) if chain.tree is None else (f"link_{carrier + 1}", chain.end(carrier) @ tool)
+        _fixed(root, at[0], link_of(name), at[1])
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 

@@ -14,6 +14,7 @@ from stcal.robot.kinematics.forward import (
     carried_poses,
     chain_jacobian,
     chain_parameters,
+    elasticity_curvature,
     elasticity_jacobian,
     elasticity_values,
     moved_chain,
@@ -149,6 +150,14 @@ def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
     return _beside(state, tip, measured), as_seen(state, measured, tip, full)
 
 
+def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
+    """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` times the model."""
+    tip, data = tips_of(state, measured.data), measured.data
+    moves = as_seen(state, measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
+    pulls = np.einsum("rw,rwk->rk", pull, moves)
+    return elasticity_curvature(state.chain, data.q, tip, data.targets, pulls, data.conditions)
+
+
 def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
     """Returns the effect (r, 6 or 3 or 1, k), in the station's axes, of motions (m, 6, k) of the tools, rad over mm."""
     if len(state.stations) > 1:
@@ -203,7 +212,7 @@ def tip_jacobian(
     """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by all parameters, rad over mm."""
     tip = tips(state, q, targets, conditions)
     axes_part = chain_jacobian(state.chain, q, tip, conditions)
-    if state.chain.grown is not None:
+    if state.chain.tree is not None:
         joint = [i for i, _ in chain_parameters(state.chain)]
         axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
     parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in state.tools)]

@@ -94,7 +94,7 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     n = len(chain)
     carrier = [chain.after(i) for i in range(n)]
     last = sorted(set(range(n)) - set(carrier))
-    ends = {i: chain.last_from_flange if chain.grown is None else chain.grown.ends[i] for i in last}
+    ends = {i: chain.end(i) for i in last}
     longest, above = _longest(chain, ends)
     length_m = 1e-3 * max(longest, 1.0)
     share = above - 0.5

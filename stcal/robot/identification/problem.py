@@ -29,17 +29,15 @@ from stcal.robot.identification.adjustment import (
     Observed,
     State,
     Weighting,
-    as_seen,
+    curvature,
     jacobian,
     linear,
     moved,
     parameter_names,
     parameter_units,
     residuals,
-    tips_of,
 )
 from stcal.robot.identification.prior import ACROSS, AXIS, DOUBT, MOMENT, Deviations, NominalRows
-from stcal.robot.kinematics.forward import elasticity_curvature
 
 MAX_STEPS = 100
 SETTLED = 1e-10
@@ -260,10 +258,7 @@ class ArmSolution:
         if not state.elastic or measured.kind == "distance":
             return None
         white = self.weights[:, None] * weighting.whiten(self.residuals, measured)
-        tip, data = tips_of(state, measured.data), measured.data
-        moves = as_seen(state, measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
-        pulls = np.einsum("rw,rwk->rk", weighting.pull(white, measured), moves)
-        elastic = elasticity_curvature(state.chain, data.q, tip, data.targets, pulls, data.conditions)
+        elastic = curvature(state, measured, weighting.pull(white, measured))
         k, count = len(self.units), state.elastic_count
         taken = np.zeros((k, k))
         place = slice(k - count, k - count + len(elastic))

@@ -78,7 +78,6 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
         return nominal_end.inverse() @ passed[i]
 
-    ends = [chain.last_from_flange] * n if chain.grown is None else chain.grown.ends
     base, tree = begin(0), nominal.tree
     if tree is not None:
         before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
@@ -87,7 +86,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal,
         rows=tuple(rows),
         world_from_base=base,
-        tools={name: end(k := chain.carrier(name)) @ ends[k] @ tool for name, tool in tools.items()},
+        tools={name: end(k := chain.carrier(name)) @ chain.end(k) @ tool for name, tool in tools.items()},
         elasticity=None,
         tree=tree,
     )

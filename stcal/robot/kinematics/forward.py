@@ -88,7 +88,7 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
 
 def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
     """Returns world_from_flange of joint vectors (m, n), for the flange that carries each row's target."""
-    if chain.grown is None:
+    if chain.tree is None:
         return flange_poses(chain, q, conditions)
     carrier = np.array([chain.carrier(name) for name in targets])
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
@@ -146,7 +146,7 @@ def torques(
 
 def _loaded(chain: Chain) -> int:
     """Returns the joint that carries the payload."""
-    if chain.grown is not None and "" not in chain.grown.tree.carriers:
+    if chain.tree is not None and "" not in chain.tree.carriers:
         raise InputError(
             "E-ROBOT-TREE",
             "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
@@ -213,7 +213,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.grown is not None:
+        if chain.tree is not None:
             moved[i] = axes, origin
     return axes, origin
 

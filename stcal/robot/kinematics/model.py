@@ -370,8 +370,8 @@ class Robot(Brief):
             centre = ends[end] @ elasticity.payload_centre
             gravity = first.rotation.T @ elasticity.gravity
             elasticity = replace(elasticity, gravity=gravity, payload_centre=centre, pivot=np.zeros_like(pivots))
-        grown = None if self.tree is None else Grown(self.tree, tuple(ends))
-        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
+        branches = self.tree, () if self.tree is None else tuple(ends)
+        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, *branches)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
         """Returns the joint, from 0, that carries another (−1: the base), and the start of the other's row after
@@ -391,22 +391,14 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grown:
-    """A tree of joints; ``ends`` : (n,) end of each joint's row in its frame; ``flange_joint`` : ends at the flange."""
-
-    tree: Tree
-    ends: tuple[Rigid, ...]
-    flange_joint: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Chain:
     """The fixed transforms of an arm, which are all that calibration changes.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
     first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
     ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
-    frame; ``elasticity`` : deflection of the links; ``grown`` : the tree, if joints form one.
+    frame; ``elasticity`` : deflection of the links; ``tree`` : if joints form one, with the ``ends`` (n,) of its rows,
+    each in its joint's frame; ``flange_joint`` : whose end is the flange.
     """
 
     rotation: np.ndarray
@@ -415,7 +407,9 @@ class Chain:
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
-    grown: Grown | None = None
+    tree: Tree | None = None
+    ends: tuple[Rigid, ...] = ()
+    flange_joint: int | None = None
 
     def __post_init__(self):
         n = len(self.prismatic)
@@ -433,18 +427,22 @@ class Chain:
 
     def after(self, i: int) -> int:
         """The joint that carries joint ``i``; −1 for the world."""
-        return i - 1 if self.grown is None else self.grown.tree.after(i)
+        return i - 1 if self.tree is None else self.tree.after(i)
+
+    def end(self, i: int) -> Rigid:
+        """End of the row of joint ``i`` in its frame; of a serial arm the flange."""
+        return self.last_from_flange if self.tree is None else self.ends[i]
 
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
         last = len(self) - 1
-        return last if self.grown is None else self.grown.tree.carrier(target, last)
+        return last if self.tree is None else self.tree.carrier(target, last)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
-        if self.grown is None:
+        if self.tree is None:
             return np.ones((len(self), len(targets)), bool)
-        found = {name: np.isin(np.arange(len(self)), self.grown.tree.path(self.carrier(name))) for name in set(targets)}
+        found = {name: np.isin(np.arange(len(self)), self.tree.path(self.carrier(name))) for name in set(targets)}
         return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
 
     def behind(self) -> np.ndarray:
@@ -469,19 +467,19 @@ class Chain:
 
     def branch(self, carrier: int) -> "Chain":
         """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, and bend it."""
-        if self.grown is None:
+        if self.tree is None:
             return self
-        return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))
+        return replace(self, last_from_flange=self.ends[carrier], flange_joint=carrier)
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
-        if self.grown is None:
+        if self.tree is None:
             return tuple(range(len(self)))
-        if self.grown.flange_joint is None:
+        if self.flange_joint is None:
             raise InputError(
                 "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
             )
-        return self.grown.tree.path(self.grown.flange_joint)
+        return self.tree.path(self.flange_joint)
 
 
 def about_z(angle: float) -> np.ndarray:
