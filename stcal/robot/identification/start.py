@@ -265,12 +265,14 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
         _any_zero(robot, thinned, tools),
         _pairs(robot, thinned),
     )
-    cases = (
-        Candidate(f"{what}; {cure}" if what else "", partial(tuple, (variant, guess)), size)
-        for size, level in enumerate(levels)
-        for what, cure, variant, guess in level
-    )
-    found = explain(cases, lambda case: _fitting(case, tools)[0], min(EXPLAINS * misfit / extent, FITS))
+    most, found = min(EXPLAINS * misfit / extent, FITS), []
+    for level in levels:  # one after the other: what a level tries may be impossible where an earlier one explains
+        cases = (
+            Candidate(f"{what}; {cure}" if what else "", partial(tuple, (variant, guess)))
+            for what, cure, variant, guess in level
+        )
+        if found := explain(cases, lambda case: _fitting(case, tools)[0], most):
+            break
     words = []
     for each, _ in found[:MOST_NAMED]:
         far = _not_there(each.change()[1], _fitting(each.change(), tools)[1])
