@@ -30,7 +30,7 @@ from stcal.register.transforms import MODELS, problem_of
 from stcal.register.workspace import residual_field
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.inverse import InverseProblem, solve
+from stcal.robot.kinematics.inverse import InverseProblem
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import made
@@ -84,7 +84,7 @@ class Cell:
         """Random places in the cube, without noise."""
         a = MIDDLE + rng.uniform(-side / 2, side / 2, (count, 3))
         poses = Poses(Rotation.from_rotvec(rng.uniform(-tilt, tilt, (count, 3))).as_matrix() @ DOWN, a)
-        q = solve(InverseProblem.of(self.drawn), poses, np.tile(NEAR, (count, 1)))
+        q = InverseProblem.of(self.drawn).solve(poses, np.tile(NEAR, (count, 1)))
         off = np.abs(forward(self.drawn, q).translation - a).max()
         if off > 1e-6:
             raise DegenerateError("E-NO-MINIMUM", f"inverse kinematics: {off:.2g} mm from a place of the cube")

@@ -23,8 +23,8 @@ from stcal.parallel import one_thread
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements

@@ -29,9 +29,9 @@ from scripts.runner import options_of
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80

@@ -35,8 +35,8 @@ from stcal.geometry.rigid import Poses, skew
 from stcal.handeye.solving import handeye
 from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import read_measurements
 from stcal.sfm import measure, pipeline

@@ -20,8 +20,8 @@ from scripts.runner import options_of
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80

@@ -13,8 +13,8 @@ import numpy as np
 from same_results import prepare
 
 from scripts.runner import options_of
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import read_measurements
 

@@ -29,8 +29,8 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.liu2017 import affine_least_squares
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward

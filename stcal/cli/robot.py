@@ -48,26 +48,24 @@ def convert(
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    to_xml = out.suffix.lower() in XML
+    from_xml, to_xml = _is_xml(source), out.suffix.lower() in XML
     made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
-    if (from_link or to_link) and (made is not None or not _is_xml(source)):
+    if (from_link or to_link) and (made is not None or not from_xml):
         raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
     if made is not None:
         robot, comment = made.robot, f"From {source.name}, calibration of Universal Robots."
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", made.notes)
-    elif _is_xml(source) == to_xml:
-        raise InputError(
-            "E-OPTION-FILES",
-            f"{source}, {out}: both are {'URDF' if to_xml else 'robot files'}; one of each needed",
-        )
-    elif not to_xml:
+    elif from_xml == to_xml:
+        both = "URDF" if to_xml else "robot files"
+        raise InputError("E-OPTION-FILES", f"{source}, {out}: both are {both}; one of each needed")
+    elif from_xml:
         urdf = load_urdf(source, from_link, to_link or "", convention)
-        robot, joints = urdf.robot, ", ".join(urdf.joints)
-        comment = f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."
-        say(f"robot {robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
+        robot, way = urdf.robot, f"{urdf.from_link} to {urdf.to_link}: {', '.join(urdf.joints)}"
+        comment = f"From {source.name}, {way}."
+        say(f"robot {robot.name}: {len(urdf.joints)} joints from {way}")
         print_each(f"note: {source}", urdf.notes)
         tool = robot.tools.get("")
         if tool is not None and max(*map(abs, tool.translation.tolist()), tool.angle_rad()) > 1e-6:
@@ -80,9 +78,8 @@ def convert(
         if convention != "standard":
             raise InputError("E-OPTION-NEEDS", "--convention: only for reading a URDF; leave it out")
         robot, comment = load_robot(source), ""
-        ends = (
-            f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
-        )
+        tools = f"{len(robot.tools)} tools"
+        ends = f"flange, and {tools}" if robot.tree is None else f"{tools} on branches"
         say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
         if coupled(robot):
             say(
@@ -160,8 +157,8 @@ def axes(
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot import load_robot, read_measurements, robot_from_sweeps
     from stcal.robot.axes.model import AxesFile
-    from stcal.robot.axes.report import axes_report
     from stcal.robot.axes.sweeps import ring
+    from stcal.robot.robot_report import axes_report
 
     nominal = load_robot(robot_file)
     source = joined.table(sweeps, "SWEEPS")
@@ -244,8 +241,8 @@ def identify(
     from stcal.robot import IdentifyOptions, load_robot, offsets_csv, read_measurements, robot_toml
     from stcal.robot import identify as identified_from
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.report import identified_report
     from stcal.robot.identification.result import IdentifiedFile, require_identified_written
+    from stcal.robot.identified_report import identified_report
 
     nominal = load_robot(robot_file)
     source = joined.table(data_file, "DATA", quaternions=quaternions)
@@ -286,7 +283,7 @@ def evaluate(
     """Compare robot files on new measurements, and tell what their residuals depend on."""
     from stcal.robot import evaluate as evaluated
     from stcal.robot import load_robot, read_measurements
-    from stcal.robot.use import report as shown
+    from stcal.robot import robot_report as shown
     from stcal.robot.use.evaluation import EvaluationFile
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
@@ -320,8 +317,8 @@ def verify(
 ) -> None:
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
+    from stcal.robot.robot_report import verification_figure, verification_report
     from stcal.robot.use import verification
-    from stcal.robot.use.report import verification_figure, verification_report
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
@@ -356,8 +353,8 @@ def compensate(
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
     from stcal.robot import load_robot, read_targets
+    from stcal.robot.robot_report import compensation_report
     from stcal.robot.use import compensation
-    from stcal.robot.use.report import compensation_report
 
     identified = load_robot(robot_file)
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
@@ -392,8 +389,8 @@ def design(
 ) -> None:
     """Choose the measurement poses that determine the robot's parameters best."""
     from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.robot_report import design_report
     from stcal.robot.use import design as pose_design
-    from stcal.robot.use.report import design_report
 
     options = pose_design.DesignOptions(
         count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target

@@ -1,8 +1,8 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
-from .identification.report import offsets_csv as offsets_csv
+from .identification.identify import identify as identify
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
-from .identification.solve import identify as identify
+from .identified_report import offsets_csv as offsets_csv
 from .kinematics.file import load_robot as load_robot
 from .kinematics.file import robot_toml as robot_toml
 from .kinematics.file import save_robot as save_robot
@@ -15,6 +15,7 @@ from .kinematics.measurements import read_measurements as read_measurements
 from .kinematics.model import DHRow as DHRow
 from .kinematics.model import Joint as Joint
 from .kinematics.model import Robot as Robot
+from .robot_report import evaluated_csv as evaluated_csv
 from .universal import load_universal as load_universal
 from .urdf import UrdfRobot as UrdfRobot
 from .urdf import load_urdf as load_urdf
@@ -26,7 +27,6 @@ from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
 from .use.design import design_csv as design_csv
 from .use.evaluation import evaluate as evaluate
-from .use.report import evaluated_csv as evaluated_csv
 from .use.targets import Targets as Targets
 from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured

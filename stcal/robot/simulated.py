@@ -16,8 +16,7 @@ from stcal.robot.kinematics.model import Robot
 
 
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:
-    """Returns the robot as made: every axis shifted and tilted, and every zero position off, by normal errors of these
-    σ."""
+    """Returns the robot as made: axes shifted and tilted, zero positions off, by normal errors of these σ."""
     chain = robot.chain()
     kinds = chain_parameters(chain)
     step = np.array([rng.normal(0, sigma_rad if c < 3 else sigma_mm) for _, c in kinds])
@@ -29,8 +28,7 @@ def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_ra
 
 
 def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:
-    """Returns joint vectors (count, n) over the middle ``share`` of each joint's range (± 1 rad or 100 mm of 0 where
-    unlimited)."""
+    """Returns joint vectors (count, n) over a share of each range (± 1 rad or 100 mm where unlimited)."""
     low, high = robot.limits().T
     free = np.where(robot.prismatic, 100.0, 1.0)
     low, high = np.where(np.isfinite(low), low, -free), np.where(np.isfinite(high), high, free)

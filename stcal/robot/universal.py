@@ -1,14 +1,14 @@
 """Calibration of an arm of Universal Robots: YAML of ur_calibration (ROS), and the controller's calibration.conf."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import yaml
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
@@ -43,19 +43,8 @@ class _Link(Strict):
     yaw: Number
 
 
-class _Kinematics(Strict):
-    # The hash of the robot stands among the links.
-    model_config = ConfigDict(extra="ignore", frozen=True)
-    shoulder: _Link
-    upper_arm: _Link
-    forearm: _Link
-    wrist_1: _Link
-    wrist_2: _Link
-    wrist_3: _Link
-
-
 class _File(Strict):
-    kinematics: _Kinematics
+    kinematics: dict[str, _Link]
 
 
 def kinematics_content(text: str) -> Mapping | None:
@@ -76,7 +65,7 @@ def is_conf(text: str) -> bool:
 
 def robot_of_kinematics(content: Mapping, where: str, convention: Convention) -> tuple[Robot, float]:
     """Returns the arm of ur_calibration's YAML, and by how far (mm) a URDF with the same numbers is off at joint values
-    of 0. Roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed ones. The base is the controller's; ROS's
+    of 0: roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed ones. The base is the controller's; ROS's
     base_link is rotated by half a turn about Z. Raises InputError naming the link."""
     held = content["kinematics"]
     missing = [name for name in LINKS if name not in held] if isinstance(held, Mapping) else []
@@ -86,18 +75,20 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
             f"{where}: kinematics without {', '.join(missing)}; an arm of Universal Robots has six links, "
             f"{', '.join(LINKS)}: extract its calibration anew with ur_calibration, or copy the whole file",
         )
+    if isinstance(held, Mapping):  # the hash of the robot stands among the links
+        content = {**content, "kinematics": {name: held[name] for name in LINKS}}
     links = validated(content, _File, where).kinematics
-    chains = []
-    for turned in (lambda angles: Rotation.from_euler("XYZ", angles).as_matrix(), from_roll_pitch_yaw):
+
+    def chain(turned: Callable[[list[float]], np.ndarray]) -> list[UrdfJoint]:
         joints = []
-        for parent, name in zip(("base", *LINKS), LINKS, strict=False):
-            link = getattr(links, name)
+        for parent, (name, link) in zip(("base", *LINKS), links.items(), strict=False):
             pose = Rigid(turned([link.roll, link.pitch, link.yaw]), METRE_MM * np.array([link.x, link.y, link.z]))
             joints.append(UrdfJoint(name, "continuous", parent, name, pose, np.array([0.0, 0.0, 1.0]), None, ""))
-        chains.append(joints)
-    moving, fixed = (product(chain).translation for chain in chains)
-    off = float(np.linalg.norm(moving - fixed))
-    return robot_of({"": chains[0]}, NAME, convention), off
+        return joints
+
+    moving = chain(lambda angles: Rotation.from_euler("XYZ", angles).as_matrix())
+    off = np.linalg.norm(product(moving).translation - product(chain(from_roll_pitch_yaw)).translation)
+    return robot_of({"": moving}, NAME, convention), float(off)
 
 
 def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> Robot:
@@ -109,10 +100,11 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
     deltas = {name: unit * _six(lists, f"delta_{name}", where) for name, unit in DELTAS.items()}
+    joints = (Joint(),) * JOINTS if nominal is None else nominal.joints
     if all(name in lists for name in ("a", "d", "alpha")):
         a, d, alpha = (_six(lists, name, where) for name in ("a", "d", "alpha"))
-        rows = [DHRow(METRE_MM * a[i], alpha[i], METRE_MM * d[i], 0.0) for i in range(JOINTS)]
-        base, tools, name = Rigid(), {"": Rigid()}, NAME
+        rows = tuple(DHRow(METRE_MM * a[i], alpha[i], METRE_MM * d[i], 0.0) for i in range(JOINTS))
+        arm = Robot(NAME, "standard", rows, joints, unusual_size=True)
     elif nominal is None:
         raise InputError(
             "E-ROBOT-NOMINAL",
@@ -126,18 +118,17 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
             "standard, needed",
         )
     else:
-        rows, base, tools, name = list(nominal.rows), nominal.world_from_base, nominal.tools, nominal.name
+        arm = nominal
     corrected = tuple(
         replace(row, **{name: getattr(row, name) + float(delta[i]) for name, delta in deltas.items()})
-        for i, row in enumerate(rows)
+        for i, row in enumerate(arm.rows)
     )
-    joints = nominal.joints if nominal is not None else (Joint(),) * JOINTS
-    controller = Robot(name, "standard", corrected, joints, tools=tools)
-    found = robot_between(controller.chain(), tools, name, convention, joints)
+    controller = Robot(arm.name, "standard", corrected, joints, tools=arm.tools)
+    found = robot_between(controller.chain(), arm.tools, arm.name, convention, joints)
     q = fixed_values(JOINTS)
-    for tool in tools:
+    for tool in arm.tools:
         require_near(found.world_from_base @ forward(found, q, tool), forward(controller, q, tool))
-    return replace(found, world_from_base=base @ found.world_from_base)
+    return replace(found, world_from_base=arm.world_from_base @ found.world_from_base)
 
 
 def _six(lists: Mapping[str, str], key: str, where: str) -> np.ndarray:
@@ -166,22 +157,17 @@ def load_universal(
 
     Parameters
     ----------
-    path : str or Path
-        The file.
-    nominal : Robot or path, optional
-        The arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
-    convention : {"standard", "modified"}
-        Convention of the rows of Denavit and Hartenberg.
+    path : the file.
+    nominal : the arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
+    convention : convention of the rows of Denavit and Hartenberg.
 
     Returns
     -------
-    UniversalRobot
-        ``robot``, mm and rad, from the controller's base.
+    UniversalRobot : ``robot``, mm and rad, from the controller's base.
 
     Raises
     ------
-    InputError
-        Another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
+    InputError : another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
     """
     found = read_universal(Path(path), nominal, convention)
     if found is None:

@@ -18,7 +18,7 @@ from stcal.io.table import pose_values
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
-from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
+from stcal.robot.kinematics.model import Chain, Convention, DHRow, Joint, JointType, Robot, Tree
 
 WHAT = "URDF"
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
@@ -30,13 +30,18 @@ PLACED_BY = {"origin": ("xyz", "rpy"), "axis": ("xyz",)}
 MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
+SAME_MM, SAME_RAD = 1e-9, 1e-12
+"""Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
+
+
 def link_of(tool: str) -> str:
-    """Name of a tool's link."""
+    """Returns the name of a tool's link."""
     return f"{TOOL}_{tool}" if tool else TOOL
 
 
-SAME_MM, SAME_RAD = 1e-9, 1e-12
-"""Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
+def few(names: Sequence[str], most: int = 12) -> str:
+    """Returns the first names of many, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -76,27 +81,21 @@ def load_urdf(
 
     Parameters
     ----------
-    path : str or Path
-        URDF; a xacro file must be expanded before.
-    from_link : str
-        The base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint, this link
-        is the base, and the joint where it stands.
-    to_link : str or sequence of str
-        The tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
+    path : URDF; a xacro file must be expanded before.
+    from_link : the base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint,
+        this link is the base, and the joint where it stands.
+    to_link : the tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
         ``tool_NAME`` as :func:`robot_urdf` writes them. Several are tools called like the links, on branches of a tree.
-    convention : {"standard", "modified"}
-        Of the Denavit–Hartenberg rows.
+    convention : of the Denavit–Hartenberg rows.
 
     Returns
     -------
-    UrdfRobot
-        Its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
+    UrdfRobot : its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
 
     Raises
     ------
-    InputError
-        Unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic others,
-        several links that may be the tool.
+    InputError : unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic
+        others, several links that may be the tool.
     """
     where = f"{WHAT} {path}"
     try:
@@ -114,7 +113,7 @@ def load_urdf(
     given = [to_link] if isinstance(to_link, str) else list(to_link)
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
-            raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {_few(links)}")
+            raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {few(links)}")
     farthest = max(joints.values(), key=_far, default=None)
     if farthest is not None and _far(farthest) > MOST_LINK_MM:
         raise InputError(
@@ -163,14 +162,9 @@ def _require_chain(path: list[UrdfJoint], start: str, end: str, where: str) -> N
             "E-URDF-LINKS", f"{where}: no joint from {start} to {end} moves; other --from-link or --to-link needed"
         )
     for joint in moving:
-        if joint.kind not in MOVING:
-            raise InputError(
-                "E-URDF-JOINT", f"{where}: joint {joint.name} is {joint.kind}; fixed, {', '.join(MOVING)} are read"
-            )
-        if joint.mimics:
-            raise InputError(
-                "E-URDF-JOINT", f"{where}: joint {joint.name} mimics {joint.mimics}; joints of their own needed"
-            )
+        known = f"is {joint.kind}; fixed, {', '.join(MOVING)} are read" if joint.kind not in MOVING else ""
+        if reason := known or (f"mimics {joint.mimics}; joints of their own needed" if joint.mimics else ""):
+            raise InputError("E-URDF-JOINT", f"{where}: joint {joint.name} {reason}")
 
 
 def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
@@ -222,8 +216,9 @@ def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
         carriers[tool], tools[tool] = last, passed
     joints, n = tuple(_limited(joint) for joint in moving), len(moving)
     bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=Tree(mounts, carriers))
-    placed, grown = Poses.of(gaps), Grown(Tree(mounts, carriers), (Rigid(),) * n)
-    chain = Chain(placed.rotation, placed.translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
+    placed = Poses.of(gaps)
+    branches = bare.tree, (Rigid(),) * n
+    chain = Chain(placed.rotation, placed.translation, Rigid(), bare.prismatic, np.eye(n), None, *branches)
     robot, q = robot_from_chain(chain, tools, bare), fixed_values(n)
     for tool, pose in tools.items():
         require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
@@ -350,28 +345,24 @@ def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, st
     if not branches and TOOL0 in ends:
         return {"": TOOL0}
     every = [link for link in joints if link not in below] if branches else ends
-    raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
+    raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {few(every)}")
 
 
 def _path(joints: dict[str, UrdfJoint], start: str, end: str, where: str) -> list[UrdfJoint]:
-    found: list[UrdfJoint] = []
+    path: list[UrdfJoint] = []
     while end != start:
-        if end not in joints or len(found) > len(joints):
+        if end not in joints or len(path) > len(joints):
             raise InputError(
                 "E-URDF-LINKS",
                 f"{where}: no joints lead from link {start} to the tool; other --from-link, --to-link needed",
             )
-        found.append(joints[end])
-        end = joints[end].parent
-    return found[::-1]
+        path.insert(0, joints[end])
+        end = path[0].parent
+    return path
 
 
 def _far(joint: UrdfJoint) -> float:
     return float(np.linalg.norm(joint.parent_from_child.translation))
-
-
-def _few(names: list[str], most: int = 12) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def robot_urdf(robot: Robot) -> str:
@@ -383,18 +374,15 @@ def robot_urdf(robot: Robot) -> str:
 
     Parameters
     ----------
-    robot : Robot
-        What to write.
+    robot : what to write.
 
     Returns
     -------
-    str
-        XML, in metres and rad; every number reads back to the same double but for the last bit.
+    str : XML, in metres and rad; every number reads back to the same double but for the last bit.
 
     Raises
     ------
-    InputError
-        An elastic robot, or a name with control characters, which XML cannot hold.
+    InputError : an elastic robot, or a name with control characters, which XML cannot hold.
     """
     for name in (robot.name, *robot.tools):
         if not name.isprintable():
@@ -426,14 +414,12 @@ def robot_urdf(robot: Robot) -> str:
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
             shown = {end: repr(float(value)) for end, value in ends.items()}
             ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-    if chain.grown is None:
+    if chain.tree is None:
         _fixed(root, f"link_{len(chain)}", FLANGE, chain.last_from_flange)
     for name, tool in robot.tools.items():
-        if chain.grown is None:
-            _fixed(root, FLANGE, link_of(name), tool)
-        else:
-            carrier = chain.carrier(name)
-            _fixed(root, f"link_{carrier + 1}", link_of(name), chain.grown.ends[carrier] @ tool)
+        carrier = chain.carrier(name)
+        at = (FLANGE, tool) if chain.tree is None else (f"link_{carrier + 1}", chain.end(carrier) @ tool)
+        _fixed(root, at[0], link_of(name), at[1])
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 

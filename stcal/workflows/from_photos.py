@@ -42,15 +42,13 @@ from stcal.robot import (
     robot_toml,
 )
 from stcal.robot.axes.model import AxesFile, AxesResult
-from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.identification.observability import predicted_at
-from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
+from stcal.robot.identified_report import identified_report
 from stcal.robot.kinematics.file import require_robot_written
 from stcal.robot.kinematics.measurements import joint_values, targets_of
+from stcal.robot.robot_report import axes_report, compensation_report
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
-from stcal.robot.use.report import compensation_report
 from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.measure_images import MeasureOptions, MeasureResult, measure
 from stcal.sfm.measurement.pose_report import (
@@ -98,7 +96,7 @@ class FromPhotos:
         compensated, sigma = self.compensated, self.identified.predicted
         if compensated is None or sigma is None:
             return np.zeros(0)
-        at = predicted_at(sigma, self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
+        at = sigma.at(self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
         return np.where(compensated.found.usable, at, np.nan)
 
     def moves(self) -> np.ndarray:
@@ -266,38 +264,25 @@ def robot_from_photos(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of the photographs, and of folders of them.
-    camera : Camera
-        The camera that took them, or its file.
-    target : TargetCircles
-        The calibrated target, of :func:`stcal.sfm.read_target` or ``RunResult.circles()``.
-    design : TargetDesign
-        Its design.
-    joints : str or Path
-        Table of joint values with a column ``key`` that names the photograph of each row (CSV).
-    nominal : Robot
-        The arm as drawn, mm and rad; the model by which the controller commands it.
-    targets : str, Path or Table, optional
-        Poses or joint values to compensate.
-    board : BoardDesign, optional
-        The board whose dots are to be told apart, if it is in view.
-    key : str
-        Name of the column of photographs.
-    measure_options, options : MeasureOptions, IdentifyOptions
-        Options of measuring and of identifying; the defaults if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : folder of the photographs, and of folders of them.
+    camera : the camera that took them, or its file.
+    target : the calibrated target, of :func:`stcal.sfm.read_target` or ``RunResult.circles()``.
+    design : its design.
+    joints : table of joint values with a column ``key`` that names the photograph of each row (CSV).
+    nominal : the arm as drawn, mm and rad; the model by which the controller commands it.
+    targets : poses or joint values to compensate.
+    board : the board whose dots are to be told apart, if it is in view.
+    key : name of the column of photographs.
+    measure_options, options : options of measuring and of identifying; the defaults if None.
+    progress : called with (stage, done, total).
 
     Returns
     -------
-    FromPhotos
-        All results, mm and rad, in the camera's frame.
+    FromPhotos : all results, mm and rad, in the camera's frame.
 
     Raises
     ------
-    StcalError
-        One of its subclasses, from the step that failed, with a one-line message that says what to do.
+    StcalError : one of its subclasses, from the step that failed, with a one-line message that says what to do.
     """
     # Both are read before the work, as both may be refused.
     values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)

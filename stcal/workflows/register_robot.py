@@ -22,8 +22,8 @@ from stcal.register.registration_report import error_table, matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.robot.identification.adjustment import State, tips
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import read_conditions
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
 from stcal.robot.kinematics.model import Robot

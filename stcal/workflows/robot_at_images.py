@@ -68,13 +68,9 @@ class RobotPoses:
         rows, missing = self.rows(names)
         if rows or (matches := partners(self.images, names)) is None:
             return rows, missing, ""
-        pairs, description = matches
-        used = {i for i, _ in pairs}
-        return (
-            {names[j]: i for i, j in pairs},
-            tuple(n for i, n in enumerate(self.images) if i not in used),
-            description,
-        )
+        rows = {names[j]: i for i, j in matches[0]}
+        used = set(rows.values())
+        return rows, tuple(name for i, name in enumerate(self.images) if i not in used), matches[1]
 
     def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
         """Returns the row of each of ``names`` that has one, and the images of rows that are not among them. Names may
@@ -175,37 +171,34 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         return AtImages(robot)
     if not robot.timed and any(stem_of(name) != name for name in robot.images):  # poses of images by their names
         return AtImages(robot)
-    if not timing.offset and all(time in samples for time in images.values()):
-        rows = {name: samples.index(time) for name, time in images.items()}
-        if not len(images) < len(samples) == len(set(samples)):
+    seen, times = list(images), [time for time in samples if time is not None]
+    if not timing.offset and all(time in times for time in images.values()):
+        rows = {name: times.index(time) for name, time in images.items()}
+        if not len(images) < len(times) == len(set(times)):
             return AtImages(_of_rows(robot, rows))
-        stream = Stream.of([time for time in samples if time is not None], robot.base_from_flange, robot.file)
+        stream = Stream.of(times, robot.base_from_flange, robot.file)
         seconds = stream.after_origin(list(images.values())).tolist()
-        return AtImages(_of_rows(robot, rows), (), stream, dict(zip(images, seconds, strict=True)))
-    times = [time for time in samples if time is not None]
+        return AtImages(_of_rows(robot, rows), (), stream, dict(zip(seen, seconds, strict=True)))
     stream = Stream.of(times, robot.base_from_flange, robot.file)
-    image_names = list(images)
-    seconds = stream.after_origin([images[name] for name in image_names])
+    seconds = stream.after_origin(list(images.values()))
     interpolated = taken_at(stream, seconds, timing.tolerance_s)
     if not interpolated.kept.any():
-        raise InputError(
-            "E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {image_names[0]}: {interpolated.why[0]}"
-        )
-    names_kept = [image_names[i] for i in np.flatnonzero(interpolated.kept)]
+        raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {seen[0]}: {interpolated.why[0]}")
+    kept = tuple(seen[i] for i in np.flatnonzero(interpolated.kept))
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
     robot_then = replace(
         robot,
-        images=tuple(names_kept),
+        images=kept,
         base_from_flange=interpolated.base_from_flange,
         covariance=None,
-        places=tuple(f"time of {name}" for name in names_kept),
+        places=tuple(f"time of {name}" for name in kept),
         understood=f"{robot.understood}{note}; {interpolated.said}",
         own=False,
         timed=False,
     )
-    left_out = [(name, why) for name, why in zip(image_names, interpolated.why, strict=True) if why]
+    left_out = [(name, why) for name, why in zip(seen, interpolated.why, strict=True) if why]
     left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
-    return AtImages(robot_then, tuple(left_out), stream, dict(zip(image_names, seconds.tolist(), strict=True)))
+    return AtImages(robot_then, tuple(left_out), stream, dict(zip(seen, seconds.tolist(), strict=True)))
 
 
 def _of_rows(robot: RobotPoses, rows: dict[str, int]) -> RobotPoses:
@@ -257,11 +250,10 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
     if images is None:
         raise InputError(
             "E-IMAGE-NAME-TIME",
-            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); "
-            "name images by "
-            "seconds (1689.25.png), or give --image-times",
+            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); name "
+            "images by seconds (1689.25.png), or give --image-times",
         )
-    if samples is None or not isinstance(samples, list) or None in samples:
+    if not isinstance(samples, list) or None in samples:
         first = f", but {robot.images[0]} …" if robot.images else ""
         raise InputError(
             "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.report import HEAD, offsets_csv, zeros
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
+from stcal.robot.identified_report import HEAD, offsets_csv, zeros
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed

@@ -1,5 +1,4 @@
-"""Relations of consecutive axes, and whether a row of them can be used; checks of measured axes against the nominal
-robot, leave-one-out, and remarks on sweeps."""
+"""Relations of consecutive axes, checks of measured axes against the nominal robot, leave-one-out, and remarks."""
 
 from dataclasses import dataclass
 from itertools import chain, combinations, pairwise
@@ -8,7 +7,7 @@ import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, refit_axis, unwound_by
+from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, unwound_by
 from stcal.robot.axes.sweeps import called
 from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.unexplained import moved_meanwhile
@@ -27,7 +26,7 @@ EXACTLY = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Pair:
-    """Two consecutive axes, ``joint`` (from 0) and the next; mm, rad; None along prismatic joints.
+    """Two consecutive axes, ``joint`` (from 1) and the next; mm, rad; None along prismatic joints.
 
     ``angle_rad`` : between the axes; ``distance_mm`` : of the next axis from this one, for near-parallel pairs in the
     plane across this axis that the robot's rows define, else along the common normal; ``parallel`` : the rows have
@@ -113,7 +112,7 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
         )  # of the angle's vector; of exactly parallel axes its largest
         variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
         pair = Pair(
-            joint=i,
+            joint=i + 1,
             angle_rad=np.pi - acute if opposed else acute,
             angle_sigma_rad=float(np.sqrt(max(variance, 0))),
             parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
@@ -143,20 +142,17 @@ def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) ->
 
 
 LIKELY, MANY = 2.0, 4
-"""Factor by which a mirror may fit worse than reversed joints and is preferred all the same, and number of reversed
-joints from which on they are not tried. A mirror explains all joints at once, and arms are symmetric."""
+"""Factor by which a mirror may fit worse than reversed joints, and number of these from which on they are not tried."""
 LIKE_SIZE = 2.0
 """Largest ratio of the distances between axes to the nominal ones, or of these to them; wrong units differ by more."""
 AGREES_RAD = np.radians(10.0)
-"""Largest difference of axes and joint zeros from a nominal robot; beyond it the robot is another one, or counts
-otherwise."""
+"""Largest difference of axes and joint zeros from a nominal robot that is the same, and counts alike."""
 MOVED_SHARE = 0.5
 """Share of the squared residuals beyond which a move along the order of the rows is named."""
 
 
 def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns cosines, moments and triple products of directed axes, which no motion changes, and their signs after a
-    mirror."""
+    """Returns cosines, moments and triple products of directed axes, and their signs after a mirror."""
     size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
     values, mirrored = [], []
     for i, k in combinations(range(len(z)), 2):
@@ -191,12 +187,10 @@ def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> Non
     shape, _ = _shape(wanted, origin[:, 0], nominal.prismatic)
     values, mirror = _shape(directions, places, nominal.prismatic)
     as_it_is, mirrored = (float(np.linalg.norm(v - shape)) for v in (values, values * mirror))
-    reversed_ = {}
+    every, reversed_ = np.arange(len(frames)), {}
     for flipped in chain.from_iterable(combinations(range(len(frames)), k) for k in range(1, MANY)):
-        sign = np.where(np.isin(np.arange(len(frames)), flipped), -1.0, 1.0)
-        reversed_[flipped] = float(
-            np.linalg.norm(_shape(directions * sign[:, None], places, nominal.prismatic)[0] - shape)
-        )
+        sign = np.where(np.isin(every, flipped), -1.0, 1.0)[:, None]
+        reversed_[flipped] = np.linalg.norm(_shape(directions * sign, places, nominal.prismatic)[0] - shape)
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
         raise InputError(
@@ -245,37 +239,40 @@ def off_mm(fit: AxisFit) -> dict[int, float]:
     return dict(sorted(distances.items(), key=lambda item: -item[1]))
 
 
-def _outliers_said(data: Measurements, fit: AxisFit) -> list[str]:
-    """Returns a line for each of a few outliers, or one line for all of many."""
-    off_arc, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
-    if len(off_arc) > FEW:
-        first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
-        return [
-            f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; "
-            f"the farthest are lines {first}; all are in --json"
-        ]
-    return [
-        f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint {fit.joint + 1}, "
-        f"{limit}"
-        for row, size in off_arc.items()
-    ]
-
-
-def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
-    """Returns remarks on the fitted axes and the robot that they make."""
+def remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
+    """Returns remarks on the axes, their robot, and moves between the rows ``measured``, ``data`` with virtual ones."""
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
         for fit in fits
         if not fit.settled
     ]
     for fit in fits:
-        notes += _outliers_said(data, fit)
-        for arc in fit.near:
+        off_arc, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
+        if len(off_arc) > FEW:
+            first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
             notes.append(
-                f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint "
-                f"{fit.joint + 1} to tell of it; its arc is not used"
+                f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, "
+                f"{limit}; the farthest are lines {first}; all are in --json"
             )
-    notes += _alone(data, fits)
+            off_arc = {}
+        notes += [
+            f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
+            f"{fit.joint + 1}, {limit}"
+            for row, size in off_arc.items()
+        ]
+        notes += [
+            f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint {fit.joint + 1} to "
+            "tell of it; its arc is not used"
+            for arc in fit.near
+        ]
+    swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
+    for name in dict.fromkeys(each for each in data.targets if each not in swept):
+        rows = [i for i, target in enumerate(data.targets) if target == name]
+        what = called(name) if name else "rows without a target, beside rows with one"
+        notes.append(
+            f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on the "
+            "flange rests on these rows alone; name it like the others, or leave it out"
+        )
     for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
         after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
         one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
@@ -284,33 +281,13 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
                 f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
                 "file: its zero position differs"
             )
-    return notes
-
-
-def of_order(data: Measurements, robot: Robot) -> list[str]:
-    """Returns a note if instrument, base or reflector moved between two rows, or a joint lost its zero. Gear errors
-    vary with the order of rows too: a move is named only if it explains most of the residuals."""
-    moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(data, "position"), MOVED_SHARE)
-    return [] if moved is None else [moved.sentence()]
-
-
-def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:
-    """Returns notes on reflectors that are on no arc."""
-    swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
-    notes = []
-    for name in dict.fromkeys(each for each in data.targets if each not in swept):
-        rows = [i for i, target in enumerate(data.targets) if target == name]
-        what = called(name) if name else "rows without a target, beside rows with one"
-        notes.append(
-            f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on the "
-            f"flange rests on these rows alone; name it like the others, or leave it out"
-        )
-    return notes
+    # Gear errors vary with the order of rows too: a move is named only if it explains most of the residuals.
+    moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(measured, "position"), MOVED_SHARE)
+    return notes if moved is None else [*notes, moved.sentence()]
 
 
 REFITTED = 200
-"""Largest number of rows of the sweeps for which each is left out by a new fit; of more rows each is left out by
-influence. For 600 rows the spread is 1 to 4 % less so."""
+"""Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -334,50 +311,42 @@ def leave_one_out(
     data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
 ) -> LeaveOneOut:
     """Returns the values without each row; what comes after a changed axis is unwound and fitted again."""
-    kinematic = data.q @ nominal.coupling.T
+    kinematic, sliding = data.q @ nominal.coupling.T, nominal.prismatic.tolist()
     start = [np.array(data.points())]
     for j, fit in enumerate(fits):
-        start.append(unwound_by(fit.world_from_axis, start[-1], kinematic[:, j], bool(nominal.prismatic[j]))[1])
+        start.append(unwound_by(fit.world_from_axis, start[-1], kinematic[:, j], sliding[j])[1])
+
+    def refitted(rows: list[int]) -> np.ndarray:
+        """Returns the values (n − 1, 6) without these rows; nan if the remaining rows determine no axis."""
+        first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
+        frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
+        try:
+            for j in range(first, len(fits)):
+                frames.append(fits[j].without(points, rows))
+                points = unwound_by(frames[j], points, kinematic[:, j], sliding[j])[1]
+            return pair_values(frames, nominal).reshape(-1, 6)
+        except (DegenerateError, ConvergenceError):
+            return np.full((len(fits) - 1, 6), np.nan)
+
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in _instants(data) if np.isin(rows, used).any()]
     if len(instants) > REFITTED:
-        values = _by_influence(instants, fits, start, passed, nominal)
+        values = _by_influence(instants, fits, passed, nominal)
     else:
-        values = np.array([_refitted(rows, fits, start, kinematic, nominal) for rows in instants])
+        values = np.array([refitted(rows) for rows in instants])
     lines = tuple(int(data.lines[rows[0]]) for rows in instants)
     return LeaveOneOut(lines, values[:, :, 3], values[:, :, 4])
 
 
-def _refitted(
-    rows: list[int], fits: list[AxisFit], start: list[np.ndarray], kinematic: np.ndarray, nominal: Robot
-) -> np.ndarray:
-    """Returns the values (n − 1, 6) of the pairs without these rows; nan if the remaining rows determine no axis."""
-    first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
-    frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
-    try:
-        for j in range(first, len(fits)):
-            frames.append(refit_axis(fits[j], points, np.array(rows)))
-            points = unwound_by(frames[j], points, kinematic[:, j], bool(nominal.prismatic[j]))[1]
-        return pair_values(frames, nominal).reshape(-1, 6)
-    except (DegenerateError, ConvergenceError):
-        return np.full((len(fits) - 1, 6), np.nan)
-
-
 def _by_influence(
-    instants: list[list[int]],
-    fits: list[AxisFit],
-    start: list[np.ndarray],
-    passed: list[list[np.ndarray]],
-    nominal: Robot,
+    instants: list[list[int]], fits: list[AxisFit], passed: list[list[np.ndarray]], nominal: Robot
 ) -> np.ndarray:
     """Returns the pairs' values (r, n − 1, 6) without each instant's rows, to first order (Cook & Weisberg 1982)."""
-    number = np.zeros(len(start[0]), int)
-    for i, rows in enumerate(instants):
-        number[rows] = i
+    number = {row: i for i, rows in enumerate(instants) for row in rows}
     changes = []
-    for fit, points, derivatives in zip(fits, start, passed, strict=False):
+    for fit, derivatives in zip(fits, passed, strict=True):
         change = np.zeros((len(instants), len(fit.gain)))
-        np.add.at(change, number[fit.rows], fit.influence(points[fit.rows]))
+        np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
         for before, derivative in zip(changes, derivatives, strict=True):
             change += before @ derivative.T
         changes.append(change)

@@ -1,6 +1,8 @@
 """Fits the axis of a joint to positions and orientations of a target along sweeps, with full turns unwound."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,8 +27,7 @@ STANDS_STILL_MM = 1.0
 WEAK_RAD = 0.02
 """σ of a direction beyond which an axis is not known; its covariance is valid for small angles only."""
 MOTION = np.radians(2.0)
-"""Largest difference of the observed motion from the joint's values; for a sliding joint also the largest share of its
-way. Joints, gears and zero positions are true to hundredths of this."""
+"""Largest difference of the observed motion from the joint's values, or share of a sliding joint's way."""
 LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
 """Share of the largest arc below which residuals are too small to hide a gross error that bent the first axis."""
@@ -36,38 +37,104 @@ WEIGHTS_SETTLED = 1e-3
 SINGULAR, TINY = 1e-10, 1e-300
 """Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
 FIRST_SIZE = 0.05
-"""Size of an arc, as a share of the largest one, from which on it is used for the first axis and σ, by which the
-smaller arcs are judged."""
+"""Size of an arc, as a share of the largest, from which on it is used for the first axis."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class AxisFit:
-    """The axis of one joint.
+    """The axis of one joint, by the distances of its arcs' points from circles or lines; p is 4 or, prismatic, 2.
 
-    ``world_from_axis`` : z of this frame is the joint's positive direction; the origin lies on the axis, at the foot of
-    the measured points' centroid; ``arcs``, ``radii``, ``heights`` : of the arcs used, (a,) mm, heights above the
-    origin (nan for a prismatic joint); ``near`` : arcs too close to the axis to be used; ``rows`` : (k,) rows used, one
-    for each point of each arc; ``residuals`` : (k, 2) mm, radial and axial (across the line for a prismatic joint);
-    ``weights`` : (k,), 0 for gross errors; ``gain`` : (p, k, 3) derivative of the axis by the points, where p is 4 (rx,
-    ry rad, tx, ty mm in the axis's own frame) or 2 (rx, ry); ``sigma_mm`` : σ of one coordinate; ``redundancy`` :
-    number of redundant measured numbers; ``span`` : range of the joint's values, rad or mm; ``settled`` : whether the
+    ``where`` : the joint, for messages; ``world_from_axis`` : z of this frame is the joint's positive direction; the
+    origin lies on the axis, at the foot of the measured points' centroid; ``arcs`` : those used; ``near`` : arcs too
+    close to the axis to be used; ``rows``, ``points`` : (k,), (k, 3) mm of each point of each arc, with the joints
+    before this one unwound; ``member`` : (k, a) one-hot, the arc of each point; ``size`` : of the largest arc, mm;
+    ``weights`` : (k,), 0 for gross errors; ``span`` : range of the joint's values, rad or mm; ``settled`` : whether the
     robust weights converged.
     """
 
-    joint: int
-    world_from_axis: Rigid
+    where: str
+    prismatic: bool
     arcs: tuple[Arc, ...]
-    radii: np.ndarray
-    heights: np.ndarray
-    near: tuple[Arc, ...]
     rows: np.ndarray
-    residuals: np.ndarray
+    points: np.ndarray
+    member: np.ndarray
+    size: float
     weights: np.ndarray
-    gain: np.ndarray
-    sigma_mm: float
-    redundancy: int
-    span: float
-    settled: bool
+    world_from_axis: Rigid
+    near: tuple[Arc, ...] = ()
+    span: float = np.nan
+    settled: bool = False
+
+    @classmethod
+    def of(cls, points: np.ndarray, arcs: Sequence[Arc], prismatic: bool, where: str, start: Rigid) -> "AxisFit":
+        """Returns the fit at its start: points (m, 3) of all rows, of equal weights."""
+        rows = np.concatenate([arc.rows for arc in arcs])
+        member = np.zeros((len(rows), len(arcs)))
+        member[np.arange(len(rows)), np.repeat(np.arange(len(arcs)), [len(arc.rows) for arc in arcs])] = 1
+        return cls(
+            where=where,
+            prismatic=prismatic,
+            arcs=tuple(arcs),
+            rows=rows,
+            points=points[rows],
+            member=member,
+            size=max(_spread(points[arc.rows]) for arc in arcs),
+            weights=np.ones(len(rows)),
+            world_from_axis=start,
+        )
+
+    @property
+    def joint(self) -> int:
+        """Number of the joint, from 0."""
+        return self.arcs[0].joint
+
+    @cached_property
+    def local(self) -> np.ndarray:
+        """The points (k, 3) in the axis's frame."""
+        return (self.points - self.world_from_axis.translation) @ self.world_from_axis.rotation
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """Values (k, 2) that are constant along an arc: radius and height, or the place across a line."""
+        if self.prismatic:
+            return self.local[:, :2]
+        return np.column_stack([np.hypot(self.local[:, 0], self.local[:, 1]), self.local[:, 2]])
+
+    @cached_property
+    def means(self) -> np.ndarray:
+        """Weighted means (2, a) of the values by arc."""
+        weighted = self.member * self.weights[:, None]
+        return (self.values.T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
+
+    @property
+    def radii(self) -> np.ndarray:
+        """Radii (a,) of the arcs, mm; nan for a prismatic joint."""
+        return self.means[0] * (np.nan if self.prismatic else 1.0)
+
+    @property
+    def heights(self) -> np.ndarray:
+        """Heights (a,) of the arcs above the origin, mm; nan for a prismatic joint."""
+        return self.means[1] * (np.nan if self.prismatic else 1.0)
+
+    @cached_property
+    def residuals(self) -> np.ndarray:
+        """Residuals (k, 2) mm, radial and axial (across the line for a prismatic joint)."""
+        return self.demean(self.values)
+
+    @property
+    def redundancy(self) -> int:
+        """Number of redundant measured numbers."""
+        return self._redundancy(self.weights)
+
+    @cached_property
+    def sigma_mm(self) -> float:
+        """σ of one coordinate, mm."""
+        return float(np.sqrt((self.weights[:, None] * self.residuals**2).sum() / max(self.redundancy, 1)))
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """Derivative (p, k, 3) of the axis (rx, ry rad, tx, ty mm in its own frame) by the points."""
+        return np.einsum("pkv,kvc->pkc", self._inverse(), self._by_points())
 
     @property
     def covariance(self) -> np.ndarray:
@@ -84,117 +151,65 @@ class AxisFit:
         """RMS of a coordinate of the residuals of the points used, mm."""
         return rms(self.lengths()) / float(np.sqrt(2))
 
-    def influence(self, points: np.ndarray) -> np.ndarray:
-        """Returns the change (k, p) of the axis, linear, without each of the fitted ``points`` (k, 3), mm."""
-        axes, prismatic = self.world_from_axis.rotation, len(self.gain) == 2
-        across = np.broadcast_to(axes.T[:2], (len(points), 2, 3)).copy()
-        if not prismatic:
-            local = (points - self.world_from_axis.translation) @ axes
-            outward = local[:, :2] / np.maximum(np.linalg.norm(local[:, :2], axis=1), TINY)[:, None]
-            across[:, 0], across[:, 1] = outward @ axes[:, :2].T, axes[:, 2]
-        step = np.einsum("pkc,kvc->kpv", self.gain, across)  # derivative of the axis by the residuals
-        weight = np.maximum(self.weights, TINY)
-        normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
-        lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
-        counts = [len(arc.rows) for arc in self.arcs]
-        sums = np.add.reduceat(self.weights, np.cumsum([0, *counts[:-1]]))
-        lever += (self.weights / np.maximum(np.repeat(sums, counts), TINY))[:, None, None] * np.eye(2)
-        without = np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None])
-        return -(step @ without)[:, :, 0]
-
     def lengths(self) -> np.ndarray:
         """Returns the lengths (k',) of the residuals of the points used, mm."""
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
 
+    def influence(self) -> np.ndarray:
+        """Returns the change (k, p) of the axis, linear, without each of its points."""
+        step = np.einsum("pkc,kvc->kpv", self.gain, self._by_points())  # derivative of the axis by the residuals
+        weight = np.maximum(self.weights, TINY)
+        normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
+        lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
+        sums = self.member @ (self.weights @ self.member)
+        lever += (self.weights / np.maximum(sums, TINY))[:, None, None] * np.eye(2)
+        without = np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None])
+        return -(step @ without)[:, :, 0]
 
-def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
-    """Returns the axis of a joint by robust least squares of the distances of its arcs' points to their circles or
-    lines.
+    def without(self, points: np.ndarray, left_out: Sequence[int]) -> Rigid:
+        """Returns world_from_axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
+        weights = np.where(np.isin(self.rows, left_out), 0.0, self.weights)
+        return replace(self, points=points[self.rows], weights=weights)._descended().world_from_axis
 
-    ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
-    this joint; ``where`` : the joint, for messages.
+    def demean(self, values: np.ndarray) -> np.ndarray:
+        """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
+        weighted = self.member * self.weights[:, None]
+        means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
+        return values - self.member @ means
 
-    Raises DegenerateError: no redundancy, reflectors on the axis, or arcs too short to give a direction. Raises
-    InputError: the motion observed about the axis is not that of the joint's values.
-    """
-    size = np.array([_spread(points[arc.rows]) for arc in arcs])
-    if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
-        raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(where, size.max()))
-    use = list(np.flatnonzero(size >= FIRST_SIZE * size.max()))
-    fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where)
-    fit.solve(moved)
-    if not prismatic:
-        small = [i for i in range(len(arcs)) if i not in use]
-        added = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
-        if added:
-            use = sorted(use + added)
-            fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where, fit.frame)
-            fit.solve(moved)
-    fit.orient(moved)
-    return fit.result(moved, tuple(arc for i, arc in enumerate(arcs) if i not in use))
+    def radius_of(self, points: np.ndarray) -> float:
+        """Returns the mean distance of ``points`` from the axis."""
+        local = (points - self.world_from_axis.translation) @ self.world_from_axis.rotation
+        return float(np.hypot(local[:, 0], local[:, 1]).mean())
 
-
-def refit_axis(fit: AxisFit, points: np.ndarray, left_out: np.ndarray) -> Rigid:
-    """Returns world_from_axis from moved points, without the rows ``left_out``; the weights of the fit are kept."""
-    again = _AxisFitting(points, list(fit.arcs), fit.gain.shape[0] == 2, f"joint {fit.joint + 1}", fit.world_from_axis)
-    again.weights = np.where(np.isin(fit.rows, left_out), 0.0, fit.weights)
-    again.descend()
-    return again.frame
-
-
-def _spread(points: np.ndarray) -> float:
-    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
-
-
-def _on_axis(where: str, spread: float) -> str:
-    return (
-        f"{where}: all reflectors stay within {spread:.3g} mm of one place while it moves, so close to its axis that "
-        "they say nothing about it; put a reflector off the axis"
-    )
-
-
-class _AxisFitting:
-    """A fit in progress: the frame of the axis and the weights change, the points stay."""
-
-    def __init__(self, points: np.ndarray, arcs: list[Arc], prismatic: bool, where: str, frame: Rigid | None = None):
-        self.arcs, self.prismatic, self.where = arcs, prismatic, where
-        self.frame, self.started, self.settled = frame or Rigid(), frame is not None, False
-        self.rows = np.concatenate([arc.rows for arc in arcs])
-        self.points = points[self.rows]
-        self.member = np.zeros((len(self.rows), len(arcs)))  # (k, a) one-hot
-        self.member[np.arange(len(self.rows)), np.repeat(np.arange(len(arcs)), [len(a.rows) for a in arcs])] = 1
-        self.weights = np.ones(len(self.rows))
-        self.size = max(_spread(points[arc.rows]) for arc in arcs)
-        self.floor = ROUNDING * max(np.abs(self.points).max(), self.size)
-
-    def solve(self, moved: np.ndarray) -> None:
-        """Starts, iterates with Huber weights, and leaves out gross errors until nothing changes; ``moved`` : (m,)
-        values of the joint."""
-        if self.redundancy() < 1:
+    def solved(self, moved: np.ndarray, starts: bool = True) -> "AxisFit":
+        """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint;
+        ``starts`` : the axis is not known yet."""
+        if self.redundancy < 1:
             raise DegenerateError(
                 "E-AXES-FEW",
                 f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
                 "position or a second reflector needed",
             )
-        if not self.started:
-            self.start(moved[self.rows])
-            self.weights = self.huber()  # before the first step, which a gross error would lead astray
+        fit = self._started(moved[self.rows]) if starts else self
+        if starts:
+            fit = replace(fit, weights=fit._huber())  # before the first step, which a gross error would lead astray
         for gross in (np.inf, GROSS):
             for _ in range(REWEIGHTINGS):
-                self.descend()
-                length = np.linalg.norm(self.residuals(), axis=1)
-                new = np.where(length > gross * self.robust_sigma(length), 0.0, self.huber())
-                new = new if self.redundancy(new) > 0 else self.huber()
-                changed = np.abs(new - self.weights).max()
-                self.weights = new
-                self.settled = bool(changed < WEIGHTS_SETTLED)
-                if self.settled:
+                fit = fit._descended()
+                length = np.linalg.norm(fit.residuals, axis=1)
+                new = np.where(length > gross * fit._robust_sigma(length), 0.0, fit._huber())
+                new = new if fit._redundancy(new) > 0 else fit._huber()
+                settled = bool(np.abs(new - fit.weights).max() < WEIGHTS_SETTLED)
+                fit = replace(fit, weights=new, settled=settled)
+                if settled:
                     break
-        self.descend()
-        self.require_known()
+        fit = fit._descended()
+        fit._require_known()
+        return fit
 
-    def start(self, moved: np.ndarray) -> None:
-        """Sets the axis from all points; if some stand out, from the subset with the least median residual. A subset
+    def _started(self, moved: np.ndarray) -> "AxisFit":
+        """Returns the axis from all points; if some stand out, from the subset with the least median residual. A subset
         leaves out one point, or all points at one value of the joint ``moved`` (k,)."""
         count = len(self.rows)
         value = np.unique(moved, return_inverse=True)[1]
@@ -203,13 +218,12 @@ class _AxisFitting:
         sets += [values[value] != out for out in np.unique(values) if value.max() > 1]
         least, best = np.inf, None
         for i, subset in enumerate(sets):
-            self.weights = np.asarray(subset, float)
-            self.frame = self.linear_start()
-            length = np.linalg.norm(self.residuals(), axis=1)
+            fit = replace(self, weights=np.asarray(subset, float))
+            fit = replace(fit, world_from_axis=fit._linear_start())
+            length = np.linalg.norm(fit.residuals, axis=1)
             if np.median(length) < least:
-                least, best = np.median(length), (self.frame, self.weights)
-            quiet = length.max() <= min(GROSS * self.robust_sigma(length), QUIET * self.size)
-            if i == 0 and quiet:
+                least, best = np.median(length), fit
+            if i == 0 and length.max() <= min(GROSS * fit._robust_sigma(length), QUIET * self.size):
                 break
         if best is None:
             raise DegenerateError(
@@ -217,9 +231,9 @@ class _AxisFitting:
                 f"{self.where}: no axis follows from any {count - 1} of its {count} positions; check them, or measure "
                 "the sweep again",
             )
-        self.frame, self.weights = best
+        return best
 
-    def linear_start(self) -> Rigid:
+    def _linear_start(self) -> Rigid:
         """Returns the axis by the arcs' common scatter and the circles' common centre (Kåsa 1976)."""
         centred = self.demean(self.points)
         _, axes = np.linalg.eigh((self.weights[:, None] * centred).T @ centred)
@@ -234,65 +248,35 @@ class _AxisFitting:
         centre = np.linalg.lstsq(2 * root[:, None] * self.demean(flat), root * square, rcond=None)[0]
         return Rigid(frame, middle + frame[:, :2] @ centre)
 
-    def local(self) -> np.ndarray:
-        """Returns the points (k, 3) in the axis's frame."""
-        return (self.points - self.frame.translation) @ self.frame.rotation
-
-    def values(self) -> np.ndarray:
-        """Returns values (k, 2) that are constant along an arc: radius and height, or the place across a line."""
-        local = self.local()
-        if self.prismatic:
-            return local[:, :2]
-        return np.column_stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]])
-
-    def means(self) -> np.ndarray:
-        """Returns the weighted means (2, a) of the values by arc."""
-        weighted = self.member * self.weights[:, None]
-        return (self.values().T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
-
-    def demean(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
-        weighted = self.member * self.weights[:, None]
-        means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
-        return values - self.member @ means
-
-    def residuals(self) -> np.ndarray:
-        return self.demean(self.values())
-
-    def radius_of(self, points: np.ndarray) -> float:
-        """Returns the mean distance of ``points`` from the axis."""
-        local = (points - self.frame.translation) @ self.frame.rotation
-        return float(np.hypot(local[:, 0], local[:, 1]).mean())
-
-    def redundancy(self, weights: np.ndarray | None = None) -> int:
-        kept = (self.weights if weights is None else weights) > 0
+    def _redundancy(self, weights: np.ndarray) -> int:
+        kept = weights > 0
         return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
 
-    def sigma(self) -> float:
-        """Returns σ of one coordinate, mm."""
-        return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.redundancy(), 1)))
+    @property
+    def _floor(self) -> float:
+        return ROUNDING * max(np.abs(self.points).max(), self.size)
 
-    def huber(self) -> np.ndarray:
+    def _huber(self) -> np.ndarray:
         """Returns Huber weights (k,) from the lengths of the residuals."""
-        length = np.linalg.norm(self.residuals(), axis=1)
-        return huber_weights(length, HUBER * self.robust_sigma(length))
+        length = np.linalg.norm(self.residuals, axis=1)
+        return huber_weights(length, HUBER * self._robust_sigma(length))
 
-    def robust_sigma(self, length: np.ndarray) -> float:
+    def _robust_sigma(self, length: np.ndarray) -> float:
         """Returns σ of one coordinate from the median length, mm."""
-        redundancy = self.redundancy(np.ones(len(length))) / (2 * len(length))
-        return max(robust_sigma(length, 2, redundancy), self.floor)
+        redundancy = self._redundancy(np.ones(len(length))) / (2 * len(length))
+        return max(robust_sigma(length, 2, redundancy), self._floor)
 
-    def points_jacobian(self) -> np.ndarray:
+    def _by_points(self) -> np.ndarray:
         """Returns the derivative (k, 2, 3) of the values by the points."""
-        local, axes = self.local(), self.frame.rotation
+        local, axes = self.local, self.world_from_axis.rotation
         if self.prismatic:
             return np.broadcast_to(axes[:, :2].T, (len(local), 2, 3))
         outward = local[:, :2] / np.maximum(np.hypot(local[:, 0], local[:, 1]), TINY)[:, None]
         return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
 
-    def jacobian(self) -> np.ndarray:
+    def _jacobian(self) -> np.ndarray:
         """Returns the derivative (k, 2, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
-        u, v, w = self.local().T
+        u, v, w = self.local.T
         zero = np.zeros_like(u)
         if self.prismatic:
             values = np.array([[zero, -w], [w, zero]])
@@ -302,9 +286,9 @@ class _AxisFitting:
         k = len(u)
         return self.demean(np.moveaxis(values, 2, 0).reshape(k, -1)).reshape(k, 2, -1)
 
-    def inverse(self) -> np.ndarray:
+    def _inverse(self) -> np.ndarray:
         """Returns the matrix (p, k, 2) by which residuals become the Gauss-Newton step."""
-        jacobian = self.jacobian()
+        jacobian = self._jacobian()
         k, _, p = jacobian.shape
         root = np.repeat(np.sqrt(self.weights), 2)
         unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
@@ -313,41 +297,31 @@ class _AxisFitting:
             raise DegenerateError("E-AXES-UNDETERMINED", f"{self.where}: its arcs do not determine an axis; {LONGER}")
         return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
 
-    def descend(self) -> None:
-        """Minimises the squares with fixed weights."""
-        self.inverse()  # refuses arcs that determine no axis
-        start, twists = self.frame, np.eye(6)[[0, 1] if self.prismatic else [0, 1, 3, 4]]
+    def _descended(self) -> "AxisFit":
+        """Returns the axis of least squares with these weights."""
+        self._inverse()  # refuses arcs that determine no axis
+        twists, root = np.eye(6)[[0, 1] if self.prismatic else [0, 1, 3, 4]], np.sqrt(np.repeat(self.weights, 2))
 
         def linearise(frame: Rigid) -> NormalEquations:
-            self.frame = frame
-            root = np.sqrt(np.repeat(self.weights, 2))
-            jacobian = self.jacobian().reshape(len(root), -1)
-            return NormalEquations.of(root * self.residuals().ravel(), root[:, None] * jacobian)
+            fit = replace(self, world_from_axis=frame)
+            jacobian = fit._jacobian().reshape(len(root), -1)
+            return NormalEquations.of(root * fit.residuals.ravel(), root[:, None] * jacobian)
 
-        minimum = minimise(
-            start,
-            linearise,
-            lambda frame, step: self.centred(frame @ Rigid.exp(step @ twists)),
-            least_gain=self.floor**2,
-        )
-        self.frame = minimum.required(f"{self.where}: axis", "are these single-joint sweeps?").state
+        def moved(frame: Rigid, step: np.ndarray) -> Rigid:
+            """Returns the moved frame with its origin at the foot of the points' centroid."""
+            frame = frame @ Rigid.exp(step @ twists)
+            shift = frame.inverse() @ self.points.mean(axis=0)
+            return Rigid(frame.rotation, frame @ (shift if self.prismatic else shift * [0, 0, 1]))
 
-    def centred(self, frame: Rigid) -> Rigid:
-        """Returns the frame with its origin at the foot of the points' centroid."""
-        shift = frame.inverse() @ self.points.mean(axis=0)
-        if not self.prismatic:
-            shift[:2] = 0
-        return Rigid(frame.rotation, frame @ shift)
+        minimum = minimise(self.world_from_axis, linearise, moved, least_gain=self._floor**2)
+        found = minimum.required(f"{self.where}: axis", "are these single-joint sweeps?").state
+        return replace(self, world_from_axis=found)
 
-    def gain(self) -> np.ndarray:
-        """Returns the derivative (p, k, 3) of the axis by the points."""
-        return np.einsum("pkv,kvc->pkc", self.inverse(), self.points_jacobian())
-
-    def require_known(self) -> None:
+    def _require_known(self) -> None:
         """Refuses an axis whose σ is too large for its linear covariance."""
-        if not self.prismatic and (self.means()[0] <= NEAR_AXIS * self.sigma()).all():
+        if not self.prismatic and (self.means[0] <= NEAR_AXIS * self.sigma_mm).all():
             raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(self.where, self.size))
-        sigma = self.sigma() * np.linalg.norm(self.gain(), axis=2)
+        sigma = self.sigma_mm * np.linalg.norm(self.gain, axis=2)
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
         if direction > WEAK_RAD or place > WEAK_RAD * self.size * 10:
             if self.size < STANDS_STILL_MM:
@@ -363,14 +337,14 @@ class _AxisFitting:
                 f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}",
             )
 
-    def orient(self, moved: np.ndarray) -> None:
-        """Turns z along positive motion, and refuses motion that does not match the joint's values."""
-        moved, local = moved[self.rows], self.local()
+    def oriented(self, moved: np.ndarray) -> "AxisFit":
+        """Returns the axis with z along positive motion; refuses motion that does not match the values (m,)."""
+        moved, local = moved[self.rows], self.local
         if self.prismatic:
             travel = self.demean(np.column_stack([local[:, 2], moved]))
             turned = (self.weights * travel[:, 0]) @ travel[:, 1] < 0
             deviation = np.abs((-1 if turned else 1) * travel[:, 0] - travel[:, 1])
-            allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma(), "mm", 1.0
+            allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma_mm, "mm", 1.0
         else:
             place = local[:, 0] + 1j * local[:, 1]
             weighted = self.member * self.weights[:, None]
@@ -378,7 +352,7 @@ class _AxisFitting:
             turned = np.abs(against).sum() > np.abs(with_it).sum()
             arm = self.member @ (against if turned else with_it)
             deviation = np.abs(np.angle(place * np.exp(-1j * (-1 if turned else 1) * moved) * arm.conj()))
-            near = GROSS * self.sigma() / np.maximum(np.abs(place), TINY)
+            near = GROSS * self.sigma_mm / np.maximum(np.abs(place), TINY)
             allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
         wrong = np.flatnonzero((deviation > allowed) & (self.weights > 0))
         if len(wrong):
@@ -387,30 +361,45 @@ class _AxisFitting:
                 f"{self.where}: the motion seen is off its values by up to {deviation[wrong].max() * shown:.3g} "
                 f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match",
             )
+        axis = self.world_from_axis
         if turned:
-            self.frame = Rigid(self.frame.rotation * [1, -1, -1], self.frame.translation)
+            axis = Rigid(axis.rotation * [1, -1, -1], axis.translation)
+        return replace(self, world_from_axis=axis, span=float(np.ptp(moved)))
 
-    def result(self, moved: np.ndarray, near: tuple[Arc, ...]) -> AxisFit:
-        """Returns the result for joint values ``moved`` (m,)."""
-        radii, heights = self.means()
-        if self.prismatic:
-            radii, heights = np.full((2, len(self.arcs)), np.nan)
-        return AxisFit(
-            joint=self.arcs[0].joint,
-            world_from_axis=self.frame,
-            arcs=tuple(self.arcs),
-            radii=radii,
-            heights=heights,
-            near=near,
-            rows=self.rows,
-            residuals=self.residuals(),
-            weights=self.weights,
-            gain=self.gain(),
-            sigma_mm=self.sigma(),
-            redundancy=self.redundancy(),
-            span=float(np.ptp(moved[self.rows])),
-            settled=self.settled,
-        )
+
+def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
+    """Returns the axis of a joint by robust least squares of the distances of its arcs' points to their circles or
+    lines.
+
+    ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
+    this joint; ``where`` : the joint, for messages.
+
+    Raises DegenerateError: no redundancy, reflectors on the axis, or arcs too short to give a direction. Raises
+    InputError: the motion observed about the axis is not that of the joint's values.
+    """
+    size = np.array([_spread(points[arc.rows]) for arc in arcs])
+    if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
+        raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(where, size.max()))
+    use = size >= FIRST_SIZE * size.max()
+    fit = AxisFit.of(points, [arcs[i] for i in np.flatnonzero(use)], prismatic, where, Rigid()).solved(moved)
+    if not prismatic and not use.all():
+        far = np.array([fit.radius_of(points[arc.rows]) for arc in arcs]) > NEAR_AXIS * fit.sigma_mm
+        if (far & ~use).any():
+            use |= far
+            used = [arcs[i] for i in np.flatnonzero(use)]
+            fit = AxisFit.of(points, used, prismatic, where, fit.world_from_axis).solved(moved, starts=False)
+    return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(~use)))
+
+
+def _spread(points: np.ndarray) -> float:
+    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+
+
+def _on_axis(where: str, spread: float) -> str:
+    return (
+        f"{where}: all reflectors stay within {spread:.3g} mm of one place while it moves, so close to its axis that "
+        "they say nothing about it; put a reflector off the axis"
+    )
 
 
 def _frame(x: np.ndarray, z: np.ndarray) -> np.ndarray:

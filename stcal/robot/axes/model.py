@@ -18,7 +18,6 @@ from stcal.robot.axes.checks import (
     chain_through,
     jacobian_by_axes,
     leave_one_out,
-    of_order,
     off_mm,
     pairs_of,
     remarks,
@@ -103,35 +102,26 @@ class AxesFile(ResultFile):
     format: Literal["stcal axes 1"] = Field(description="the file's form and its version")
     robot: RobotText = Field(description="text of the robot file")
     fits: list[AxisPart] = Field(
-        description="of each joint in order, all joints at zero: `world_from_axis`, z along positive motion; "
-        "`covariance` of rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by the noise of its own sweeps; "
-        "`rms_mm` of a coordinate of the residuals, `sigma_mm` of a coordinate, `redundancy`; `span` of the joint's "
-        "values, rad or mm; reflectors of its `arcs`, their `radii` and `heights`, mm"
+        description="of each joint, all joints at zero: `world_from_axis`, z along positive motion; `covariance` of "
+        "rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by its own noise; `rms_mm` of a coordinate of the "
+        "residuals, `sigma_mm`, `redundancy`; `span`, rad or mm; reflectors of its `arcs`, `radii` and `heights`, mm"
     )
     off: list[dict[ByLine, float]] = Field(description="by joint, rows off their arcs and left out, mm")
-    covariance: Matrix = Field(
-        description="of all axes together, in the order of `fits`, with what each inherits from those before"
-    )
+    covariance: Matrix = Field(description="of all axes together, with what each inherits from those before")
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     row_sigma: Matrix = Field(description="their σ; 0: kept from the robot given")
     tools: dict[ByName, Pose] = Field(description="flange_from_target, mm")
-    tool_spread_mm: dict[ByName, float] = Field(
-        description="RMS of all rows about it: encoders, gears and elasticity are in it"
-    )
+    tool_spread_mm: dict[ByName, float] = Field(description="RMS about it: encoders, gears and elasticity are in it")
     pairs: list[Pair] = Field(
-        description="`joint` (from 0) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
+        description="`joint` (from 1) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
         "`distance_mm`, `distance_sigma_mm`: along the common normal, of near-parallel axes in the plane of their row; "
         "`normal_mm`, `foot_mm` and their σ `normal_sigma_mm`, `foot_sigma_mm`: the common normal, and its foot along "
         'the first axis from where that was measured; `refused`: why these must not be used, or `""`'
     )
     without_one: LeaveOneOutRows = Field(
-        description="`lines` of the rows left out (with all reflectors), `distance`, `normal` of each pair without "
-        "them, mm, signed as `a`"
+        description="`lines` of the rows left out, `distance`, `normal` of each pair without them, mm, signed as `a`"
     )
-    notes: list[str] = Field(
-        description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short; columns that "
-        "were not read, angles by their convention"
-    )
+    notes: list[str] = Field(description="rows, reflectors and arcs not used, columns not read, conventions of angles")
 
 
 @one_thread()
@@ -145,12 +135,9 @@ def robot_from_sweeps(
 
     Parameters
     ----------
-    data : Measurements
-        Positions of one or more reflectors in sweeps of single joints.
-    nominal : Robot
-        Convention, joint types, coupling, and approximate build of the arm.
-    still_rad : float
-        Change of a revolute joint's value up to which the joint stands still.
+    data : positions of one or more reflectors in sweeps of single joints.
+    nominal : convention, joint types, coupling, and approximate build of the arm.
+    still_rad : change of a revolute joint's value up to which the joint stands still.
     places : (k, 3) array, optional
         Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
         too: those of :func:`~stcal.robot.axes.sweeps.ring`, or points of a real target. If None, positions alone
@@ -158,18 +145,14 @@ def robot_from_sweeps(
 
     Returns
     -------
-    AxesResult
-        Axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
+    AxesResult : axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
 
     Raises
     ------
-    ConvergenceError
-        The fit of an axis reaches no minimum.
-    InputError
-        Several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of another
-        build; no orientations where they are asked for.
-    DegenerateError
-        Axes that their arcs do not determine.
+    ConvergenceError : the fit of an axis reaches no minimum.
+    InputError : several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of
+        another build; no orientations where they are asked for.
+    DegenerateError : axes that their arcs do not determine.
 
     References
     ----------
@@ -208,9 +191,9 @@ def robot_from_sweeps(
 
     row_sigma = sigma_of(jacobian_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
-    notes += [*remarks(data, fits, robot, nominal), *of_order(measured, robot)]
+    notes += remarks(measured, data, fits, robot, nominal)
     notes += [
-        f"joints {p.joint + 1} and {p.joint + 2}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
+        f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"
         for p in pairs
         if p.refused and not p.parallel

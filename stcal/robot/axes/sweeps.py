@@ -11,8 +11,7 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
 STILL_RAD = np.radians(1.5e-3)
-"""Difference up to which joint values are equal: a controller shows 0.001°, and coupling adds two of them. It is 0.05
-mm at 2 m."""
+"""Difference up to which joint values are equal: a controller shows 0.001°, and coupling adds two of them."""
 STILL_MM = 2e-3
 DISTINCT = {"revolute": 3, "prismatic": 2}
 """Number of positions that give an arc its radius and height, or a line its direction."""

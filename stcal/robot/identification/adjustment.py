@@ -1,18 +1,13 @@
-"""Residuals of measurements about a robot, their derivatives by the minimal parameters, and robust least squares over
-these; it separates determined from undetermined directions."""
+"""Measurements as observations of an arm: their residuals, the derivatives by the minimal parameters, and their σ."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.io.covariance import TWIST
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
@@ -30,6 +25,10 @@ from stcal.robot.kinematics.model import Chain
 
 Kind = Literal["pose", "position", "distance"]
 WIDTH = {"pose": 6, "position": 3, "distance": 1}
+TOOL_WIDTH = {"pose": 6, "position": 3, "distance": 3}
+"""Number of parameters of each tool; orientation is seen in poses only."""
+UNSEEN = {"pose": 0, "position": 0, "distance": 6}
+"""Number of directions that observations never show: those of the instrument's place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +74,23 @@ class Observed:
         """Kind of observation for which the measurements are used."""
         return "distance" if self.frameless else self.kind
 
+    def __getitem__(self, keep: np.ndarray) -> "Observed":
+        """Returns the observations at the indices, or of the mask (r,), ``keep``."""
+        if self.kind == "distance":
+            return replace(self, first=self.first[keep], second=self.second[keep], values=self.values[keep])
+        data = self.data[keep]
+        rows = np.arange(len(data))
+        return replace(self, data=data, first=rows, second=rows)
 
-def tool_width(kind: Kind) -> int:
-    """Returns the number of parameters of each tool; orientation is seen in poses only."""
-    return 6 if kind == "pose" else 3
+    def require_more_than(self, seeks: int, what: str, advice: str) -> None:
+        """Refuses observations that give no more numbers than ``seeks`` parameters."""
+        width = WIDTH[self.kind]
+        if width * len(self) <= seeks:
+            raise DegenerateError(
+                "E-IDENTIFY-FEW",
+                f"{self.data.where}: {len(self)} {self.kind}s give {width * len(self)} numbers for {seeks} {what}; "
+                f"{seeks // width + 1} or more needed, {advice}",
+            )
 
 
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
@@ -101,7 +113,7 @@ def parameter_names(state: State, kind: Kind) -> list[str]:
     """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
     ``station B rx`` … of stations but the first; r in rad, the others in mm."""
     names = [f"J{i + 1} {TWIST[c]}" for i, c in chain_parameters(state.chain)]
-    names += [f"{f'tool {name}'.rstrip()} {c}" for name in state.tools for c in TWIST[-tool_width(kind) :]]
+    names += [f"{f'tool {name}'.rstrip()} {c}" for name in state.tools for c in TWIST[-TOOL_WIDTH[kind] :]]
     return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in TWIST]
 
 
@@ -179,7 +191,7 @@ def tool_motions(tip: Poses, targets: Sequence[str], tool: str, kind: Kind) -> n
     moves = np.zeros((len(tip), 6, 6))
     moves[:, :3, :3] = moves[:, 3:, 3:] = tip.rotation
     moves *= np.array([name == tool for name in targets])[:, None, None]
-    return moves[..., -tool_width(kind) :]
+    return moves[..., -TOOL_WIDTH[kind] :]
 
 
 def _beside(state: State, tip: Poses, measured: Observed) -> np.ndarray:
@@ -200,7 +212,7 @@ def tip_jacobian(
     """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by all parameters, rad over mm."""
     tip = tips(state, q, targets, conditions)
     axes_part = chain_jacobian(state.chain, q, tip, conditions)
-    if state.chain.grown is not None:
+    if state.chain.tree is not None:
         joint = [i for i, _ in chain_parameters(state.chain)]
         axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
     parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in state.tools)]
@@ -213,7 +225,7 @@ def tip_jacobian(
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     """Returns the state after small motions along the parameters, (k,)."""
     k = len(chain_parameters(state.chain))
-    width = tool_width(kind)
+    width = TOOL_WIDTH[kind]
     tools = {}
     for t, (name, tool) in enumerate(state.tools.items()):
         tool_step = step[k + width * t : k + width * (t + 1)]
@@ -228,48 +240,8 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     return replace(state, chain=chain, tools=tools, stations=stations)
 
 
-def only_of(measured: Observed, keep: np.ndarray) -> Observed:
-    """Returns the observations at the indices, or of the mask (r,), ``keep``."""
-    if measured.kind == "distance":
-        return replace(
-            measured,
-            first=measured.first[keep],
-            second=measured.second[keep],
-            values=measured.values[keep],
-        )
-    data = measured.data[keep]
-    rows = np.arange(len(data))
-    return replace(measured, data=data, first=rows, second=rows)
-
-
-MAX_STEPS = 100
-SETTLED = 1e-10
-"""Relative decrease of the cost below which the descent has converged."""
-HUBER_LEVEL = 0.999
-"""Probability that an observation without a gross error has full weight; one in a thousand has less."""
-USELESS_MM = 50.0
-"""Largest σ of a determined direction (1 mm, or the rotation that moves the tool by 1 mm). Beyond it the nominal value
-is better. All parameters are held to their start by this σ, which determined directions do not feel."""
-ACCEPTED = 1e-4
-"""Largest predicted decrease of the cost, in σ², that is accepted when a descent has used up its steps. Along a flat
-direction Huber weights halve every step, so that steps are many and short."""
-ACCEPTED_ELASTIC = 0.05
-"""The same for elastic arms, whose valleys are curved: 0.2 σ of a hardly determined parameter."""
-MOST_BENT = 2 / 3
-"""Largest share of the curvature along a direction that second derivatives may take away; variances become three times
-as large. Flatter valleys have two minima, and the curvature at one minimum does not describe the other."""
-ROUNDING = 1e-13
-"""Relative error by rounding in the square root of a normal matrix with unit diagonal and some hundred parameters."""
-NEAR, NEAR_STEPS = 1.0, 50
-"""Largest predicted decrease of a step, in σ², for which second derivatives are good, and largest number of steps
-without them before. Second derivatives used from afar may lead to a state where compliance and moment both have the
-wrong sign. Steps without them are many along curved valleys, and need not converge."""
-STAYS_MM = 1e-3
-"""σ, in mm, that fixes a movement which the observations never show."""
-LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
-"""Decrease of the cost, in σ², below which a descent ends, for rigid and for elastic arms. Measurements without noise
-still gain the first by rounding. The second moves no parameter by more than 0.03 σ: it is not worth a step along the
-curved valleys of products of compliance and moment."""
+FIELDS = {"factor": "factor", "rad": "sigma_rad", "mm": "sigma_mm"}
+"""Fields of :class:`Weighting` by the names of their σ, in the order in which σ are estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,12 +292,15 @@ class Weighting:
 
     def value(self, name: str) -> float:
         """Returns the value of σ ``name``."""
-        return {"mm": self.sigma_mm, "rad": self.sigma_rad, "factor": self.factor}[name]
+        return getattr(self, FIELDS[name])
 
     def with_values(self, found: Mapping[str, float]) -> "Weighting":
         """Returns the weighting with the σ ``found`` in place of its own."""
-        new = {name: found.get(name, self.value(name)) for name in ("mm", "rad", "factor")}
-        return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
+        return replace(self, **{FIELDS[name]: value for name, value in found.items()})
+
+    def medians(self, white: np.ndarray) -> dict[str, float]:
+        """Returns the median size of whitened residuals (r, w) by the name of their σ."""
+        return {n: float(np.median(np.abs(white[:, at]))) for n, at in self.columns(white.shape[1]).items()}
 
 
 def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> np.ndarray:
@@ -341,202 +316,6 @@ def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> n
     return (flat - u * (1 - 1 / np.sqrt(1 + size)) @ (u.T @ flat)).reshape(values.shape)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Held:
-    """Prior knowledge: ``value + jacobian @ step``, (p,), is 0 with ``sigma``; ``fixed`` : (p,) mask of conditions."""
-
-    value: np.ndarray
-    jacobian: np.ndarray
-    sigma: np.ndarray
-    fixed: np.ndarray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """An adjusted state with its normal equations. ``residuals`` : (r, w) rad, mm; ``weights`` : (r,) Huber weights;
-    ``normal`` : (k, k) normal matrix of the observations alone, whitened and weighted; ``units`` : (k,) factors that
-    make each parameter a movement of the tool of about 1 mm; ``cost`` : Huber cost; ``prior`` : (k, k) normal matrix of
-    the prior knowledge; ``conditions`` : (k, k) normal matrix of the conditions; ``count`` : number of conditions."""
-
-    state: State
-    residuals: np.ndarray
-    weights: np.ndarray
-    normal: np.ndarray
-    units: np.ndarray
-    cost: float
-    prior: np.ndarray
-    conditions: np.ndarray
-    count: int = 0
-
-    def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns eigenvalues (j,) and directions (j, j), in columns, of the normal matrix with conditions, over axes
-        and tools, and a mask (j,) of determined ones. Elasticity is left out, as there is prior knowledge of it."""
-        rigid = slice(len(self.units) - self.state.elastic_count)
-        known = self.normal[rigid, rigid] + self.conditions[rigid, rigid]
-        values, directions = np.linalg.eigh(known * self.units[rigid, None] * self.units[rigid])
-        return values, directions, values > 1 / USELESS_MM**2
-
-    def rank(self) -> int:
-        """Returns the number of directions that the data determine."""
-        return int(self.spectrum()[2].sum()) - self.count
-
-    def inverse(self) -> np.ndarray:
-        """Returns the covariance (k, k) of the parameters at unit weight."""
-        scaled = (self.normal + self.prior) * self.units[:, None] * self.units
-        return np.linalg.inv(scaled) * self.units[:, None] * self.units
-
-
-Away = tuple[State, np.ndarray]
-"""A state, and the sum of the steps (k,) that led to it."""
-
-
-def solve(
-    state: State, measured: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
-) -> Solution:
-    """Minimises the whitened residuals from ``state``, about which ``held`` is linear. Parameters are small motions
-    about the present state, so that none is singular. Raises ConvergenceError."""
-    limit = huber_limit(measured.kind) if robust else np.inf
-    first = _linearised(state, measured, weighting, limit)[0]
-    held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
-    conditions, count = np.zeros_like(first.normal), 0
-    if held is not None:
-        weighted = held.jacobian.T / held.sigma**2
-        held_normal, pull = weighted @ held.jacobian, weighted @ held.value  # half the gradient of the squares
-        fixed = held.jacobian[held.fixed] / held.sigma[held.fixed, None]
-        conditions, count = fixed.T @ fixed, len(fixed)
-    _, directions, determined = replace(first, conditions=conditions).spectrum()
-    prior = held_normal + _fixed(first, directions[:, : unseen(measured.kind)])
-    hold = held_normal + _fixed(first, directions[:, ~determined])  # along undetermined ones valleys bend, and lead far
-
-    def kept(away: np.ndarray) -> NormalEquations:
-        return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
-
-    def linearise(at: Away, bends: bool) -> NormalEquations:
-        fit, gradient = _linearised(at[0], measured, weighting, limit)
-        straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at[1])
-        curved = curvature_of(fit, measured, weighting) if bends else None
-        if curved is None:
-            return straight
-        return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
-
-    def cost(at: Away) -> float:
-        white = weighting.whiten(residuals(at[0], measured), measured)
-        return float(huber_cost(np.linalg.norm(white, axis=1), limit).sum() + kept(at[1]).cost)
-
-    def descended(begin: Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[Away, NormalEquations]:
-        return minimise(
-            begin,
-            partial(linearise, bends=bends),
-            lambda at, step: (moved(at[0], step, measured.kind), at[1] + step),
-            cost=cost,
-            settled=SETTLED,
-            least_gain=least_gain,
-            max_steps=max_steps,
-        )
-
-    begin = state, np.zeros(len(hold))
-    if state.elastic:
-        near = descended(begin, False, NEAR, NEAR_STEPS).state
-        fit, accepted = descended(near, True, LEAST_ELASTIC, MAX_STEPS), ACCEPTED_ELASTIC
-    else:
-        fit, accepted = descended(begin, False, LEAST_GAIN, MAX_STEPS), ACCEPTED
-    fit.required(f"{measured.data.where}: identification", "check the robot file and the outliers", accepted)
-    solution = _linearised(fit.state[0], measured, weighting, limit)[0]
-    return replace(solution, prior=prior, conditions=conditions, count=count)
-
-
-def curvature_of(solution: Solution, measured: Observed, weighting: Weighting) -> np.ndarray | None:
-    """Returns the part (k, k) of the normal matrix that second derivatives by compliance and moment subtract: without
-    it descents take hundreds of steps. None for rigid arms and distances."""
-    if not solution.state.elastic or measured.kind == "distance":
-        return None
-    white = solution.weights[:, None] * weighting.whiten(solution.residuals, measured)
-    elastic = curvature(solution.state, measured, weighting.pull(white, measured))
-    k, count = len(solution.units), solution.state.elastic_count
-    taken = np.zeros((k, k))
-    place = slice(k - count, k - count + len(elastic))
-    taken[place, place] = elastic
-    return taken
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bent:
-    """Shares, at most :data:`MOST_BENT`, of a normal matrix (k, k) with this ``root`` that second derivatives take
-    away: ``share`` : (k,) of each of ``directions`` (k, k), columns that are independent in the matrix's metric."""
-
-    root: np.ndarray
-    directions: np.ndarray
-    share: np.ndarray
-
-    @classmethod
-    def of(cls, normal: np.ndarray, curved: np.ndarray) -> "Bent":
-        """Returns the shares for ``curved`` (k, k), all that second derivatives take."""
-        scale = np.sqrt(np.diag(normal))
-        unit = normal / scale[:, None] / scale + ROUNDING * np.eye(len(scale))
-        root = scale[:, None] * np.linalg.cholesky(unit)
-        half = solve_triangular(root, curved, lower=True)
-        share, directions = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-        return cls(root, directions, np.minimum(share, MOST_BENT))
-
-    def taken(self) -> np.ndarray:
-        """Returns what is taken from the normal matrix, (k, k)."""
-        along = self.root @ self.directions
-        return (along * self.share) @ along.T
-
-    def bends(self) -> np.ndarray:
-        """Returns B (k, k): Bᵀ N B is what is left of the normal matrix N."""
-        wider = (self.directions * np.sqrt(1 - self.share)) @ self.directions.T
-        return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
-
-
-def require_enough(measured: Observed, seeks: int, what: str, advice: str) -> None:
-    """Refuses observations that give no more numbers than ``seeks`` parameters."""
-    numbers, width = WIDTH[measured.kind] * len(measured), WIDTH[measured.kind]
-    if numbers <= seeks:
-        raise DegenerateError(
-            "E-IDENTIFY-FEW",
-            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} {what}; "
-            f"{seeks // width + 1} or more needed, {advice}",
-        )
-
-
-def unseen(kind: Kind) -> int:
-    """Returns the number of directions that this kind of observation never shows: those of the instrument's place."""
-    return 6 if kind == "distance" else 0
-
-
-def _fixed(solution: Solution, directions: np.ndarray) -> np.ndarray:
-    """Returns the normal matrix (k, k) that holds parameters at their start: weakly, but firmly along ``directions``
-    (j, d)."""
-    padded = np.pad(directions, ((0, solution.state.elastic_count), (0, 0)))
-    fixed = np.eye(len(padded)) / USELESS_MM**2 + padded @ padded.T / STAYS_MM**2
-    return fixed / solution.units[:, None] / solution.units
-
-
-def huber_limit(kind: Kind) -> float:
-    """Returns the length of an observation's whitened residual beyond which it weighs less."""
-    return length_limit(WIDTH[kind], 1 - HUBER_LEVEL)
-
-
-def normal_rank(state: State, measured: Observed, weighting: Weighting) -> int:
-    """Returns how many parameters these observations determine, at the state where they would be exact."""
-    return _linearised(state, measured, weighting, np.inf)[0].rank()
-
-
-def _linearised(state: State, measured: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
-    """Returns the state with its normal matrix, and half the gradient (k,) of the cost."""
-    errors, derivative = linear(state, measured)
-    units = parameter_units(derivative)
-    white, whitened = weighting.whiten(errors, measured), weighting.whiten(derivative, measured)
-    weights = huber_weights(np.linalg.norm(white, axis=1), limit)
-    flat = whitened.reshape(-1, whitened.shape[2])
-    weighted = flat * np.repeat(weights, white.shape[1])[:, None]
-    cost = float(huber_cost(np.linalg.norm(white, axis=1), limit).sum())
-    normal = weighted.T @ flat
-    zero = np.zeros_like(normal)
-    return Solution(state, errors, weights, normal, units, cost, zero, zero), -weighted.T @ white.ravel()
-
-
 def parameter_units(derivative: np.ndarray) -> np.ndarray:
     """Returns steps (k,) that move the tool by 1 mm RMS, or by 1 rad if they move no point; 1 if they move nothing."""
     lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
@@ -544,3 +323,8 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
     turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
+
+
+def position_errors(found: np.ndarray) -> np.ndarray:
+    """Returns the position errors (r,), mm."""
+    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])

@@ -14,37 +14,34 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.geometry.robust import ratio_limit
-from stcal.robot.identification.adjustment import Observed, State, Weighting, linear, moved, parameter_units
+from stcal.robot.identification.adjustment import State, linear, moved, parameter_units
+from stcal.robot.identification.problem import ArmProblem
 
 SUBSETS, SEED = 1000, 0
-"""Number of random subsets, each of as few rows as determine all parameters, and seed. With a quarter of 40 rows wrong,
-one subset in forty is clean."""
+"""Number of random subsets, and seed. With a quarter of 40 rows wrong, one in forty is clean."""
 KEPT_SUBSETS, FIRST_STEPS, STEPS = 20, 2, 50
-"""Number of subsets that are followed to their end, and numbers of concentration steps before and after their
-choice."""
+"""Number of subsets that are followed to their end, and of concentration steps before and after their choice."""
 MOST_ROWS = 400
-"""Largest number of rows that are searched. Of more rows a random sample is searched, with the same share of errors."""
+"""Largest number of rows that are searched; of more a random sample is, with the same share of errors."""
 HELD = 1e-4
-"""Information on each parameter (of 1 mm) about its start, in units of that of one observation. What a subset leaves
-open stays nominal within a hundred times the noise."""
+"""Information on each parameter (of 1 mm) about its start, in units of that of one observation."""
 FALSE_ALARM = 1e-3
 """False-alarm probability of a set: that any row of a good set is called wrong."""
 TINY = 1e-300
 ROUNDS, SEARCHES = 6, 2
-"""Number of linear solutions, the third of which is practically exact; and number of searches. The second search uses σ
-of positions and orientations from the residuals of the first solution."""
+"""Number of linear solutions, the third of which is practically exact, and of searches, the second by better σ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _Linearised:
     """``white`` : (r, w) residuals over σ; ``slope`` : (r, w, k) derivatives by parameters of about 1 mm."""
 
     white: np.ndarray
     slope: np.ndarray
 
-    def of(self, rows: np.ndarray) -> "_Problem":
+    def of(self, rows: np.ndarray) -> "_Linearised":
         """Returns the problem of these rows alone."""
-        return _Problem(self.white[rows], self.slope[rows])
+        return _Linearised(self.white[rows], self.slope[rows])
 
     def solved(self, masks: np.ndarray) -> np.ndarray:
         """Returns the steps (s, k) that solve the rows of each mask (s, r)."""
@@ -71,33 +68,32 @@ class _Problem:
         return ((self.slope @ inverse) * self.slope).sum(2)
 
 
-def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarray:
+def agreeing(problem: ArmProblem, state: State) -> np.ndarray:
     """Returns a mask (r,) of the observations that agree with a solution near ``state``, linear about it; all agree if
-    too few are redundant. σ of ``weighting`` need only be known up to a common factor."""
+    too few are redundant. Their σ need only be known up to a common factor."""
+    measured, weighting = problem.measured, problem.weighting
     good = every = np.ones(len(measured), bool)
     for step in range(ROUNDS):
         errors, derivative = linear(state, measured)
         units = parameter_units(derivative)
         if step:
-            white = weighting.whiten(errors, measured)
-            medians = {n: float(np.median(np.abs(white[:, at]))) for n, at in weighting.columns(white.shape[1]).items()}
+            medians = weighting.medians(weighting.whiten(errors, measured))
             weighting = weighting.with_values({n: weighting.value(n) * (value or 1.0) for n, value in medians.items()})
-        problem = _Problem(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
-        r, w, k = problem.slope.shape
+        rows = _Linearised(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
+        r, w, k = rows.slope.shape
         half = (r + k // w + 1) // 2 + 1
         if half >= r:
             return every
-        before = good
-        searched = step < SEARCHES
-        begin = _trimmed(problem, half) if searched else good
-        good = _tested(problem, begin, half if searched else None, list(weighting.columns(w).values()))
-        state = moved(state, units * problem.solved(good[None])[0], measured.kind)
+        before, searched = good, step < SEARCHES
+        begin = _trimmed(rows, half) if searched else good
+        good = _tested(rows, begin, half if searched else None, list(weighting.columns(w).values()))
+        state = moved(state, units * rows.solved(good[None])[0], measured.kind)
         if not searched and (good == before).all():
             break
     return good
 
 
-def _trimmed(problem: _Problem, half: int) -> np.ndarray:
+def _trimmed(problem: _Linearised, half: int) -> np.ndarray:
     """Returns a mask (r,) of the rows of the best half."""
     rng, count = np.random.default_rng(SEED), len(problem.white)
     rows = np.sort(rng.permutation(count)[:MOST_ROWS])
@@ -128,7 +124,7 @@ def _smallest(squares: np.ndarray, wanted: int) -> np.ndarray:
     return masks
 
 
-def _tested(problem: _Problem, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
+def _tested(problem: _Linearised, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
     """Returns the rows that fit the solution of the good rows within chance, repeated. ``half`` : number of good rows
     if they are the smallest; ``kinds`` : columns with one σ each, estimated from the good rows."""
     r, w, _ = problem.slope.shape

@@ -1,8 +1,4 @@
-"""How well a set of poses determines a robot's parameters: observability indices O1 … O5, and the error that the
-identified robot is expected to have, where it was measured and elsewhere.
-
-Few rows, or rows of a small part of the joints' ranges, fit well but determine little; the covariance shows how little.
-"""
+"""How well a set of poses determines a robot's parameters: observability indices, and errors expected elsewhere."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +8,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import WIDTH, Kind, Observed, State, tip_jacobian, tool_width
+from stcal.robot.identification.adjustment import TOOL_WIDTH, WIDTH, Kind, Observed, State, tip_jacobian
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import chain_parameters
@@ -23,8 +19,7 @@ SEEN = 1e-9
 """Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""
 
 TOGETHER, MOST_BESIDE = 0.2, 2
-"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of parameters
-named beside the first."""
+"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of those."""
 
 MEANING = {
     "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
@@ -77,8 +72,7 @@ class ObservabilityIndices:
 
     @classmethod
     def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
-        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, parameters in mm, by its ``seen`` largest
-        singular values."""
+        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, by its ``seen`` largest singular values."""
         sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
         return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
 
@@ -95,8 +89,7 @@ def identification_jacobian(
     sigma_rad: float = 1.0,
     tool: str = "",
 ) -> np.ndarray:
-    """Returns the derivatives (m, r, k) of the measured values, over σ, at joint vectors (m, n) by all identified
-    parameters, in the world's axes. r is 6 (rotation over translation) or 3 (position)."""
+    """Returns the derivatives (m, 6 or 3, k) of the measured values, over σ, at joint vectors (m, n), in the world."""
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
     sigma = np.repeat([sigma_rad, sigma_mm], 3)
@@ -107,13 +100,12 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
     """Returns factors (k,) that bring all parameters to mm, angles as arcs at the reach with the longest tool."""
     tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
-    turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
+    turning += ([True] * (TOOL_WIDTH[observe] - 3) + [False] * 3) * len(tools)
     return np.where(turning, 1 / reach_mm(robot, tools), 1.0)
 
 
 def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
-    """Returns names of directions (k, d), such as ``J2 y (with tool z)``, led by a parameter that is in no other
-    one."""
+    """Returns names of directions (k, d), ``J2 y (with tool z)``, each led by a parameter of its own."""
     lead, reduced = [], directions.copy()
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
@@ -125,24 +117,19 @@ def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...
         reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
         lead.append(int(i))
     named = []
-    for i, direction in zip(lead, reduced.T, strict=True):
-        strong = [
-            k
-            for k in np.argsort(-np.abs(direction))
-            if k != i and abs(direction[k]) > TOGETHER * np.abs(direction).max()
-        ]
-        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+    for i, direction in zip(lead, np.abs(reduced.T), strict=True):
+        order = np.argsort(-direction)
+        strong = [names[k] for k in order if k != i and direction[k] > TOGETHER * direction.max()]
+        beside = " and ".join(strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
         named.append(f"{names[i]} (with {beside})" if beside else names[i])
     return tuple(named)
 
 
 SAMPLES, SEED = 200, 0
 ELSEWHERE = 3.0
-"""Ratio of σ over the joints' ranges to σ at the measured rows, above which there is a warning: 40 rows over the middle
-60 % of all ranges have 1.6, over 30 % 3.5, eight rows 3."""
+"""Largest ratio of σ over the ranges to σ at the rows without a warning: 40 rows over 60 % of the ranges have 1.6."""
 FEW = 2.0
-"""Number of measured values per parameter below which σ are hardly estimated: of 40 simulated sets of eight poses (1.6)
-two gave a tenth of the true σ."""
+"""Number of measured values per parameter below which σ may come out at a tenth of the true ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,10 +147,18 @@ class Predicted:
         """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
         return rms(self.ranges_mm) / max(rms(self.here_mm), 1e-9)
 
+    def at(self, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
+        """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in
+        the residuals; nan for tools that were not measured."""
+        sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
+        if known.any():
+            known_targets = [name for name in targets if name in state.tools]
+            sigma[known] = np.hypot(_sigma(state, q[known], known_targets, kind, self.covariance), self.left_mm)
+        return sigma
+
 
 def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
-    """Returns σ for the target of most rows, over the ranges of ``robot``; None for distances, which do not place the
-    arm."""
+    """Returns σ for the target of most rows; None for distances, which do not place the arm."""
     if measured.kind == "distance":
         return None
     data, kind = measured.data, measured.kind
@@ -187,19 +182,8 @@ def _sigma(
     return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 
-def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
-    """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in the
-    residuals; nan for tools that were not measured."""
-    sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
-    if known.any():
-        known_targets = [name for name in targets if name in state.tools]
-        sigma[known] = np.hypot(_sigma(state, q[known], known_targets, kind, found.covariance), found.left_mm)
-    return sigma
-
-
 def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
-    """Returns random joint values (count, n), rad or mm; a joint without limits moves by half a turn, or by the reach
-    with ``tool``, to either side."""
+    """Returns random joint values (count, n); without limits, of half a turn, or the reach, to either side."""
     low, high = robot.limits().T
     half = np.where(robot.prismatic, reach_mm(robot, [tool]), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
@@ -207,8 +191,7 @@ def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """Returns the prediction, enlarged over the ranges by the effects found in the residuals, and notes on it: the
-    covariance takes the model as true."""
+    """Returns the prediction, enlarged over the ranges by the effects that the model lacks, and notes on it."""
     if found is None or not left:
         return found, ()
     effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
@@ -229,20 +212,14 @@ def doubts(
     names: list[str],
     tested: bool,
 ) -> tuple[str, ...]:
-    """Returns notes on rows that are few, or that cover a small part of the ranges. ``units`` : (k,) of about 1 mm of
-    the tool; ``tested`` : rows were held out."""
-    notes = []
+    """Returns notes on few rows, or of a small part of the ranges; ``tested`` : rows were held out."""
     numbers = WIDTH[measured.kind] * len(measured)
-    count = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters"
+    count, notes = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters", []
+    few = "σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
     if not tested:
-        notes.append(
-            f"{count}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "
-            "as many"
-        )
-    elif numbers < FEW * len(names):
-        notes.append(
-            f"{count}: σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
-        )
+        few = "none can be held out to test the result, and errors of the same rows say nothing; measure twice as many"
+    if not tested or numbers < FEW * len(names):
+        notes.append(f"{count}: {few}")
     if found is not None and found.elsewhere() > ELSEWHERE:
         sizes, directions = np.linalg.eigh(covariance / units[:, None] / units)
         worst = directions_named(directions[:, -1:], names)[0]

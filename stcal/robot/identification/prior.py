@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Held, Kind, State, moved, parameter_names
+from stcal.robot.identification.adjustment import Kind, State, moved, parameter_names
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, chain_parameters, elasticity_values, moved_chain
@@ -18,15 +18,11 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""
 MASS_KG = 100.0
-"""Usual mass of an arm of one metre. It grows with the square of the length, and falls to nothing from the first link
-to the last; arms on the market have 25 kg at 0.6 m, 116 kg at 1.2 m, 550 kg at 2.1 m. Compliances compensate its error,
-so that a factor of 3 does no harm."""
+"""Usual mass of an arm of one metre; a factor of 3 does no harm, as compliances compensate it."""
 BESIDE = 0.15
-"""Typical distance of a link's centre of mass from the middle of its two joints, in each direction, as a share of the
-arm's length."""
+"""Typical distance of a link's centre of mass from the middle of its two joints, as a share of the arm's length."""
 HEAVIER = 0.5
-"""σ of the factor by which an arm is heavier than usual. Without loads nothing shows this factor, and compliances
-compensate it. The torques of known masses give compliances a scale."""
+"""σ of the factor by which an arm is heavier than usual, which the torques of known masses show."""
 DOWN = np.array([0.0, 0.0, -1.0])
 SOME = 0.1
 """Share of a σ at which compliances start; at 0 moments would move nothing."""
@@ -64,8 +60,7 @@ class UsualElasticity:
 
 
 def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
-    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show how heavy the arm
-    is."""
+    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show its mass."""
     n = len(chain)
     gears = np.array([PERIODIC] * (4 * n) + [HYSTERESIS] * (n if hysteresis else 0))
     moment, beside = _moments(chain)
@@ -77,9 +72,7 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
 
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
-    """Returns the state with elasticity to be adjusted, from the robot file or nearly rigid with gravity down. The
-    payload is the mass that all rows carried, if it was one; hysteresis is included if rows have approach
-    directions."""
+    """Returns the state with elasticity to be adjusted, that of the robot file, or nearly rigid with gravity down."""
     elasticity = state.chain.elasticity
     if elasticity is None or not elasticity.compliance.any():
         n, prior = len(state.chain), usual(state.chain)
@@ -101,7 +94,7 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     n = len(chain)
     carrier = [chain.after(i) for i in range(n)]
     last = sorted(set(range(n)) - set(carrier))
-    ends = {i: chain.last_from_flange if chain.grown is None else chain.grown.ends[i] for i in last}
+    ends = {i: chain.end(i) for i in last}
     longest, above = _longest(chain, ends)
     length_m = 1e-3 * max(longest, 1.0)
     share = above - 0.5
@@ -116,8 +109,7 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray]:
-    """Returns the length, in mm, of the longest way from the first joint of a branch at the base to its end; and for
-    each joint (n,) the number of joints from it, itself included, to the farthest end."""
+    """Returns the longest way, mm, from base to an end, and the number (n,) of joints from each to its farthest end."""
     length, above = np.zeros(len(chain)), np.ones(len(chain))
     for i, end in ends.items():
         length[i] = np.linalg.norm(end.translation)
@@ -130,13 +122,11 @@ def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray
 
 
 DIFFERENCE_MM = 1e-4
-"""Step of the derivatives by differences, in mm of movement of the tool: linear to a millionth, and far above
-rounding."""
+"""Step of the derivatives by differences, in mm of movement of the tool."""
 DOUBT = 1.0
-"""σ of the logarithm of the deviations' σ: the deviations of makes of robots are known within a factor of about e."""
+"""σ of the logarithm of the deviations' σ, which are known of makes of robots within a factor of about e."""
 COAXIAL_MM = 100.0
-"""Distance of parallel axes below which an error of length across them turns θ by more than zero positions err (0.5 mm
-over 5 mrad)."""
+"""Distance of parallel axes below which an error of 0.5 mm across them turns θ by more than zero positions err."""
 LENGTH, TWIST, ZERO = 0, 1, 2
 FIXED_LENGTH, FIXED_ANGLE = 8, 9
 FIXED_MM, FIXED_RAD = 1e-4, 1e-7
@@ -155,8 +145,7 @@ SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 
 
 def adjusted(text: str) -> Adjusted:
-    """Returns the option for ``text``, names with commas, with base and tool added; raises InputError: an unknown
-    name."""
+    """Returns the option for ``text``, names with commas; raises InputError: an unknown name."""
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
         raise InputError("E-OPTION-VALUE", f"--adjust {text}: base,tool, zeros, geometry or all needed")
@@ -187,6 +176,16 @@ class Deviations:
 def dh_values(robot: Robot) -> np.ndarray:
     """Returns a, alpha, d, theta, beta of the rows, (n, 5)."""
     return np.array([astuple(row) for row in robot.rows], float)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Prior knowledge: ``value + jacobian @ step``, (p,), is 0 with ``sigma``; ``fixed`` : (p,) mask of conditions."""
+
+    value: np.ndarray
+    jacobian: np.ndarray
+    sigma: np.ndarray
+    fixed: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,8 +324,7 @@ class Placed:
 
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
-    """Returns base and tools as ``nominal``'s file form has them, stations, and starts of branches, with σ from the
-    ``covariance`` without elasticity. Positions tell no orientation of a tool, distances no base."""
+    """Returns base, tools, stations and starts of branches with σ; nan where the observations do not tell them."""
 
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)

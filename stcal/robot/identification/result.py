@@ -12,36 +12,24 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.io.files import require_written
 from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
-from stcal.robot.identification.adjustment import (
-    Kind,
-    Observed,
-    Solution,
-    State,
-    Weighting,
-    residuals,
-)
+from stcal.robot.identification.adjustment import Kind, Observed, State, Weighting, position_errors, residuals
 from stcal.robot.identification.observability import ObservabilityIndices, Predicted
-from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed, dh_values
+from stcal.robot.identification.prior import Adjusted, Placed, dh_values
+from stcal.robot.identification.problem import ArmSolution
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.identification.variances import Spread
 from stcal.robot.kinematics.file import WRITTEN_MM, RobotText, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
 
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
-"""Number of standard errors by which the held-out errors of one model must be below those of the other. Rows of one
-fold share the error of their solution, so that a standard error of independent rows is too small: for rigid arms 2
-would do for 95 %."""
+"""Standard errors by which one model must predict better; rows of one fold share the error of their solution."""
 OUTLIER_WEIGHT = 0.5
 """Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
-
-
 NO_GAIN = 0.95
 """Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
 LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
-"""Common relative change of all lengths, its probability by chance among changes of the same size, and number of
-lengths that were adjusted, from which on and down to which the scale is named."""
+"""Common relative change of all lengths, its probability by chance, and number of adjusted lengths for a note."""
 FAR_FROM_STATED = 3.0
 """Factor between the σ that residuals show and those that are stated from which on it is told."""
 MEDIAN_OF_NORMAL = 0.6745
@@ -54,33 +42,23 @@ class IdentifyOptions:
 
     Parameters
     ----------
-    observe : {"pose", "position", "distance"}, optional
-        Kind of observation to use; if not given, the richest one that was measured.
-    sigma_mm, sigma_rad : float, optional
-        σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
-    robust : bool
-        Whether outliers weigh less (Huber), and gross errors nothing at all.
-    folds : int
-        Number of folds of the cross-validation; 0 for none.
-    repeats : int, optional
-        Number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many, if not
-        given.
-    seed : int
-        Seed of the divisions.
-    partial : bool
-        Keep nominal what the data do not determine, instead of refusing the data.
-    adjust : {"all", "geometry", "zeros", "base,tool"}
-        Dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone, or
-        none. Dimensions that are fixed in the robot file stay in any case.
-    model : {"rigid", "elastic", "auto"}
-        ``elastic``: links bend under gravity and gears have periodic errors. ``auto`` takes the elastic model if it
+    observe : kind of observation to use; if not given, the richest one that was measured.
+    sigma_mm, sigma_rad : σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
+    robust : whether outliers weigh less (Huber), and gross errors nothing at all.
+    folds : number of folds of the cross-validation; 0 for none.
+    repeats : number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many,
+        if not given.
+    seed : seed of the divisions.
+    partial : keep nominal what the data do not determine, instead of refusing the data.
+    adjust : dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone,
+        or none. Dimensions that are fixed in the robot file stay in any case.
+    model : ``elastic``: links bend under gravity and gears have periodic errors. ``auto`` takes the elastic model if it
         predicts held-out rows better by more than chance, else the rigid one.
 
     Raises
     ------
-    InputError
-        A choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two
-        folds.
+    InputError : a choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer
+        than two folds.
     """
 
     observe: Kind | None = None
@@ -160,73 +138,41 @@ class Gain:
         return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjustment:
-    """A solution with its σ. ``notes`` : on iterations that did not converge."""
-
-    solution: Solution
-    weighting: Weighting
-    deviations: Deviations
-    rows: NominalRows
-    parts: Spread
-    notes: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Identified(Brief):
     """The identified robot, and how far to trust it; r observations, k parameters, n joints.
 
     Parameters
     ----------
-    robot, nominal : Robot
-        The robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
-    seen : Observed
-        The r observations.
-    adjustment : Adjustment
-        Solution, weights and σ; what is used often is a property, too.
-    names : tuple of str
-        Names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about
-        its y, rad; tool x: mm).
-    covariance : (k, k) array
-        Covariance of the parameters, rad and mm.
-    rank : int
-        Number of parameters that the data used determine.
-    ranks : dict of str to int
-        Number of parameters that these joint values determine, by kind of observation.
-    undetermined : tuple of str
-        Directions that were kept nominal, each named by its parameters.
-    nominal_mm : (r,) array
-        Errors with nominal axes, base and tools fitted.
-    held_out : HeldOutRows or None
-        Errors of the cross-validation.
-    predicted : Predicted or None
-        σ of the tool's position by the covariance; None for distances.
-    placed : tuple of Placed
-        Base and tools of the robot, with σ.
-    left : tuple of Finding or None
-        Effects found in the residuals; None if there are too few observations for a test.
-    dh_sigma : (n, 5) array
-        σ of a, alpha, d, theta, beta; mm, rad.
-    observability : ObservabilityIndices
-        Indices of the determined parameters.
-    deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of the
-        deflection of links at the usual torque, of gears and of hysteresis, rad.
-    elasticity_sigma : Elasticity or None
-        σ of the robot's elasticity where it was adjusted.
-    gain : Gain or None
-        Comparison of both models, where both were tried.
-    all_held_out : HeldOutRows or None
-        Errors of the cross-validation with all dimensions adjusted, where some are kept.
-    notes : tuple of str
-        Rows left out, and remarks on the result.
+    robot, nominal : the robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
+    seen : the r observations.
+    adjustment : solution, weights and σ; what is used often is a property, too.
+    names : names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2
+        about its y, rad; tool x: mm).
+    covariance : (k, k) array: covariance of the parameters, rad and mm.
+    rank : number of parameters that the data used determine.
+    ranks : number of parameters that these joint values determine, by kind of observation.
+    undetermined : directions that were kept nominal, each named by its parameters.
+    nominal_mm : (r,) array: errors with nominal axes, base and tools fitted.
+    held_out : errors of the cross-validation.
+    predicted : σ of the tool's position by the covariance; None for distances.
+    placed : base and tools of the robot, with σ.
+    left : effects found in the residuals; None if there are too few observations for a test.
+    dh_sigma : (n, 5) array: σ of a, alpha, d, theta, beta; mm, rad.
+    observability : indices of the determined parameters.
+    deviations : σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ
+        of the deflection of links at the usual torque, of gears and of hysteresis, rad.
+    elasticity_sigma : σ of the robot's elasticity where it was adjusted.
+    gain : comparison of both models, where both were tried.
+    all_held_out : errors of the cross-validation with all dimensions adjusted, where some are kept.
+    notes : rows left out, and remarks on the result.
     """
 
     format: ClassVar = "stcal identified 1"
     robot: Robot
     nominal: Robot
     seen: Observed
-    adjustment: Adjustment
+    adjustment: ArmSolution
     names: tuple[str, ...]
     covariance: Array
     rank: int
@@ -257,12 +203,12 @@ class Identified(Brief):
     @property
     def state(self) -> State:
         """Chain and tools as identified."""
-        return self.adjustment.solution.state
+        return self.adjustment.state
 
     @property
     def weighting(self) -> Weighting:
         """σ of the observations."""
-        return self.adjustment.weighting
+        return self.adjustment.problem.weighting
 
     @property
     def sigma0(self) -> float:
@@ -272,12 +218,12 @@ class Identified(Brief):
     @property
     def weights(self) -> np.ndarray:
         """Huber weights (r,)."""
-        return self.adjustment.solution.weights
+        return self.adjustment.weights
 
     @property
     def residuals(self) -> np.ndarray:
         """Residuals (r, 6), (r, 3) or (r, 1), measured minus modelled, rad and mm, in the instrument's axes."""
-        return self.adjustment.solution.residuals
+        return self.adjustment.residuals
 
     @property
     def fitted_mm(self) -> np.ndarray:
@@ -344,37 +290,34 @@ class IdentifiedFile(ResultFile):
     observed: str = Field(validation_alias=AliasPath("seen", "used"), description="kind of observation used")
     rank: int = Field(description="parameters determined by the data used")
     ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
-    undetermined: list[str] = Field(
-        description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
-    )
+    undetermined: list[str] = Field(description="directions kept nominal (`--partial`): `J2 y (with tool z and J1 x)`")
     notes: list[str] = Field(description="rows left out, columns not read, and remarks on the result")
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
     gain: Gain | None = Field(
-        description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
-        "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
+        description="where both were tried: RMS errors of held-out rows, `rigid_mm` and `elastic_mm`; mean by which "
+        "elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
     elasticity_sigma: ElasticityValues | None = Field(
-        description="σ of the elasticity in the robot file, a row for each joint: `compliance` (rad/Nm) about its axis "
-        "and across it, `moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
+        description="σ of the elasticity, a row for each joint: `compliance` (rad/Nm) about its axis and across it, "
+        "`moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
     )
     weighting: Weighting = Field(
-        description="σ of one coordinate, `sigma_mm`, and of one component of a rotation, `sigma_rad`, or `given` by "
-        "the rows' covariances; `factor`: σ₀ by which these are multiplied; `estimated`: which of them"
+        description="σ of a coordinate, `sigma_mm`, and of a rotation, `sigma_rad`, or `given` by covariances; "
+        "`factor`: σ₀ by which these are multiplied; `estimated`: which of them"
     )
     deviations: dict[str, float | None] = Field(
-        description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
-        "`axis_rad`, `across_rad`: of what links give way by at the usual torque, `periodic_rad`: of gears, "
-        "`hysteresis_rad`; null where it has none"
+        description="σ of this robot about nominal: `length_mm`, `twist_rad`, `zero_rad`, links by gravity `axis_rad`, "
+        "`across_rad`, gears `periodic_rad`, `hysteresis_rad`; null where it has none"
     )
     errors: dict[ByName, Figures] = Field(
         description="position errors, mm: `rows`, `mean`, `median`, `rms`, `p95`, `max` of `nominal` (base and tools "
-        "fitted), `identified`, `held_out`, `all_held_out` (were all dimensions adjusted); and the same of the "
-        "predicted `sigma` of the tool's position, and `sigma_over_ranges` of the joints, there with what is in `left`"
+        "fitted), `identified`, `held_out`, `all_held_out` (were all dimensions adjusted); and of the predicted "
+        "`sigma` of the tool's position, and `sigma_over_ranges` of the joints, with what is in `left`"
     )
     observability: ObservabilityIndices = Field(
         description="`o1` … `o5` (Borm & Menq; `o2` Driels & Pathre; `o3` Nahvi, Hollerbach & Hayward; `o4` Nahvi & "
-        "Hollerbach; `o5` Sun & Hollerbach) of the Jacobian over σ, an angle being the arc that it makes at the arm's "
-        "whole length; 1/mm, `o2` without unit; 1/`o3` is the σ in mm of the combination that is seen worst"
+        "Hollerbach; `o5` Sun & Hollerbach) of the Jacobian over σ, an angle being its arc at the arm's whole length; "
+        "1/mm, `o2` without unit"
     )
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
@@ -390,10 +333,9 @@ class IdentifiedFile(ResultFile):
     fitted_mm: Vector = Field(description="their errors")
     weights: Vector = Field(description="their weights; below a half: outliers")
     left: list[Finding] | None = Field(
-        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
-        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
-        "number of tests, `line` of the first row after a jump along their order (null: no jump), `advice`; null where "
-        "rows are too few to tell"
+        description="what the residuals go with: `what` in words, `joint` and `turns` (0: none), `effect_mm`, "
+        "`effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the number of tests, "
+        "`line` of the first row after a jump, `advice`; null where rows are too few to tell"
     )
 
 
@@ -402,8 +344,7 @@ OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
 
 
 def misgivings(result: Identified) -> tuple[str, ...]:
-    """Returns notes on stated σ that residuals contradict, no gain over the nominal robot, or lengths that differ by
-    one factor."""
+    """Returns notes on contradicted σ, no gain over the nominal robot, or lengths that differ by one factor."""
     notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
     if result.held_out is not None:
         before, after = (result.errors[key].rms for key in ("nominal", "held_out"))
@@ -438,7 +379,7 @@ def misgivings(result: Identified) -> tuple[str, ...]:
 
 def _stated_otherwise(result: Identified) -> str | None:
     """Returns a note on stated σ that are far from what the residuals show, None where they are not."""
-    sigma = result.weighting
+    sigma, kind = result.weighting, result.seen.kind
     few = np.count_nonzero(result.weights < OUTLIER_WEIGHT)
     remedy = "check --sigma-mm and --sigma-rad, or covariances, and their units; or leave them out, to have σ estimated"
     if 2 * few > len(result.weights):
@@ -446,29 +387,14 @@ def _stated_otherwise(result: Identified) -> str | None:
             f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small: "
             f"{remedy}"
         )
-    if sigma.given:
-        ratio, what = sigma.factor, "residuals are"
-    else:
-        white = sigma.factor * sigma.whiten(result.residuals, result.seen)
-        columns = replace(sigma, estimated=()).columns(white.shape[1])
-        size = {
-            name: float(np.median(np.abs(white[:, own]))) / MEDIAN_OF_NORMAL
-            for name, own in columns.items()
-            if name not in sigma.estimated
-        }
-        if not size:
-            return None
-        name = max(size, key=lambda each: abs(np.log(max(size[each], 1e-12))))
-        ratio, what = size[name], f"residuals of {'orientations' if name == 'rad' else result.seen.kind + 's'} are"
-        what = what.replace("poses", "positions")
-    if 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED:
-        return None
-    return f"{what} {ratio:.2g} times the σ that are stated: {remedy}"
-
-
-def position_errors(found: np.ndarray) -> np.ndarray:
-    """Returns the position errors (r,), mm."""
-    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
+    ratios = {"residuals": sigma.factor}
+    if not sigma.given:
+        medians = replace(sigma, estimated=()).medians(sigma.factor * sigma.whiten(result.residuals, result.seen))
+        names = {"rad": "residuals of orientations", "mm": f"residuals of {kind}s".replace("poses", "positions")}
+        ratios = {names[n]: v / MEDIAN_OF_NORMAL for n, v in medians.items() if n not in sigma.estimated}
+    far = {what: ratio for what, ratio in ratios.items() if not 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED}
+    what = max(far, key=lambda each: abs(np.log(max(far[each], 1e-12))), default="")
+    return f"{what} are {far[what]:.2g} times the σ that are stated: {remedy}" if far else None
 
 
 def require_identified_written(path: Path | str, result: Identified) -> None:

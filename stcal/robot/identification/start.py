@@ -15,7 +15,8 @@ from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
-from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
+from stcal.robot.identification.adjustment import State, observed, residuals, tips_of
+from stcal.robot.identification.problem import USELESS_MM
 from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
@@ -25,27 +26,19 @@ from stcal.robot.kinematics.model import Robot
 Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))
 ROUNDS = 500
-SETTLED = 1e-5
-"""Largest predicted decrease of the last step, as a share of the squared misfit, which is compared with others."""
-REGULAR = 1e-10
-"""Smallest damping. It keeps parameters that these positions leave open at their start, such as the point of a tool
-that never turned."""
+SETTLED, REGULAR = 1e-5, 1e-10
+"""Largest predicted decrease of the last step, as a share of the squared misfit, which is compared with others; and
+smallest damping, which keeps what these positions leave open at its start, as the point of a tool that never turned."""
 NEARLY = 1e-3
-"""Share of the squared misfit that the next step may still be predicted to remove. Where the robot file does not belong
-to the data, the valley is flat, and the misfit shows it."""
+"""Share of the squared misfit that the next step may still gain: of a wrong robot file the valley is flat."""
 STILL_MM = 0.01
-QUARTERS_DEG = (90, -90, 180)
-"""Errors of a joint's zero that conventions of a robot's home position cause."""
-ZERO_STEP_DEG = 30
-"""Step at which other errors of a joint's zero are looked for; between two steps there is one minimum."""
+QUARTERS_DEG, ZERO_STEP_DEG = (90, -90, 180), 30
+"""Errors of a joint's zero by conventions of the home position, and step at which others are looked for."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
-MOST_NAMED = 3
-"""Largest number of mistakes that explain the data equally and are named, as a joint's zero off by 180° and another
-joint's sign may."""
-SHOWN = 6
-"""Number of lines that a message names."""
+MOST_NAMED, SHOWN = 3, 6
+"""Largest numbers of mistakes that explain the data equally and are named, and of lines that a message names."""
 GUESS_ROWS = 60
 """Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
 MOST_JOINTS = 8
@@ -55,8 +48,7 @@ LEAST_ORIENTATIONS = 5
 PROBED, MOST_MOVES = 8, 4
 """Number of rows by which the place of an instrument is found again, and largest number of times that it moves."""
 AROUND = 0.1
-"""Distance from the given tool point at which distances are fitted from other starts too, as a share of the arm's
-reach."""
+"""Distance from the given tool point at which distances are fitted from other starts, as a share of the reach."""
 
 
 def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
@@ -67,10 +59,18 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     """
     if data.positions is not None and len(set(data.stations)) > 1:
         return _with_stations(robot, data, fit)
-    _moves(data)
     named = sorted(set(data.targets))
-    if robot.tree is not None:
-        _carried(robot, data, named)
+    _require_motion(data, named)
+    missing = [] if robot.tree is None else [name for name in named if name not in robot.tree.carriers]
+    if missing:
+        target, key = "the tool of rows without a target", "[tool] joint"
+        if missing[0]:
+            target, key = f"target {missing[0]}", "it a [[target]] with joint"
+        raise InputError(
+            "E-ROBOT-TREE",
+            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
+            f"{key}",
+        )
     if "tool" in fit:
         tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in named}
     else:
@@ -90,19 +90,6 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
         require_orientations(data.where, data.targets, flange, data.rotations, len(data) >= LEAST_ORIENTATIONS)
     return replace(state, stations={data.stations[0]: Rigid()})
-
-
-def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
-    """Refuses targets that the robot file of a tree puts on no branch."""
-    assert robot.tree is not None
-    missing = [name for name in named if name not in robot.tree.carriers]
-    if missing:
-        target = f"target {missing[0]}" if missing[0] else "the tool of rows without a target"
-        raise InputError(
-            "E-ROBOT-TREE",
-            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
-            + ("it a [[target]] with joint" if missing[0] else "[tool] joint"),
-        )
 
 
 def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
@@ -142,7 +129,7 @@ def _extent(data: Measurements) -> float:
     return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
 
 
-def _moves(data: Measurements) -> None:
+def _require_motion(data: Measurements, targets: list[str]) -> None:
     if data.positions is None:
         if np.ptp(data.lengths()[0]) < STILL_MM:
             raise DegenerateError(
@@ -150,7 +137,7 @@ def _moves(data: Measurements) -> None:
                 f"{data.where}: all distances are equal; positions apart from one another needed",
             )
         return
-    for name in sorted(set(data.targets)):
+    for name in targets:
         xyz = data.positions[[t == name for t in data.targets]]
         moved = float(np.linalg.norm(np.ptp(xyz, axis=0)))
         if moved < STILL_MM and len(xyz) > 1:
@@ -173,7 +160,13 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
         points, misfit = _points_of_distances(robot, flange, data, rows, points, "tool" in fit)
         return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
     if "base" in fit:
-        _off_a_line(data)
+        extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
+        if len(extents) < 2 or extents[1] <= STILL_MM:
+            raise DegenerateError(
+                "E-IDENTIFY-UNDETERMINED",
+                f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that the instrument's pose is "
+                "not determined; move joints that take the target off the line",
+            )
     given = None if "base" in fit else robot.world_from_base
     base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
     if data.rotations is not None and "tool" in fit:
@@ -185,16 +178,6 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
     tools = {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}
     placed = replace(robot, world_from_base=base)
     return State(placed.chain(), tools), misfit
-
-
-def _off_a_line(data: Measurements) -> None:
-    extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
-    if len(extents) < 2 or extents[1] <= STILL_MM:
-        raise DegenerateError(
-            "E-IDENTIFY-UNDETERMINED",
-            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that the instrument's pose is "
-            "not determined; move joints that take the target off the line",
-        )
 
 
 def _base_and_points(
@@ -274,29 +257,28 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     """Raises an error that says what is wrong with the data, or with the robot file."""
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; "
-    thinned, most = _thinned(data), min(EXPLAINS * misfit / extent, FITS)
+    thinned = _thinned(data)
     levels = (
         [("", "", robot, data)],
         chain(_single(robot, thinned), _late(robot, data)),
         _moves_of(robot, data, tools),
         _any_zero(robot, thinned, tools),
+        _pairs(robot, thinned),
     )
-    for level in (*levels, _pairs(robot, thinned)):
+    most, found = min(EXPLAINS * misfit / extent, FITS), []
+    for level in levels:  # one after the other: what a level tries may be impossible where an earlier one explains
         cases = (
             Candidate(f"{what}; {cure}" if what else "", partial(tuple, (variant, guess)))
             for what, cure, variant, guess in level
         )
-        found = explain(cases, lambda case: _fitting(case[0], case[1], tools)[0], most)
-        if found:
-            words = []
-            for each, _ in found[:MOST_NAMED]:
-                variant, guess = each.change()
-                far = _not_there(guess, _fitting(variant, guess, tools)[1])
-                words.append(", and ".join(filter(None, (each.words, far))))
-            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {', or if '.join(words)}")
-    raise InputError(
-        "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
-    )
+        if found := explain(cases, lambda case: _fitting(case, tools)[0], most):
+            break
+    words = []
+    for each, _ in found[:MOST_NAMED]:
+        far = _not_there(each.change()[1], _fitting(each.change(), tools)[1])
+        words.append(", and ".join(filter(None, (each.words, far))))
+    cause = "check D-H rows and convention, the order and zero of joints, coupling, and units"
+    raise InputError("E-IDENTIFY-MISFIT", says + (f"it would fit if {', or if '.join(words)}" if words else cause))
 
 
 def _thinned(data: Measurements) -> Measurements:
@@ -306,8 +288,9 @@ def _thinned(data: Measurements) -> Measurements:
     return data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
 
 
-def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
+def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
     """Returns the RMS misfit as a share of the spread, and a mask (m,) of rows that are far off and take no part."""
+    robot, data = case
     near = np.ones(len(data), bool)
     for _ in range(TRIMS):
         used = data if near.all() else data[near]
@@ -341,17 +324,12 @@ def _late(robot: Robot, data: Measurements) -> Iterator[Case]:
         return
     cure = "pair each position with the joint values of its moment"
     for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
-        yield (
-            f"joint values stood one row further {way}",
-            cure,
-            robot,
-            _thinned(replace(data[places], q=data.q[joints])),
-        )
+        shifted = _thinned(replace(data[places], q=data.q[joints]))
+        yield f"joint values stood one row further {way}", cure, robot, shifted
 
 
 def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
-    """Yields the rows up to the first at which the instrument, the base or the target seems to stand elsewhere, if the
-    rows between such changes all fit by themselves."""
+    """Yields the rows before instrument, base or target moved, if the rows between moves all fit by themselves."""
     if data.positions is None or robot.tree is not None:
         return
     starts = [0]
@@ -380,13 +358,13 @@ def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
 
 def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields frequent mistakes, one at a time."""
-    q = data.q
-    in_degrees = replace(data, q=q * np.where(robot.prismatic, 1.0, 180 / np.pi))
-    yield "joint values are radians in columns of degrees", "call the columns q1_rad …", robot, in_degrees
-    in_radians = replace(data, q=q / np.where(robot.prismatic, 1.0, 180 / np.pi))
-    yield "joint values are degrees in columns of radians", "call the columns q1_deg …", robot, in_radians
-    reversed_ = replace(data, q=np.where(robot.prismatic, q, -q))
-    yield "all joint values had the opposite sign", "check the rows and the joints' directions", robot, reversed_
+    q, sliding, n = data.q, robot.prismatic, len(robot.rows)
+    for what, cure, values in (
+        ("joint values are radians in columns of degrees", "call the columns q1_rad …", q * (180 / np.pi)),
+        ("joint values are degrees in columns of radians", "call the columns q1_deg …", q / (180 / np.pi)),
+        ("all joint values had the opposite sign", "check the rows and the joints' directions", -q),
+    ):
+        yield what, cure, robot, replace(data, q=np.where(sliding, q, values))
     lengths = {"distances": data.distances, "positions": data.positions}
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
@@ -399,17 +377,15 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
         rows = tuple(replace(row, alpha=np.degrees(row.alpha), theta=np.degrees(row.theta)) for row in robot.rows)
         yield "angles of the robot file were radians", "write them in degrees", replace(robot, rows=rows), data
-    types = [joint.type for joint in robot.joints]
-    for i, k in combinations(range(len(types)), 2) if len(types) <= MOST_JOINTS else ():
-        if types[i] == types[k]:
-            order = list(range(len(types)))
-            order[i], order[k] = k, i
-            what, rows = f"{i + 1} and {k + 1} were exchanged", tuple(robot.rows[r] for r in order)
+    for i, k in combinations(range(n), 2) if n <= MOST_JOINTS else ():
+        if sliding[i] == sliding[k]:
+            order = [{i: k, k: i}.get(r, r) for r in range(n)]
             columns = f"columns q{i + 1} and q{k + 1} were exchanged"
             yield columns, "correct the order of the joint values", robot, replace(data, q=q[:, order])
             if robot.tree is None:
-                yield f"rows {what}", "correct the robot file", replace(robot, rows=rows), data
-    if len(set(types)) == 1:
+                what, rows = f"rows {i + 1} and {k + 1} were exchanged", tuple(robot.rows[r] for r in order)
+                yield what, "correct the robot file", replace(robot, rows=rows), data
+    if sliding.all() or not sliding.any():
         backward = replace(data, q=q[:, ::-1])
         yield "joint values were in the opposite order, the last joint first", "correct the columns", robot, backward
     if data.positions is None:
@@ -491,12 +467,8 @@ def _couplings(robot: Robot, data: Measurements) -> Iterator[Case]:
     if (robot.coupling != np.eye(n)).any():
         yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
         other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
-        yield (
-            "the joints were coupled with the other sign",
-            "change the signs of coupling off its diagonal",
-            other,
-            data,
-        )
+        cure = "change the signs of coupling off its diagonal"
+        yield "the joints were coupled with the other sign", cure, other, data
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)
@@ -516,7 +488,7 @@ def _inner(robot: Robot) -> list[int]:
 
 def _turned(robot: Robot, turns_deg: Mapping[int, float]) -> Robot:
     """Returns the robot with θ of its rows larger by these angles."""
-    rows = enumerate(robot.rows)
-    return replace(
-        robot, rows=tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in rows)
-    )
+    rows = list(robot.rows)
+    for i, turn in turns_deg.items():
+        rows[i] = replace(rows[i], theta=rows[i].theta + np.radians(turn))
+    return replace(robot, rows=tuple(rows))

@@ -18,7 +18,7 @@ from stcal.robot.identification.adjustment import (
     tips_of,
     tool_motions,
 )
-from stcal.robot.identification.variances import GROSS
+from stcal.robot.identification.problem import GROSS
 from stcal.robot.kinematics.forward import joint_frames, joint_motions
 from stcal.row_order import Change, changes_along
 
@@ -31,8 +31,7 @@ LEAST_SHARE, LEAST_MM, LEAST_RAD = 0.01, 1e-3, 1e-6
 LEAST_FREEDOM = 10
 """Smallest number of degrees of freedom that allows a test."""
 NEW, SAME = 1e-3, 1e-9
-"""Share of a motion that must be left after the parameters absorb theirs; and share below which a remainder is
-rounding."""
+"""Share of a motion that must be left beside the parameters, and share below which a remainder is rounding."""
 SHARED = 4
 """Number of distances from one position from which on the error of this position counts as a parameter."""
 TURNS = {1: "once a turn", 2: "twice a turn"}
@@ -73,7 +72,7 @@ def left(
     world_from_base: Rigid,
     measured: Observed,
     weighting: Weighting,
-    explained: np.ndarray,
+    explained: np.ndarray | None = None,
     weights: np.ndarray | None = None,
 ) -> tuple[Finding, ...] | None:
     """Returns the effects found in the residuals of ``state``, at most three, the strongest first; None for too few
@@ -84,25 +83,41 @@ def left(
     are scale, linear terms, and the distance from the base's axis. Along the order of the rows, a jump or drift of
     instrument, base, target or a joint's zero is tried with all rows, since half of them may seem to be errors.
 
-    ``explained`` : (r, w, k) derivatives by the fitted parameters; ``weights`` : (r,), those below 0.5 are left out.
+    ``explained`` : (r, w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are
+    left out.
     """
-    errors = residuals(state, measured)
-    candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
+    if explained is None:
+        explained = jacobian(state, measured)
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
-    good = np.ones(len(errors), bool) if weights is None else weights >= GROSS
-    root = np.sqrt(np.ones(len(errors)) if weights is None else weights) * good
-    rest = _Rest.of(errors, explained, candidates, weighting, measured, root)
+    rows = _Weighted(residuals(state, measured), weighting, measured)
+    candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
+    tests = len(candidates) + len(order)
+    good = np.ones(len(rows.errors), bool) if weights is None else weights >= GROSS
+    root = np.sqrt(np.ones(len(good)) if weights is None else weights) * good
+    rest = _Rest.of(rows, explained, candidates, root)
     findings: list[Finding] = []
     while len(findings) < MOST:
-        moved = _moved_meanwhile(order, errors, explained, weighting, measured, len(candidates) + len(order))
-        beyond_chance = [found for found in (rest.strongest(len(order)), moved) if found is not None]
+        tried = rest.strongest(len(order)), _moved_meanwhile(rows, order, explained, tests)
+        beyond_chance = [found for found in tried if found is not None]
         if not beyond_chance:
             break
         found = min(beyond_chance, key=lambda each: each.log_p)
         findings.append(found.finding)
         explained = np.concatenate([explained, found.motions], axis=2)
-        rest = found.rest or _Rest.of(errors, explained, candidates, weighting, measured, found.root)
+        rest = found.rest or _Rest.of(rows, explained, candidates, found.root)
     return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Weighted:
+    """Residuals (r, w) of observations, with their weights."""
+
+    errors: np.ndarray
+    weighting: Weighting
+    measured: Observed
+
+    def white(self, values: np.ndarray) -> np.ndarray:
+        return self.weighting.whiten(values, self.measured)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,6 +145,12 @@ class _Found:
     root: np.ndarray
     rest: "_Rest | None" = None
 
+    def worth_saying(self) -> "_Found | None":
+        """Returns the finding if it is beyond chance, and not tiny."""
+        found = self.finding
+        tiny = found.share < LEAST_SHARE or (found.effect_mm < LEAST_MM and found.effect_rad < LEAST_RAD)
+        return None if tiny or self.log_p > np.log(LEVEL) else self
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rest:
@@ -147,30 +168,22 @@ class _Rest:
     effects: list[tuple[_Effect, np.ndarray]]
 
     @classmethod
-    def of(
-        cls,
-        errors: np.ndarray,
-        explained: np.ndarray,
-        candidates: list[_Effect],
-        weighting: Weighting,
-        measured: Observed,
-        root: np.ndarray,
-    ) -> "_Rest":
-        """Returns the unexplained part of ``errors`` (r, w) after the motions ``explained`` (r, w, k)."""
+    def of(cls, rows: _Weighted, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray) -> "_Rest":
+        """Returns the residuals that the motions ``explained`` (r, w, k) leave."""
 
         def white(values: np.ndarray) -> np.ndarray:
-            return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)
+            return (root[:, None, None] * rows.white(values)).reshape(rows.errors.size, -1)
 
         good = root > 0
         fitted = _basis(_unit(white(explained)), SAME)
-        before = white(errors[..., None]).ravel()
+        before = white(rows.errors[..., None]).ravel()
         remaining = before - fitted @ (fitted.T @ before)
-        freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
+        freedom = int(good.sum()) * rows.errors.shape[1] - fitted.shape[1]
         effects = [(each, white(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
         square = float(remaining @ remaining)
-        return cls(errors[good], before, fitted, remaining, square, freedom, root, effects)
+        return cls(rows.errors[good], before, fitted, remaining, square, freedom, root, effects)
 
-    def _effect(self, takes: np.ndarray, part: slice) -> float:
+    def _size(self, takes: np.ndarray, part: slice) -> float:
         """Returns the RMS of ``takes`` (N,), rad or mm."""
         width = self.errors.shape[1]
         unit, size, taken = (
@@ -180,22 +193,15 @@ class _Rest:
 
     def strongest(self, others: int) -> _Found | None:
         """Returns the candidate that explains most beyond chance; ``others`` : number of further tests."""
-        tried = [
-            (each, test)
-            for each, values in self.effects
-            if (test := _tested(self.remaining, self.fitted, values, self.freedom))
-        ]
+        tried = [(each, test) for each, values in self.effects if (test := self._tested(values))]
         if not tried:
             return None
         candidate, (log_p, takes, new) = min(tried, key=lambda each: each[1][0])
         amplitude = np.sqrt(2) if candidate.turns else 1.0
-        mm = float(amplitude * self._effect(takes, slice(-3, None)))
-        rad = float(amplitude * self._effect(takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
-        share = float(takes @ takes) / max(self.square, 1e-300)
+        mm = float(amplitude * self._size(takes, slice(-3, None)))
+        rad = float(amplitude * self._size(takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
         log_p += float(np.log(len(tried) + others))
-        if log_p > np.log(LEVEL) or share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
-            return None
-        p = float(np.exp(min(log_p, 0.0)))
+        share, p = float(takes @ takes) / max(self.square, 1e-300), float(np.exp(min(log_p, 0.0)))
         rest = replace(
             self,
             fitted=np.hstack([self.fitted, new]),
@@ -203,23 +209,20 @@ class _Rest:
             freedom=self.freedom - new.shape[1],
         )
         finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
-        return _Found(finding, log_p, candidate.motions, self.root, rest)
+        return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
 
-
-def _tested(
-    rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: int
-) -> tuple[float, np.ndarray, np.ndarray] | None:
-    """Returns the F test of what ``values`` (N, c) add to ``known``: log p, the part (N,) of the residuals that it
-    explains, and a basis (N, c) of it; None if nothing, or without degrees of freedom."""
-    values = _unit(values)
-    new = _basis(values - known @ (known.T @ values), NEW)
-    c = new.shape[1]
-    if c == 0 or freedom - c < 1:
-        return None
-    takes = new @ (new.T @ rest)
-    left_over = rest - takes
-    ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (freedom - c), 1e-300)
-    return float(f_distribution.logsf(ratio, c, freedom - c)), takes, new
+    def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """Returns the F test of what ``values`` (N, c) add: log p, the part (N,) of the residuals that it explains, and
+        a basis (N, c) of it; None if nothing, or without degrees of freedom."""
+        values = _unit(values)
+        new = _basis(values - self.fitted @ (self.fitted.T @ values), NEW)
+        c = new.shape[1]
+        if c == 0 or self.freedom - c < 1:
+            return None
+        takes = new @ (new.T @ self.remaining)
+        left_over = self.remaining - takes
+        ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (self.freedom - c), 1e-300)
+        return float(f_distribution.logsf(ratio, c, self.freedom - c)), takes, new
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
@@ -235,8 +238,7 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
 
 
 def _shared(state: State, measured: Observed) -> np.ndarray:
-    """Returns shifts (r, w, c) of positions from which several distances start. The error of such a position is in all
-    of its distances, which looks like an effect of place."""
+    """Returns shifts (r, w, c) of positions from which several distances start: each is in all of its distances."""
     starts = [row for row in np.unique(measured.second) if (measured.second == row).sum() >= SHARED]
     if measured.kind != "distance" or not starts:
         return np.zeros((len(measured), WIDTH[measured.kind], 0))
@@ -272,43 +274,33 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     return order
 
 
-def _moved_meanwhile(
-    order: list[_Effect],
-    errors: np.ndarray,
-    explained: np.ndarray,
-    weighting: Weighting,
-    measured: Observed,
-    tests: int,
-) -> _Found | None:
+def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarray, tests: int) -> _Found | None:
     """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
-    white = weighting.whiten(errors, measured), weighting.whiten(explained, measured)
-    changes = changes_along(*white, [weighting.whiten(each.motions, measured) for each in order])
+    motions = [rows.white(each.motions) for each in order]
+    changes = changes_along(rows.white(rows.errors), rows.white(explained), motions)
     found = [(each, change) for each, change in zip(order, changes, strict=True) if change is not None]
     if not found:
         return None
     moved, change = min(found, key=lambda each: each[1].log_p)
     log_p = change.log_p + float(np.log(tests))
     mm, rad = _size(moved, change)
-    if log_p > np.log(LEVEL) or change.share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
-        return None
-    lines = measured.lines
-    if change.kind == "drift":
-        what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
-    else:
+    what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
+    if change.kind != "drift":
+        lines = rows.measured.lines
         line, advice = lines[change.row], moved.advice
         likely = f"{lines[change.first]} to {lines[change.last]}"
         where = f"line {line}" + (f" ({likely} as likely)" if change.first < change.last else "")
         what = f"the order of the rows, {moved.what} from {where} on"
     p = float(np.exp(min(log_p, 0.0)))
     finding = Finding(what, moved.joint, 0, mm, rad, change.share, p, line, advice)
-    return _Found(finding, log_p, change.moves[:, None, None] * moved.motions, change.good.astype(float))
+    taken = change.moves[:, None, None] * moved.motions
+    return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
-    """Returns the jump or the drift along the order of the rows beside all parameters of an arm, each row of the same
-    σ; None if there is none beyond chance, or it explains no more than ``share`` of the squares."""
-    order, one = _order(state, measured), Weighting(1.0, 1.0)
-    found = _moved_meanwhile(order, residuals(state, measured), jacobian(state, measured), one, measured, len(order))
+    """Returns the jump or drift along the rows, of equal σ; None without one of more than ``share`` of the squares."""
+    order, rows = _order(state, measured), _Weighted(residuals(state, measured), Weighting(1.0, 1.0), measured)
+    found = _moved_meanwhile(rows, order, jacobian(state, measured), len(order))
     return found.finding if found is not None and found.finding.share > share else None
 
 

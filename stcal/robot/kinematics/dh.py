@@ -25,11 +25,9 @@ from stcal.robot.kinematics.model import (
 )
 
 PARALLEL_RAD = np.radians(1.0)
-"""Angle between axes below which Hayati's β is used. There the foot of the common normal is far away, and moves by
-metres if an axis turns by micro-radians."""
+"""Angle between axes below which Hayati's β is used: the foot of the common normal is metres away."""
 SAME_AXIS_MM = 1e-10
-"""Distance below which parallel axes count as one line, as in a SCARA's spindle. Then θ is free; the nominal θ is
-kept."""
+"""Distance below which parallel axes count as one line: θ is free, and the nominal one is kept."""
 
 ROUNDING, ROUNDING_MM = 1e-12, 1e-9
 """Tolerances for the rounding error of a product of a dozen transforms."""
@@ -80,7 +78,6 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
         return nominal_end.inverse() @ passed[i]
 
-    ends = [chain.last_from_flange] * n if chain.grown is None else chain.grown.ends
     base, tree = begin(0), nominal.tree
     if tree is not None:
         before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
@@ -89,7 +86,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal,
         rows=tuple(rows),
         world_from_base=base,
-        tools={name: end(k := chain.carrier(name)) @ ends[k] @ tool for name, tool in tools.items()},
+        tools={name: end(k := chain.carrier(name)) @ chain.end(k) @ tool for name, tool in tools.items()},
         elasticity=None,
         tree=tree,
     )
@@ -100,9 +97,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
 
 
 def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_loaded: Rigid) -> Elasticity:
-    """Returns the elasticity of ``chain`` in the joint frames of the rigid ``robot``, which are turned about the
-    joints' axes and shifted along them: pivots keep their points. ``flange_from_loaded`` : frame of the loaded
-    joint."""
+    """Returns the elasticity of ``chain`` in the joint frames of ``robot``: pivots keep their points."""
     zero = np.zeros((1, len(chain)))
     of_rows, rows_at = joint_frames(robot.chain(), zero)
     of_chain, chain_at = joint_frames(replace(chain, elasticity=None), zero)
@@ -157,8 +152,7 @@ def _near(angle: float, nominal: float) -> float:
 def robot_between(
     chain: Chain, tools: Mapping[str, Rigid], name: str, convention: Convention, joints: tuple[Joint, ...]
 ) -> Robot:
-    """Returns a robot with these axes and tools (flange_from_tool), without a nominal robot. Base and tools absorb what
-    a row without β cannot take."""
+    """Returns the robot with these axes and tools, without a nominal one; base and tools absorb what rows cannot."""
     bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling, unusual_size=True)
     hints = list(bare.rows)
     robot = _with_ends(chain, tools, bare)
@@ -219,8 +213,7 @@ def _angle(value: float) -> float:
 FITS = 0.05
 """A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
 TURNED_RAD = 0.2
-"""Orientations of a robot that fits by its positions are within this of the nominal ones, RMS; the zeros of its joints,
-and the base as positions have it, are off by less than half of that (:data:`FITS`)."""
+"""Largest RMS difference of orientations from nominal ones; errors of zeros and base are less than half of it."""
 
 
 MOST_TOOLS = 200

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, Field
 
 from stcal.errors import InputError
@@ -35,10 +36,14 @@ OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
 MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
 WRITTEN_MM = 1e-5
-"""Largest difference of a place, mm, between a written robot file and what was reported: decimals of angles in degrees
-move a tool by 1e-11 mm, and a chain of 60 joints by less than 1e-7 mm."""
+"""Largest difference, mm, between a written robot file and what was reported: far above that of decimals."""
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
+_FORM = {
+    "standard": "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)",
+    "modified": "Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)",
+}
+_KEYS = {"a": "a_mm", "alpha": "alpha_deg", "d": "d_mm", "theta": "theta_deg", "beta": "beta_deg"}
 
 
 class _CarriedFile(PoseEntry):
@@ -113,19 +118,16 @@ def load_robot(path: str | Path) -> Robot:
 
     Parameters
     ----------
-    path : str or Path
-        ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    path : ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
 
     Returns
     -------
-    Robot
-        Lengths in mm, angles in rad.
+    Robot : lengths in mm, angles in rad.
 
     Raises
     ------
-    InputError
-        Unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix that does
-        not fit, quaternions that are not unit; the message names the file and the place.
+    InputError : unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix
+        that does not fit, quaternions that are not unit; the message names the file and the place.
     """
     if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
         raise InputError(
@@ -213,15 +215,12 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 
     Parameters
     ----------
-    robot : Robot
-        What to write.
-    comments : sequence of str
-        Lines to stand at the top.
+    robot : what to write.
+    comments : lines to stand at the top.
 
     Returns
     -------
-    str
-        TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    str : TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
     """
     lines = [f"# {comment}" for comment in comments]
     lines += [
@@ -230,15 +229,14 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
         *stated_unusual(longest_link(robot.rows)),
     ]
     if (robot.coupling != np.eye(len(robot.rows))).any():
-        rows = ", ".join(_numbers(row) for row in robot.coupling)
-        lines += ["# kinematic joint values from the controller's", f"coupling = [{rows}]"]
+        lines += ["# kinematic joint values from the controller's", f"coupling = {_number(robot.coupling)}"]
     mounts, carriers = ({}, {}) if robot.tree is None else (robot.tree.mounts, robot.tree.carriers)
     for i, (row, joint) in enumerate(zip(robot.rows, robot.joints, strict=True)):
         lines += ["", "[[joint]]", f'type = "{joint.type}"']
-        lines += [f"a_mm = {_number(row.a)}", f"alpha_deg = {_number(np.degrees(row.alpha))}"]
-        lines += [f"d_mm = {_number(row.d)}", f"theta_deg = {_number(np.degrees(row.theta))}"]
-        if row.beta:
-            lines.append(f"beta_deg = {_number(np.degrees(row.beta))}")
+        for name, key in _KEYS.items():
+            value = getattr(row, name)
+            if value or name != "beta":
+                lines.append(f"{key} = {_number(np.degrees(value) if key.endswith('deg') else value)}")
         unit, of_unit = ("deg", np.degrees) if joint.type == "revolute" else ("mm", float)
         lines += [
             f"{end}_{unit} = {_number(round(of_unit(value), LIMIT_DIGITS))}"
@@ -268,33 +266,24 @@ RobotText = Annotated[str, BeforeValidator(lambda robot: robot_toml(robot) if is
 
 def _elasticity_lines(elasticity: Elasticity) -> list[str]:
     axis, across = elasticity.compliance.T
-
-    def rows(values: np.ndarray) -> str:
-        return f"[{', '.join(_numbers(row) for row in values)}]"
-
     lines = [
         "[elasticity]  # one entry for each joint; compliance about its axis and across it",
-        f"gravity = {_numbers(elasticity.gravity)}  # in the base",
-        f"axis_rad_per_Nm = {_numbers(axis)}",
-        f"across_rad_per_Nm = {_numbers(across)}",
-        f"moment_Nm = {rows(elasticity.moment)}",
+        f"gravity = {_number(elasticity.gravity)}  # in the base",
+        f"axis_rad_per_Nm = {_number(axis)}",
+        f"across_rad_per_Nm = {_number(across)}",
+        f"moment_Nm = {_number(elasticity.moment)}",
         "# of sin q, cos q, sin 2q, cos 2q",
-        f"periodic_rad = {rows(elasticity.periodic)}",
+        f"periodic_rad = {_number(elasticity.periodic)}",
     ]
     if elasticity.hysteresis.any():
-        lines.append(f"hysteresis_rad = {_numbers(elasticity.hysteresis)}  # half of it: farther if it came from below")
+        lines.append(f"hysteresis_rad = {_number(elasticity.hysteresis)}  # half of it: farther if it came from below")
     if elasticity.pivot.any():
-        lines.append(
-            f"pivot_mm = {rows(elasticity.pivot)}  # in the joints' frames: where the links turn when they give way"
-        )
+        pivot = _number(elasticity.pivot)
+        lines.append(f"pivot_mm = {pivot}  # in the joints' frames: where the links turn when they give way")
     if elasticity.payload_kg or elasticity.payload_centre.any():
         lines.append(f"payload_kg = {_number(elasticity.payload_kg)}")
-        lines.append(f"payload_centre_mm = {_numbers(elasticity.payload_centre)}  # in the frame of the flange")
+        lines.append(f"payload_centre_mm = {_number(elasticity.payload_centre)}  # in the frame of the flange")
     return lines
-
-
-def _numbers(values: np.ndarray) -> str:
-    return f"[{', '.join(_number(value) for value in values)}]"
 
 
 @require_arguments
@@ -303,17 +292,13 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
 
     Parameters
     ----------
-    path : str or Path
-        File to write; an existing one is replaced.
-    robot : Robot
-        What to write.
-    comments : sequence of str
-        Lines to stand at the top.
+    path : file to write; an existing one is replaced.
+    robot : what to write.
+    comments : lines to stand at the top.
 
     Raises
     ------
-    InputError
-        It cannot be written.
+    InputError : it cannot be written.
     """
     save(Path(path), robot_toml(robot, comments))
     require_robot_written(path, robot)
@@ -325,9 +310,7 @@ def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = 
 
     Raises ConvergenceError: the file cannot be read again, or an axis or a pose of a tool differs.
     """
-    q = fixed_values(len(robot.rows))
-
-    tools = list(robot.tools)
+    q, tools = fixed_values(len(robot.rows)), list(robot.tools)
 
     def values(robot: Robot, chain: Chain) -> np.ndarray:
         poses = [carried_poses(robot.chain(), q, [name] * len(q)) @ robot.tool(name) for name in tools]
@@ -343,19 +326,11 @@ def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = 
     require_written(path, again, values(robot, chain or robot.chain()), WRITTEN_MM, "mm")
 
 
-_FORM = {
-    "standard": "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)",
-    "modified": "Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)",
-}
-
-
-_KEYS = {"a": "a_mm", "alpha": "alpha_deg", "d": "d_mm", "theta": "theta_deg", "beta": "beta_deg"}
-
-
 def _pose_lines(pose: Rigid) -> list[str]:
     values = (*pose.translation, *Poses.of([pose]).quaternions()[0])
     return [f"{key} = {_number(value)}" for key, value in zip(POSE, values, strict=True)]
 
 
-def _number(value: float) -> str:
-    return repr(float(value))
+def _number(value: ArrayLike) -> str:
+    """Returns a number, or an array of them, that reads back the same."""
+    return repr(np.asarray(value, float).tolist())

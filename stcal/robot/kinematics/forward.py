@@ -15,10 +15,7 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot, warn_of_degre
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
-"""Number of joint vectors processed at a time.
-
-Their frames, 96 bytes each, stay in a processor's cache of a megabyte.
-"""
+"""Number of joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache."""
 
 
 def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
@@ -26,24 +23,18 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints; where its base stands does not matter.
-    q : (m, n) or (n,) array
-        Values of the controller, rad or mm.
-    tool : str
-        Name of the tool.
-    payload_kg : float or (m,) array, optional
-        Mass at the flange; that of the robot if not given.
+    robot : an arm of n joints; where its base stands does not matter.
+    q : (m, n) or (n,) array: values of the controller, rad or mm.
+    tool : name of the tool.
+    payload_kg : float or (m,) array, optional: mass at the flange; that of the robot if not given.
 
     Returns
     -------
-    Poses
-        m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
+    Poses : m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
 
     Raises
     ------
-    InputError
-        Joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
+    InputError : joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
     values = _joint_vectors(q, robot)
     return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
@@ -65,8 +56,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
     Raises
     ------
-    InputError
-        Joint values of another shape or not finite; an unknown tool.
+    InputError : joint values of another shape or not finite; an unknown tool.
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)
@@ -98,7 +88,7 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
 
 def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
     """Returns world_from_flange of joint vectors (m, n), for the flange that carries each row's target."""
-    if chain.grown is None:
+    if chain.tree is None:
         return flange_poses(chain, q, conditions)
     carrier = np.array([chain.carrier(name) for name in targets])
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
@@ -156,7 +146,7 @@ def torques(
 
 def _loaded(chain: Chain) -> int:
     """Returns the joint that carries the payload."""
-    if chain.grown is not None and "" not in chain.grown.tree.carriers:
+    if chain.tree is not None and "" not in chain.tree.carriers:
         raise InputError(
             "E-ROBOT-TREE",
             "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
@@ -198,8 +188,7 @@ def _elasticity(chain: Chain) -> Elasticity:
 def _walk(
     chain: Chain, joints: Sequence[int], q: np.ndarray, conditions: Conditions = USUAL, visit=None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns axes (3 axes, 3 components, m) and origin (3, m) after ``joints``; ``visit`` gets frames before each
-    motion."""
+    """Returns axes (3, 3, m) and origin (3, m) after ``joints``; ``visit`` gets frames before each motion."""
     m = len(q)
     give = None
     if chain.elasticity is not None:
@@ -224,7 +213,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.grown is not None:
+        if chain.tree is not None:
             moved[i] = axes, origin
     return axes, origin
 
@@ -242,8 +231,7 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
 
 
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Returns the derivative (m, 6, k) of ``tip``, world_from_tool, by :func:`chain_parameters`, in the world's
-    axes."""
+    """Returns the derivative (m, 6, k) of ``tip`` by :func:`chain_parameters`, in the world's axes."""
     rotation, origin = joint_frames(chain, q, conditions)
     joint, component = np.array(chain_parameters(chain)).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
@@ -289,8 +277,7 @@ def elasticity_jacobian(
 def elasticity_curvature(
     chain: Chain, q: np.ndarray, tip: Poses, targets: Sequence[str], pull: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
-    """Returns the second derivative (9 n, 9 n) of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s
-    motions; only products of compliance and moment have one."""
+    """Returns the second derivative (9 n, 9 n) of ``pull`` (m, 6) times the tool's motions by elasticity."""
     elasticity, n = _elasticity(chain), len(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     z = rotation[..., 2]

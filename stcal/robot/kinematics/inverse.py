@@ -23,155 +23,15 @@ LONGEST = 1.0
 LEAST_DAMPING = 1e-14
 """Smallest damping; it keeps the normal equations regular where the Jacobian is singular."""
 ORIENTATION_WEIGHT = 0.03
-"""Weight of the orientation for arms of fewer than six joints, whose position has priority. The position error that
-remains is removed by :func:`_position_exact`."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class InverseProblem:
-    """An arm with a tool, in unitless joint values. ``unit`` : (n,) rad or mm of a unitless 1; ``reach`` : mm;
-    ``bounds`` : (n, 2); ``middle`` : (n,) of the bounds, 0 if unlimited; ``turns`` : (n,) whether 2π more is the same
-    position."""
-
-    robot: Robot
-    tool: str
-    unit: np.ndarray
-    reach: float
-    bounds: np.ndarray
-    middle: np.ndarray
-    turns: np.ndarray
-
-    @classmethod
-    def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
-        reach = reach_mm(robot, [tool])
-        sliding = robot.prismatic
-        unit = np.where(sliding, reach, 1.0)
-        bounds = robot.limits() / unit[:, None]
-        finite = np.isfinite(bounds)
-        middle = np.where(finite.all(axis=1), np.where(finite, bounds, 0.0).mean(axis=1), 0.0)
-        middle = np.clip(middle, *bounds.T)
-        # A whole turn of the controller's value leaves the arm in place only if the coupling maps it to whole turns.
-        whole = np.isclose(robot.coupling, np.round(robot.coupling)) & ~(sliding[:, None] & (robot.coupling != 0))
-        return cls(robot, tool, unit, reach, bounds, middle, ~sliding & whole.all(axis=0))
-
-    @property
-    def under_actuated(self) -> bool:
-        chain = self.robot.chain()
-        return len(chain.branch(chain.carrier(self.tool)).path()) < 6
-
-    def clipped(self, q: np.ndarray) -> np.ndarray:
-        return np.clip(q, *self.bounds.T)
-
-    def errors(self, poses: Poses, q: np.ndarray) -> np.ndarray:
-        """Returns (m, 6) differences from the poses that q reaches to ``poses``: rad, mm."""
-        return poses.difference(forward(self.robot, q * self.unit, self.tool))
-
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
-        """Returns the unitless Jacobian, (m, 6, n)."""
-        derivative = jacobian(self.robot, q * self.unit, self.tool) * self.unit
-        derivative[:, 3:] /= self.reach
-        return derivative
-
-
-def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
-    """Returns an upper bound of the distance from first joint to the origin of any of the tools, mm: the sum of all
-    links and travels."""
-    whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
-    links = []
-    for tool in tools:
-        chain = whole.branch(whole.carrier(tool))
-        end = chain.last_from_flange @ robot.tool(tool)
-        along = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1)
-        links.append(along.sum() + np.linalg.norm(end.translation))
-    return float(max(max(links) + travel[np.isfinite(travel)].sum(), 1.0))
-
-
-def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-    """Returns unitless joint vectors (m, n) of least error from starts q, a local minimum where a pose is out of
-    reach."""
-    q = q.copy()
-    if not len(q):
-        return q
-    weight = np.full(6, 1.0)
-    weight[3:] = 1 / problem.reach
-    if problem.under_actuated:
-        weight[:3] = ORIENTATION_WEIGHT
-    rows, goal = np.arange(len(q)), poses
-    error = problem.errors(goal, q)
-    damping, going = np.full(len(q), 1e-2), np.ones(len(q), bool)
-    for _ in range(ROUNDS):
-        going &= ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
-        rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
-        if not len(rows):
-            break
-        step, gain = _step(problem, q[rows], error, weight, damping, bounds)
-        trial = q[rows] + step
-        if bounds is not None:
-            trial = np.clip(trial, *bounds.T)
-        new = problem.errors(goal, trial)
-        better = np.linalg.norm(new * weight, axis=1) < np.linalg.norm(error * weight, axis=1)
-        q[rows[better]] = trial[better]
-        error = np.where(better[:, None], new, error)
-        damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-12, 1e12)
-        stuck = (np.abs(trial - q[rows]).max(axis=1) < 1e-15) & ~better | (gain < 1e-15)
-        going = ~stuck
-    return _position_exact(problem, poses, q, bounds) if problem.under_actuated else q
-
-
-def _step(
-    problem: InverseProblem,
-    q: np.ndarray,
-    off: np.ndarray,
-    weight: np.ndarray,
-    damping: np.ndarray,
-    bounds: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the damped step (m, n) and the norm (m,) of the gradient, the error that the joints can act on."""
-    weighted = off * weight
-    row = np.where(weight == 1 / problem.reach, 1.0, weight)  # the Jacobian's translation is in shares of the reach
-    derivative = problem.jacobian(q) * row[:, None]
-    pull = np.einsum("mij,mi->mj", derivative, weighted)
-    if bounds is not None:  # a joint at its limit does not move beyond it
-        low, high = bounds.T
-        held = ((q <= low) & (pull < 0)) | ((q >= high) & (pull > 0))
-        derivative = np.where(held[:, None], 0.0, derivative)
-        pull = np.where(held, 0.0, pull)
-    size = np.einsum("mi,mi->m", weighted, weighted)
-    normal = np.einsum("mij,mik->mjk", derivative, derivative)
-    diagonal = np.arange(normal.shape[1])
-    normal[:, diagonal, diagonal] += (np.maximum(damping * size, LEAST_DAMPING))[:, None]
-    step = np.linalg.solve(normal, pull[..., None])[..., 0]
-    longest = np.abs(step).max(axis=1, keepdims=True)
-    gain = np.linalg.norm(pull, axis=1)
-    return step * np.minimum(1, LONGEST / np.maximum(longest, 1e-300)), gain
-
-
-def _position_exact(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
-    """Removes the remaining position error by minimum-norm steps of the joints that are not at their limits."""
-    for _ in range(4):
-        off = problem.errors(poses, q)[:, 3:] / problem.reach
-        derivative = problem.jacobian(q)[:, 3:]
-        near = np.linalg.norm(off, axis=1) < ORIENTATION_WEIGHT  # poses farther off are out of reach and stay unchanged
-        if bounds is not None:
-            low, high = bounds.T
-            derivative = np.where(((q <= low) | (q >= high))[:, None], 0.0, derivative)
-        step = np.einsum("mji,mi->mj", np.linalg.pinv(derivative, rcond=1e-9), off)
-        q = np.where(near[:, None], q + step, q)
-        if bounds is not None:
-            q = np.clip(q, *bounds.T)
-    return q
-
-
+"""Weight of the orientation for arms of fewer than six joints, whose position has priority."""
 WITHIN_MM, WITHIN_RAD = 1e-9, 1e-12
 """Errors below which a pose counts as reached: far below any measurement, above the rounding of a chain of metres."""
 LIMIT_SLACK = 1e-9
 """Largest excess over joint limits that counts as rounding, rad (or shares of the reach)."""
 SINGULAR = 1e-5
-"""Smallest singular value (no unit) below which joint values are not determined. At a fold the error is the square of
-what the joints are off, so that an error of 1e-12 leaves 1e-6: the joints cannot be found nearer to the fold."""
+"""Smallest singular value (no unit) below which joint values are not determined, as an error of 1e-12 leaves 1e-6."""
 POOL, STARTS = 4096, 96
-"""Number of joint vectors over the range, and number of the nearest of them that are starts for each pose. Of 2738
-branches of 600 poses of five arms, found with 600 starts, 96 missed none, 48 three, 32 twenty-eight."""
+"""Joint vectors over the range, and nearest that are starts: 96 miss none of 2738 branches."""
 SAME_BRANCH = 1e-4
 """Distance of joint vectors, rad, below which they are one solution."""
 SHORT = 0.1
@@ -180,9 +40,22 @@ AS_GOOD = 2.0
 """Largest ratio of an orientation error to the least one that counts as equally good, for arms with few joints."""
 GROUP = 2048
 """Number of poses processed at a time if all branches are sought."""
+TURN = 2 * np.pi
 
 REACHED, ORIENTATION, SINGULAR_POSE = "reached", "orientation", "singular"
 LIMIT, UNREACHABLE = "limit", "unreachable"
+
+
+def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
+    """Returns an upper bound, mm, of the distance from the first joint to any of the tools: all links and travels."""
+    whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
+    links = []
+    for tool in tools:
+        chain = whole.branch(whole.carrier(tool))
+        end = chain.last_from_flange @ robot.tool(tool)
+        along = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1)
+        links.append(along.sum() + np.linalg.norm(end.translation))
+    return float(max(max(links) + travel[np.isfinite(travel)].sum(), 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -230,28 +103,22 @@ def inverse(
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints; where its base stands does not matter.
-    poses : Poses
-        m transforms base_from_tool, mm.
+    robot : an arm of n joints; where its base stands does not matter.
+    poses : m transforms base_from_tool, mm.
     near : (m, n) or (n,) array, optional
         Reference values of the controller, rad or mm. Without it the first pose gets the branch nearest to the middle
         of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
-    tool : str
-        Name of the tool.
-    payload_kg : float, optional
-        Mass at the flange; that of the robot if not given.
+    tool : name of the tool.
+    payload_kg : mass at the flange; that of the robot if not given.
 
     Returns
     -------
-    Inverse
-        Joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
+    Inverse : joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
 
     Raises
     ------
-    InputError
-        ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown tool;
-        a mass that no arm carries.
+    InputError : ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown
+        tool; a mass that no arm carries.
 
     References
     ----------
@@ -261,16 +128,16 @@ def inverse(
     m, n = len(poses), len(robot.rows)
     problem = InverseProblem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
     if near is None:
-        _refuse_redundant(problem)
-        return _by_search(problem, poses, np.arange(m), np.zeros((m, n)), np.zeros(m, bool), None)
+        problem.refuse_redundant()
+        return problem.searched(poses, np.arange(m), np.zeros((m, n)), np.zeros(m, bool), None)
     near = np.asarray(near, float)
     if near.shape not in ((n,), (m, n)):
         raise InputError("E-ARRAY-SHAPE", f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
     near = np.broadcast_to(near, (m, n)) / problem.unit
     if not np.isfinite(near).all():
         raise InputError("E-ARRAY-NOT-FINITE", "reference joint values: hold values that are not finite")
-    q, ok = _from_near(problem, poses, near)
-    return _by_search(problem, poses, np.flatnonzero(~ok), q, ok, near)
+    q, ok = problem.from_near(poses, near)
+    return problem.searched(poses, np.flatnonzero(~ok), q, ok, near)
 
 
 @require_arguments
@@ -282,122 +149,32 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
 
     Parameters
     ----------
-    robot : Robot
-        An arm of n joints, at most six; where its base stands does not matter.
-    pose : Rigid
-        base_from_tool, mm.
-    tool : str
-        Name of the tool.
+    robot : an arm of n joints, at most six; where its base stands does not matter.
+    pose : base_from_tool, mm.
+    tool : name of the tool.
 
     Returns
     -------
-    Inverse
-        Joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
+    Inverse : joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
 
     Raises
     ------
-    InputError
-        The arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
+    InputError : the arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
     problem = InverseProblem.of(robot, tool)
-    _refuse_redundant(problem)
+    problem.refuse_redundant()
     poses = Poses.of([pose])
-    solutions, inside = _turned(problem, _every_solution(problem, poses)[0], problem.middle)
+    solutions, inside = problem.turned(problem.every_solution(poses)[0], problem.middle)
     kept: list[np.ndarray] = []
     for q in solutions[inside]:
         if all(np.abs(q - other).max() > SAME_BRANCH for other in kept):
             kept.append(q)
     solutions = np.array(kept).reshape(-1, solutions.shape[1])
-    repeated = Poses(np.repeat(poses.rotation, len(solutions), 0), np.repeat(poses.translation, len(solutions), 0))
-    judged = _judge(problem, repeated, solutions)
+    judged = problem.judge(poses[np.zeros(len(solutions), int)], solutions)
     keep = np.flatnonzero(judged.usable & _as_good(judged.error_rad))
     order = keep[np.argsort(np.linalg.norm(solutions[keep] - problem.middle, axis=1), kind="stable")]
-    return Inverse(
-        judged.q[order], tuple(judged.status[i] for i in order), judged.error_mm[order], judged.error_rad[order]
-    )
-
-
-def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns joint vectors (m, n) by descent from ``near``, and a mask (m,) of those that are surely nearest."""
-    isolated = len(problem.unit) <= 6
-    bounds = None if isolated else problem.bounds
-    q = solve(problem, poses, near if isolated else problem.clipped(near), bounds)
-    q, inside = _turned(problem, q, near)
-    ok = inside & _judge(problem, poses, q).usable
-    if isolated:
-        doubtful = ok & ~_is_nearest(problem, q, near)
-        q[doubtful] = _nearest_around(problem, poses[doubtful], q[doubtful], near[doubtful])
-        ok &= ~doubtful | (np.linalg.norm(q - near, axis=1) <= SHORT)
-    return q, ok
-
-
-def _by_search(
-    problem: InverseProblem, poses: Poses, rest: np.ndarray, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None
-) -> Inverse:
-    """Returns all joint vectors, after a search over all branches for the poses ``rest``: the nearest to ``near`` (m,
-    n), or if that is None to the solution of the previous pose."""
-    beyond, last = np.zeros(len(poses), bool), problem.middle
-    for start in range(0, len(rest), GROUP):
-        part = rest[start : start + GROUP]
-        every = _every_solution(problem, poses[part], None if near is None else q[part])
-        for i, solutions in zip(part, every, strict=True):
-            wanted = last if near is None else near[i]
-            best, beyond[i] = _nearest(problem, poses[[i]], solutions, wanted)
-            ok[i] = best is not None
-            q[i] = last = wanted if best is None else best
-    return _finished(problem, poses, q, ok, beyond)
-
-
-def _refuse_redundant(problem: InverseProblem) -> None:
-    n = len(problem.unit)
-    if n > 6:
-        raise InputError(
-            "E-ROBOT-REDUNDANT",
-            f"robot {problem.robot.name}: {n} joints reach a pose in infinitely many ways; "
-            "give the joint values to stay near to (columns q1_deg …)",
-        )
-
-
-def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
-    """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), converged or not, ignoring
-    limits."""
-    n, m = len(problem.unit), len(poses)
-    low, high = problem.bounds.T
-    whole = np.minimum(np.pi, (high - low) / 2)  # of more than a turn one turn is enough
-    half = np.where(problem.turns, whole, np.where(np.isfinite(high - low), (high - low) / 2, 1.0))
-    pool = problem.middle + (2 * qmc.Halton(n, scramble=False).random(POOL + 1)[1:] - 1) * half
-    reach = problem.reach
-    tree = KDTree(_embedded(forward(problem.robot, pool * problem.unit, problem.tool), reach))
-    chosen = tree.query(_embedded(poses, reach), k=STARTS)[1].ravel()
-    repeated = np.repeat(np.arange(m), STARTS)
-    found = solve(problem, poses[repeated], pool[chosen]).reshape(m, STARTS, n)
-    if more is not None:
-        found = np.concatenate([more[:, None], found], axis=1)
-    return list(found)
-
-
-def _embedded(poses: Poses, reach: float) -> np.ndarray:
-    """Returns points (m, 12) whose distances are those of poses: chord of the rotation and shares of the reach."""
-    return np.hstack([poses.rotation.reshape(-1, 9) / np.sqrt(2), poses.translation / reach])
-
-
-def _nearest(
-    problem: InverseProblem, pose: Poses, solutions: np.ndarray, near: np.ndarray
-) -> tuple[np.ndarray | None, bool]:
-    """Returns the solution nearest to ``near`` within the limits or None, and whether only solutions beyond them
-    reach."""
-    turned, inside = _turned(problem, solutions, near)
-    count = len(turned)
-    many = Poses(np.repeat(pose.rotation, count, 0), np.repeat(pose.translation, count, 0))
-    off = problem.errors(many, turned)
-    good = _is_reached(problem, off)
-    if not good.any():
-        return None, False
-    good[good] = _as_good(np.linalg.norm(off[good, :3], axis=1))
-    eligible = np.flatnonzero(good & inside)
-    if not len(eligible):
-        return None, True
-    return turned[eligible[np.linalg.norm(turned[eligible] - near, axis=1).argmin()]], False
+    status = tuple(judged.status[i] for i in order)
+    return Inverse(judged.q[order], status, judged.error_mm[order], judged.error_rad[order])
 
 
 def _as_good(error_rad: np.ndarray) -> np.ndarray:
@@ -405,77 +182,206 @@ def _as_good(error_rad: np.ndarray) -> np.ndarray:
     return error_rad <= AS_GOOD * error_rad.min(initial=np.inf) + WITHIN_RAD
 
 
-def _is_reached(problem: InverseProblem, off: np.ndarray) -> np.ndarray:
-    """Returns (m,) true if errors (m, 6), rad and mm, are within tolerance; fewer than six joints: position only."""
-    position = np.linalg.norm(off[:, 3:], axis=1) <= WITHIN_MM
-    return position & ((np.linalg.norm(off[:, :3], axis=1) <= WITHIN_RAD) | problem.under_actuated)
+@dataclass(frozen=True, slots=True, eq=False)
+class InverseProblem:
+    """An arm with a tool, in unitless joint values. ``unit`` : (n,) rad or mm of a unitless 1; ``reach`` : mm;
+    ``bounds`` : (n, 2); ``middle`` : (n,) of the bounds, 0 if unlimited; ``turns`` : (n,) whether 2π more is the same
+    position; ``few`` : whether fewer than six joints carry the tool."""
 
+    robot: Robot
+    tool: str
+    unit: np.ndarray
+    reach: float
+    bounds: np.ndarray
+    middle: np.ndarray
+    turns: np.ndarray
+    few: bool
 
-def _turned(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns joint values turned by 2π to be nearest to ``near`` within limits, and a mask (m,) of those within."""
-    low, high = problem.bounds.T
-    turn = 2 * np.pi
-    turned = q + turn * np.round((near - q) / turn)
-    with np.errstate(invalid="ignore"):  # inf − inf never occurs, inf / 2π does
-        turned = turned - turn * np.ceil(np.maximum(turned - high - LIMIT_SLACK, 0) / turn)
-        turned = turned + turn * np.ceil(np.maximum(low - turned - LIMIT_SLACK, 0) / turn)
-    turned = np.where(problem.turns, turned, q)
-    return turned, ((turned >= low - LIMIT_SLACK) & (turned <= high + LIMIT_SLACK)).all(axis=1)
+    @classmethod
+    def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
+        reach, sliding, chain = reach_mm(robot, [tool]), robot.prismatic, robot.chain()
+        unit = np.where(sliding, reach, 1.0)
+        bounds = robot.limits() / unit[:, None]
+        finite = np.isfinite(bounds)
+        middle = np.where(finite.all(axis=1), np.where(finite, bounds, 0.0).mean(axis=1), 0.0)
+        middle = np.clip(middle, *bounds.T)
+        # A whole turn of the controller's value leaves the arm in place only if the coupling maps it to whole turns.
+        whole = np.isclose(robot.coupling, np.round(robot.coupling)) & ~(sliding[:, None] & (robot.coupling != 0))
+        few = len(chain.branch(chain.carrier(tool)).path()) < 6
+        return cls(robot, tool, unit, reach, bounds, middle, ~sliding & whole.all(axis=0), few)
 
+    def refuse_redundant(self) -> None:
+        if (n := len(self.unit)) > 6:
+            raise InputError(
+                "E-ROBOT-REDUNDANT",
+                f"robot {self.robot.name}: {n} joints reach a pose in infinitely many ways; "
+                "give the joint values to stay near to (columns q1_deg …)",
+            )
 
-def _is_nearest(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``.
+    def errors(self, poses: Poses, q: np.ndarray) -> np.ndarray:
+        """Returns (m, 6) differences from the poses that q reaches to ``poses``: rad, mm."""
+        return poses.difference(forward(self.robot, q * self.unit, self.tool))
 
-    A solution is the only one within 2σ/K, σ being the smallest singular value of the Jacobian there and K a Lipschitz
-    constant of the Jacobian (the mean value theorem; Newton–Kantorovich). In the embedding of :func:`_embedded` the
-    second derivatives by two joints are at most √2 long (1 of the rotation, 1 of the translation), which makes
-    K ≤ √2 n ‖coupling‖². A distance up to σ/K is therefore the least.
-    """
-    bound = np.sqrt(2) * q.shape[1] * np.linalg.norm(problem.robot.coupling, 2) ** 2
-    return np.linalg.norm(q - near, axis=1) <= _smallest(problem, q) / bound
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Returns the unitless Jacobian, (m, 6, n)."""
+        derivative = jacobian(self.robot, q * self.unit, self.tool) * self.unit
+        derivative[:, 3:] /= self.reach
+        return derivative
 
-
-def _nearest_around(problem: InverseProblem, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Returns the solutions nearest to ``near`` among q (m, n) and neighbouring branches. Branches meet along the
-    right singular vector of the smallest singular value, so starts on either side along it find a neighbour."""
-    if not len(q):
+    def solve(self, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
+        """Returns joint vectors (m, n) of least error from starts q, also where a pose is out of reach."""
+        q = q.copy()
+        if not len(q):
+            return q
+        low, high = (np.tile([-np.inf, np.inf], (len(self.unit), 1)) if bounds is None else bounds).T
+        balance = np.repeat([ORIENTATION_WEIGHT if self.few else 1.0, 1.0], 3)
+        weight = balance / np.repeat([1.0, self.reach], 3)  # the Jacobian's translation is in shares of the reach
+        rows, goal = np.arange(len(q)), poses
+        error = self.errors(goal, q)
+        damping, going = np.full(len(q), 1e-2), np.ones(len(q), bool)
+        for _ in range(ROUNDS):
+            going &= ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
+            rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
+            if not len(rows):
+                break
+            at, weighted = q[rows], error * weight
+            derivative = self.jacobian(at) * balance[:, None]
+            pull = np.einsum("mij,mi->mj", derivative, weighted)
+            held = ((at <= low) & (pull < 0)) | ((at >= high) & (pull > 0))  # do not move beyond their limits
+            derivative, pull = np.where(held[:, None], 0.0, derivative), np.where(held, 0.0, pull)
+            normal = np.einsum("mij,mik->mjk", derivative, derivative)
+            diagonal = np.arange(normal.shape[1])
+            size = np.einsum("mi,mi->m", weighted, weighted)
+            normal[:, diagonal, diagonal] += np.maximum(damping * size, LEAST_DAMPING)[:, None]
+            step = np.linalg.solve(normal, pull[..., None])[..., 0]
+            longest = np.abs(step).max(axis=1, keepdims=True)
+            trial = np.clip(at + step * np.minimum(1, LONGEST / np.maximum(longest, 1e-300)), low, high)
+            new = self.errors(goal, trial)
+            better = np.linalg.norm(new * weight, axis=1) < np.linalg.norm(weighted, axis=1)
+            q[rows[better]] = trial[better]
+            error = np.where(better[:, None], new, error)
+            damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-12, 1e12)
+            stuck = (np.abs(trial - q[rows]).max(axis=1) < 1e-15) & ~better
+            going = ~(stuck | (np.linalg.norm(pull, axis=1) < 1e-15))
+        for _ in range(4 if self.few else 0):  # minimum-norm steps remove what the orientation's weight left
+            off = self.errors(poses, q)[:, 3:] / self.reach
+            near = np.linalg.norm(off, axis=1) < ORIENTATION_WEIGHT  # poses farther off stay out of reach
+            derivative = np.where(((q <= low) | (q >= high))[:, None], 0.0, self.jacobian(q)[:, 3:])
+            step = np.einsum("mji,mi->mj", np.linalg.pinv(derivative, rcond=1e-9), off)
+            q = np.clip(np.where(near[:, None], q + step, q), low, high)
         return q
-    weakest = np.linalg.svd(problem.jacobian(q))[2][:, q.shape[1] - 1]
-    best, distance = q.copy(), np.linalg.norm(q - near, axis=1)
-    for side in (-2, -1, 1, 2):
-        start = q + side * distance[:, None] * weakest
-        neighbour, inside = _turned(problem, solve(problem, poses, start), near)
-        away = np.linalg.norm(neighbour - near, axis=1)
-        nearer = inside & _is_reached(problem, problem.errors(poses, neighbour))
-        nearer &= away < np.linalg.norm(best - near, axis=1)
-        best[nearer] = neighbour[nearer]
-    return best
 
+    def from_near(self, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns joint vectors (m, n) by descent from ``near``, and a mask (m,) of those that are surely nearest."""
+        isolated = len(self.unit) <= 6
+        begin = near if isolated else np.clip(near, *self.bounds.T)
+        q, inside = self.turned(self.solve(poses, begin, None if isolated else self.bounds), near)
+        ok = inside & self.judge(poses, q).usable
+        if isolated:
+            doubtful = ok & ~self._is_nearest(q, near)
+            q[doubtful] = self._nearest_around(poses[doubtful], q[doubtful], near[doubtful])
+            ok &= ~doubtful | (np.linalg.norm(q - near, axis=1) <= SHORT)
+        return q, ok
 
-def _smallest(problem: InverseProblem, q: np.ndarray) -> np.ndarray:
-    """Returns the smallest singular value (m,) of the unitless Jacobian."""
-    if not len(q):
-        return np.zeros(0)
-    return np.linalg.svd(problem.jacobian(q), compute_uv=False)[:, -1]
+    def searched(
+        self, poses: Poses, rest: np.ndarray, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None
+    ) -> Inverse:
+        """Returns all joint vectors, the poses ``rest`` searched: nearest to ``near`` (m, n), or to the solution
+        before; for a pose not reached, the local minimum of error within the limits."""
+        beyond, last = np.zeros(len(poses), bool), self.middle
+        for start in range(0, len(rest), GROUP):
+            part = rest[start : start + GROUP]
+            every = self.every_solution(poses[part], None if near is None else q[part])
+            for i, solutions in zip(part, every, strict=True):
+                wanted = last if near is None else near[i]
+                best, beyond[i] = self._nearest(poses[[i]], solutions, wanted)
+                ok[i] = best is not None
+                q[i] = last = wanted if best is None else best
+        q, missing = q.copy(), np.flatnonzero(~ok)
+        if len(missing):
+            q[missing] = self.solve(poses[missing], np.clip(q[missing], *self.bounds.T), self.bounds)
+        judged = self.judge(poses, q)
+        # An arm of more than six joints may get there on the second way, within the limits.
+        over = ~ok & beyond & np.array([s == UNREACHABLE for s in judged.status], bool)
+        status = tuple(LIMIT if o else s for o, s in zip(over, judged.status, strict=True))
+        return Inverse(judged.q, status, judged.error_mm, judged.error_rad)
 
+    def every_solution(self, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
+        """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), ignoring limits."""
+        n, m = len(self.unit), len(poses)
+        half = np.diff(self.bounds, axis=1)[:, 0] / 2
+        one_turn = np.minimum(np.pi, half)  # of more than a turn one turn is enough
+        half = np.where(self.turns, one_turn, np.where(np.isfinite(half), half, 1.0))
+        pool = self.middle + (2 * qmc.Halton(n, scramble=False).random(POOL + 1)[1:] - 1) * half
+        tree = KDTree(self._embedded(forward(self.robot, pool * self.unit, self.tool)))
+        chosen = tree.query(self._embedded(poses), k=STARTS)[1].ravel()
+        found = self.solve(poses[np.repeat(np.arange(m), STARTS)], pool[chosen]).reshape(m, STARTS, n)
+        return list(found if more is None else np.concatenate([more[:, None], found], axis=1))
 
-def _judge(problem: InverseProblem, poses: Poses, q: np.ndarray) -> Inverse:
-    """Returns the status of joint vectors, ignoring limits."""
-    off = problem.errors(poses, q)
-    error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
-    reached, singular = _is_reached(problem, off), _smallest(problem, q) < SINGULAR
-    status = np.where(~reached, UNREACHABLE, np.where(singular, SINGULAR_POSE, REACHED)).astype(object)
-    status[reached & (error_rad > WITHIN_RAD)] = ORIENTATION
-    return Inverse(q * problem.unit, tuple(status), error_mm, error_rad)
+    def _embedded(self, poses: Poses) -> np.ndarray:
+        """Returns points (m, 12) whose distances are those of poses: chord of the rotation and shares of the reach."""
+        return np.hstack([poses.rotation.reshape(-1, 9) / np.sqrt(2), poses.translation / self.reach])
 
+    def _nearest(self, pose: Poses, solutions: np.ndarray, near: np.ndarray) -> tuple[np.ndarray | None, bool]:
+        """Returns the nearest solution within the limits or None, and whether only solutions beyond them reach."""
+        turned, inside = self.turned(solutions, near)
+        off = self.errors(pose[np.zeros(len(turned), int)], turned)
+        good = self._is_reached(off)
+        if not good.any():
+            return None, False
+        good[good] = _as_good(np.linalg.norm(off[good, :3], axis=1))
+        eligible = turned[good & inside]
+        if not len(eligible):
+            return None, True
+        return eligible[np.linalg.norm(eligible - near, axis=1).argmin()], False
 
-def _finished(problem: InverseProblem, poses: Poses, q: np.ndarray, ok: np.ndarray, beyond: np.ndarray) -> Inverse:
-    """Returns all joint vectors with status; for a pose not reached, the local minimum of error within the limits."""
-    q = q.copy()
-    missing = np.flatnonzero(~ok)
-    if len(missing):
-        q[missing] = solve(problem, poses[missing], problem.clipped(q[missing]), problem.bounds)
-    judged = _judge(problem, poses, q)
-    # An arm of more than six joints may get there on the second way, within the limits.
-    status = [s if ok[i] or s != UNREACHABLE else (LIMIT if beyond[i] else s) for i, s in enumerate(judged.status)]
-    return Inverse(judged.q, tuple(status), judged.error_mm, judged.error_rad)
+    def _is_reached(self, off: np.ndarray) -> np.ndarray:
+        """Returns (m,) whether errors (m, 6), rad and mm, are within tolerance; of few joints: the position."""
+        position = np.linalg.norm(off[:, 3:], axis=1) <= WITHIN_MM
+        return position & ((np.linalg.norm(off[:, :3], axis=1) <= WITHIN_RAD) | self.few)
+
+    def turned(self, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns joint values turned to be nearest to ``near`` within limits, and a mask (m,) of those within."""
+        low, high = self.bounds.T
+        turned = q + TURN * np.round((near - q) / TURN)
+        with np.errstate(invalid="ignore"):  # inf − inf never occurs, inf / 2π does
+            turned = turned - TURN * np.ceil(np.maximum(turned - high - LIMIT_SLACK, 0) / TURN)
+            turned = turned + TURN * np.ceil(np.maximum(low - turned - LIMIT_SLACK, 0) / TURN)
+        turned = np.where(self.turns, turned, q)
+        return turned, ((turned >= low - LIMIT_SLACK) & (turned <= high + LIMIT_SLACK)).all(axis=1)
+
+    def _is_nearest(self, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``.
+
+        A solution is the only one within 2σ/K, σ being the smallest singular value of the Jacobian there and K a
+        Lipschitz constant of the Jacobian (Newton–Kantorovich). In the embedding of :meth:`_embedded` the second
+        derivatives by two joints are at most √2 long, so that K ≤ √2 n ‖coupling‖²: a distance up to σ/K is the least.
+        """
+        bound = np.sqrt(2) * q.shape[1] * np.linalg.norm(self.robot.coupling, 2) ** 2
+        return np.linalg.norm(q - near, axis=1) <= self._weakest(q) / bound
+
+    def _nearest_around(self, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Returns the solutions nearest to ``near`` among q and neighbours, which are along the weakest direction."""
+        if not len(q):
+            return q
+        weakest = np.linalg.svd(self.jacobian(q))[2][:, q.shape[1] - 1]
+        best, distance = q.copy(), np.linalg.norm(q - near, axis=1)
+        for side in (-2, -1, 1, 2):
+            neighbour, inside = self.turned(self.solve(poses, q + side * distance[:, None] * weakest), near)
+            nearer = inside & self._is_reached(self.errors(poses, neighbour))
+            nearer &= np.linalg.norm(neighbour - near, axis=1) < np.linalg.norm(best - near, axis=1)
+            best[nearer] = neighbour[nearer]
+        return best
+
+    def _weakest(self, q: np.ndarray) -> np.ndarray:
+        """Returns the smallest singular value (m,) of the unitless Jacobian."""
+        return np.linalg.svd(self.jacobian(q), compute_uv=False)[:, -1] if len(q) else np.zeros(0)
+
+    def judge(self, poses: Poses, q: np.ndarray) -> Inverse:
+        """Returns the status of joint vectors, ignoring limits."""
+        off = self.errors(poses, q)
+        error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
+        reached, singular = self._is_reached(off), self._weakest(q) < SINGULAR
+        status = np.where(~reached, UNREACHABLE, np.where(singular, SINGULAR_POSE, REACHED)).astype(object)
+        status[reached & (error_rad > WITHIN_RAD)] = ORIENTATION
+        return Inverse(q * self.unit, tuple(status), error_mm, error_rad)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,38 +44,26 @@ class Measurements(Brief):
 
     Parameters
     ----------
-    where : str
-        The file, for messages.
-    lines : sequence of int
-        (m,) its lines.
-    q : (m, n) array
-        Values of the controller, rad or mm.
-    targets : tuple of str
-        (m,) names of the reflector or target seen.
+    where : the file, for messages.
+    lines : (m,) its lines.
+    q : (m, n) array: values of the controller, rad or mm.
+    targets : (m,) names of the reflector or target seen.
     positions : (m, 3) array, optional
         Of the targets in the instrument's frame, mm; None where only distances were measured.
-    rotations : (m, 3, 3) array, optional
-        instrument_from_target, where poses were measured.
-    covariance : (m, 6, 6) array, optional
-        Of the poses, rad and mm, left perturbation.
+    rotations : (m, 3, 3) array, optional: instrument_from_target, where poses were measured.
+    covariance : (m, 6, 6) array, optional: of the poses, rad and mm, left perturbation.
     common : (m, 6, r) array, optional
         Common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r normal numbers z of
         σ 1 for all, and by itself.
-    distances : (m,) array, optional
-        Where only these were measured, mm.
-    from_row : (m,) array of int, optional
-        Row, from 0, at whose position each distance starts.
-    stations : tuple of str
-        (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
-    notes : tuple of str
-        On rows of the file that are not here, columns that were not read, and angles by their convention.
-    conditions : Conditions
-        What the flange carried, and from where joints came.
+    distances : (m,) array, optional: where only these were measured, mm.
+    from_row : (m,) array of int, optional: row, from 0, at whose position each distance starts.
+    stations : (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
+    notes : on rows of the file that are not here, columns that were not read, and angles by their convention.
+    conditions : what the flange carried, and from where joints came.
 
     Raises
     ------
-    InputError
-        Arrays of other shapes, or with values that are not finite.
+    InputError : arrays of other shapes, or with values that are not finite.
     """
 
     where: str
@@ -96,12 +85,10 @@ class Measurements(Brief):
         freeze(self, "q", (None, None), "joint values")
         m = len(self.q)
         object.__setattr__(self, "stations", self.stations or ("",) * m)
-        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
+        shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None), "distances": ()}
         for name, shape in shapes.items():
             if getattr(self, name) is not None:
                 freeze(self, name, (m, *shape), name)
-        if self.distances is not None:
-            freeze(self, "distances", (m,), "distances")
         if self.from_row is not None:
             freeze(self, "from_row", (m,), "rows", int)
 
@@ -131,8 +118,7 @@ class Measurements(Brief):
 
         Raises
         ------
-        InputError
-            Neither positions nor poses, or arrays of other shapes.
+        InputError : neither positions nor poses, or arrays of other shapes.
         """
         if poses is not None:
             positions, rotations = poses.translation, poses.rotation
@@ -218,44 +204,38 @@ def read_measurements(
 
     Parameters
     ----------
-    path : str or Path
-        Table (CSV; form: ``data_layout.md``).
-    robot : Robot
-        The robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
+    path : table (CSV; form: ``data_layout.md``).
+    robot : the robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    rotation : str, optional
-        Convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
+    rotation : convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
         (``data_layout.md``).
-    payload_kg : float, optional
-        Mass at the flange in all rows, if there is no column ``payload_kg``.
+    payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------
-    Measurements
-        In the instrument's frame; mm, rad.
+    Measurements : in the instrument's frame; mm, rad.
 
     Raises
     ------
-    InputError
-        Missing columns, bad rows, joint values of another unit or number than the robot's, angles whose convention is
-        open, masses that no arm carries; the message names the line.
+    InputError : missing columns, bad rows, joint values of another unit or number than the robot's, angles whose
+        convention is open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
-    q = joint_values(table, robot)
-    targets, conditions = targets_of(table), read_conditions(table, payload_kg, len(robot.rows))
-    own = (PAYLOAD, *approach_columns(len(robot.rows)))
+    joints = len(robot.rows)
+    own = (PAYLOAD, *approach_columns(joints))
+    q, targets = joint_values(table, robot), targets_of(table)
+    base: dict[str, Any] = {"conditions": read_conditions(table, payload_kg, joints)}
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
-        said += unread(table, (*columns, *own))
-        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=said, conditions=conditions)
-        if "station" in table:
-            data = replace(data, stations=tuple(table.text("station")))
         if poses is not None:
             covariance = table.pose_covariances()
-            data = replace(
-                data, rotations=poses.rotation, covariance=covariance, common=table.common_errors(covariance)
-            )
+            common = table.common_errors(covariance)
+            base |= {"rotations": poses.rotation, "covariance": covariance, "common": common}
+        if "station" in table:
+            base["stations"] = tuple(table.text("station"))
+        notes = said + unread(table, (*columns, *own))
+        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=notes, **base)
         within(table, "position", data.points(), "mm")
         for rows in data.by_station().values():
             _in_reach(data[rows], robot)
@@ -273,15 +253,14 @@ def read_measurements(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
         )
     from_row = _from_rows(table)
-    if len(itself := np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM))):
-        i = int(itself[0])
+    for i in np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM)).tolist():
         raise InputError(
             "E-MEASURED-DISTANCES",
             f"{table.where}: line {table.lines[i]}: the distance of a position from itself is {distances[i]:.4g} mm, "
             "0 needed: distances start at the first row, which is missing, or at the row that column from_row names",
         )
-    seen = {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
-    return Measurements(table.where, table.lines, q, targets, **seen, conditions=conditions)
+    base |= {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
+    return Measurements(table.where, table.lines, q, targets, **base)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
@@ -291,11 +270,10 @@ def targets_of(table: Table) -> tuple[str, ...]:
 
 def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
     """Refuses values (m,) or (m, k) beyond possible ones."""
-    bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
-    if len(bad):
+    for row in np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1)).tolist():
         raise InputError(
             "E-VALUE-TOO-FAR",
-            f"{table.where}: line {table.lines[bad[0]]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
+            f"{table.where}: line {table.lines[row]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
             "remove the line",
         )
 
@@ -303,20 +281,19 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
 def _in_reach(data: Measurements, robot: Robot) -> None:
     """Refuses positions farther from the middle one than arm and tool allow."""
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
-    reach = reach_mm(robot, robot.tools)
-    worst = int(away.argmax())
-    if (usual := float(np.median(away))) > 2 * reach + LONGEST_TOOL_MM:
-        raise InputError(
-            "E-MEASURED-REACH",
-            f"{data.where}: positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches "
-            f"{reach:.4g} mm; correct the unit of x, y, z: are these mm, in columns of another unit?",
+    reach, usual, worst = reach_mm(robot, robot.tools), float(np.median(away)), int(away.argmax())
+    if away[worst] <= 2 * reach + LONGEST_TOOL_MM:
+        return
+    said = (
+        f"line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, robot {robot.name} "
+        f"reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
+    )
+    if usual > 2 * reach + LONGEST_TOOL_MM:
+        said = (
+            f"positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches {reach:.4g} mm; "
+            "correct the unit of x, y, z: are these mm, in columns of another unit?"
         )
-    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
-        raise InputError(
-            "E-MEASURED-REACH",
-            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, "
-            f"robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z",
-        )
+    raise InputError("E-MEASURED-REACH", f"{data.where}: {said}")
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
@@ -324,11 +301,9 @@ def _usable(data: Measurements, table: Table) -> Measurements:
     undecided = np.zeros(len(data), bool)
     if STATUS in table:
         undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
-    rotations = np.zeros((len(data), 0)) if data.rotations is None else data.rotations.reshape(len(data), -1)
     names = np.unique(data.targets, return_inverse=True)[1]
-    mass = data.conditions.payload_kg
-    carried = np.zeros(len(data)) if mass is None else mass
-    every = np.column_stack([data.q, names, data.points(), rotations, carried])
+    more = [each for each in (data.rotations, data.conditions.payload_kg) if each is not None]
+    every = np.column_stack([data.q, names, data.points(), *(each.reshape(len(data), -1) for each in more)])
     copies = np.ones(len(data), bool)
     copies[np.unique(every, axis=0, return_index=True)[1]] = False
     reasons = {
@@ -356,17 +331,17 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
             f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file",
         )
     columns = []
-    for i, joint in enumerate(robot.joints, 1):
-        units = ANGLES if joint.type == "revolute" else LENGTHS
+    for i, sliding in enumerate(robot.prismatic, 1):
+        units, unit = (LENGTHS, "mm") if sliding else (ANGLES, "rad")
         values = table.quantity(f"q{i}", units)
         far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
-        if joint.type == "revolute" and len(far) and table.unit(f"q{i}", units) == "rad":
+        if not sliding and len(far) and table.unit(f"q{i}", units) == "rad":
             raise InputError(
                 "E-JOINT-VALUE",
                 f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
                 f"if these are degrees call the column q{i}_deg",
             )
-        within(table, f"q{i}", values, "mm" if units is LENGTHS else "rad")
+        within(table, f"q{i}", values, unit)
         columns.append(values)
     return np.column_stack(columns)
 

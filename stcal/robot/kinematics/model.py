@@ -43,21 +43,15 @@ class DHRow:
 
     Parameters
     ----------
-    a : float
-        Length of the common normal, mm.
-    alpha : float
-        Twist about it, rad.
-    d : float
-        Offset along the joint's axis, mm.
-    theta : float
-        Angle about the joint's axis where the joint's value is 0, rad.
-    beta : float
-        Second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
+    a : length of the common normal, mm.
+    alpha : twist about it, rad.
+    d : offset along the joint's axis, mm.
+    theta : angle about the joint's axis where the joint's value is 0, rad.
+    beta : second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
 
     Raises
     ------
-    InputError
-        A value that is no finite number.
+    InputError : a value that is no finite number.
 
     References
     ----------
@@ -90,17 +84,13 @@ class Joint:
 
     Parameters
     ----------
-    type : {"revolute", "prismatic"}
-        Whether it turns about its axis or slides along it.
-    lower, upper : float
-        Limits of the controller's value, rad or mm; unlimited where not given.
-    fixed : mapping of str to str
-        Dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
+    type : whether it turns about its axis or slides along it.
+    lower, upper : limits of the controller's value, rad or mm; unlimited where not given.
+    fixed : dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
 
     Raises
     ------
-    InputError
-        Another type, limits that are swapped or no numbers, a dimension that no row has.
+    InputError : another type, limits that are swapped or no numbers, a dimension that no row has.
     """
 
     type: JointType = "revolute"
@@ -149,8 +139,7 @@ class Elasticity:
 
     Raises
     ------
-    InputError
-        Arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
+    InputError : arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
     """
 
     compliance: np.ndarray
@@ -227,32 +216,22 @@ class Robot(Brief):
 
     Parameters
     ----------
-    name : str
-        For messages and reports.
-    convention : {"standard", "modified"}
-        Of all rows; see :class:`DHRow`.
-    rows : tuple of DHRow
-        One for each joint, from the base; mm, rad.
-    joints : tuple of Joint
-        One for each row: type and range.
+    name : for messages and reports.
+    convention : of all rows; see :class:`DHRow`.
+    rows : one for each joint, from the base; mm, rad.
+    joints : one for each row: type and range.
     coupling : (n, n) array, optional
         Kinematic joint values from the controller's, a regular matrix; the identity if not given.
-    world_from_base : Rigid
-        Base in the frame of the measuring instrument, mm.
-    tools : mapping of str to Rigid
-        flange_from_tool by name, mm; ``""`` is the tool if none is named.
-    elasticity : Elasticity, optional
-        Rigid if not given.
-    tree : Tree, optional
-        Every joint is carried by the one before it, and tools by the last one, if not given.
-    unusual_size : bool
-        True if unusually long or short links are not a mistake of units.
+    world_from_base : base in the frame of the measuring instrument, mm.
+    tools : flange_from_tool by name, mm; ``""`` is the tool if none is named.
+    elasticity : rigid if not given.
+    tree : every joint is carried by the one before it, and tools by the last one, if not given.
+    unusual_size : true if unusually long or short links are not a mistake of units.
 
     Raises
     ------
-    InputError
-        Another convention; rows and joints of other types, or of different numbers, or none; lengths that are not mm; a
-        coupling matrix of another shape, or a singular one; elasticity of another number of joints.
+    InputError : another convention; rows and joints of other types, or of different numbers, or none; lengths that are
+        not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
     """
 
     name: str
@@ -316,13 +295,11 @@ class Robot(Brief):
 
         Raises
         ------
-        InputError
-            Arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        InputError : arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
 
         Warns
         -----
-        InputNote
-            Limits of many turns, which seem to be degrees.
+        InputNote : limits of many turns, which seem to be degrees.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
@@ -393,8 +370,8 @@ class Robot(Brief):
             centre = ends[end] @ elasticity.payload_centre
             gravity = first.rotation.T @ elasticity.gravity
             elasticity = replace(elasticity, gravity=gravity, payload_centre=centre, pivot=np.zeros_like(pivots))
-        grown = None if self.tree is None else Grown(self.tree, tuple(ends))
-        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
+        branches = self.tree, () if self.tree is None else tuple(ends)
+        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, *branches)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
         """Returns the joint, from 0, that carries another (−1: the base), and the start of the other's row after
@@ -414,22 +391,14 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grown:
-    """A tree of joints; ``ends`` : (n,) end of each joint's row in its frame; ``flange_joint`` : ends at the flange."""
-
-    tree: Tree
-    ends: tuple[Rigid, ...]
-    flange_joint: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Chain:
     """The fixed transforms of an arm, which are all that calibration changes.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
     first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
     ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
-    frame; ``elasticity`` : deflection of the links; ``grown`` : the tree, if joints form one.
+    frame; ``elasticity`` : deflection of the links; ``tree`` : if joints form one, with the ``ends`` (n,) of its rows,
+    each in its joint's frame; ``flange_joint`` : whose end is the flange.
     """
 
     rotation: np.ndarray
@@ -438,7 +407,9 @@ class Chain:
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
-    grown: Grown | None = None
+    tree: Tree | None = None
+    ends: tuple[Rigid, ...] = ()
+    flange_joint: int | None = None
 
     def __post_init__(self):
         n = len(self.prismatic)
@@ -456,18 +427,22 @@ class Chain:
 
     def after(self, i: int) -> int:
         """The joint that carries joint ``i``; −1 for the world."""
-        return i - 1 if self.grown is None else self.grown.tree.after(i)
+        return i - 1 if self.tree is None else self.tree.after(i)
+
+    def end(self, i: int) -> Rigid:
+        """End of the row of joint ``i`` in its frame; of a serial arm the flange."""
+        return self.last_from_flange if self.tree is None else self.ends[i]
 
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
         last = len(self) - 1
-        return last if self.grown is None else self.grown.tree.carrier(target, last)
+        return last if self.tree is None else self.tree.carrier(target, last)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
-        if self.grown is None:
+        if self.tree is None:
             return np.ones((len(self), len(targets)), bool)
-        found = {name: np.isin(np.arange(len(self)), self.grown.tree.path(self.carrier(name))) for name in set(targets)}
+        found = {name: np.isin(np.arange(len(self)), self.tree.path(self.carrier(name))) for name in set(targets)}
         return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
 
     def behind(self) -> np.ndarray:
@@ -491,21 +466,20 @@ class Chain:
         return total
 
     def branch(self, carrier: int) -> "Chain":
-        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, as they bend this
-        one."""
-        if self.grown is None:
+        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, and bend it."""
+        if self.tree is None:
             return self
-        return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))
+        return replace(self, last_from_flange=self.ends[carrier], flange_joint=carrier)
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
-        if self.grown is None:
+        if self.tree is None:
             return tuple(range(len(self)))
-        if self.grown.flange_joint is None:
+        if self.flange_joint is None:
             raise InputError(
                 "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
             )
-        return self.grown.tree.path(self.grown.flange_joint)
+        return self.tree.path(self.flange_joint)
 
 
 def about_z(angle: float) -> np.ndarray:
@@ -528,8 +502,7 @@ def across(row: DHRow) -> Rigid:
 
 
 def mh80() -> Robot:
-    """Returns an arm with the size, reach (2061 mm) and joint ranges of Yaskawa's Motoman MH80, from its data sheet; J3
-    is not coupled, and the tool is at the flange."""
+    """Returns an arm of the size and ranges of Yaskawa's Motoman MH80, from its data sheet, J3 not coupled."""
     rows = ((145, -90, 540, 0), (870, 0, 0, -90), (210, -90, 0, 0), (0, 90, 1025, 0), (0, -90, 0, 0), (0, 0, 175, 0))
     ranges = ((-180, 180), (-90, 155), (-80, 90), (-360, 360), (-125, 125), (-360, 360))
     return Robot(

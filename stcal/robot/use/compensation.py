@@ -37,67 +37,15 @@ LEAST_SHOWN_MM = 1e-6
 """Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
-
-
-def _stayed(
-    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None, inverse: Inverse, known: np.ndarray
-) -> tuple[Inverse, dict[int, str]]:
-    """Returns solutions in the configuration of the commanding joint values ``near`` (m, n), where these are ``known``
-    (m,), and by row the limits that prevent it. A row whose nearest solution is beyond the limits gets status ``limit``
-    and joint values there."""
-    if near is None or not known.any() or len(robot.rows) > ISOLATED:
-        return inverse, {}
-    away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
-    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
-    if not len(rows):
-        return inverse, {}
-    unlimited = _between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1)))
-    free = joints_of(unlimited, targets[rows], poses[rows], near[rows])
-    q, status = inverse.q.copy(), list(inverse.status)
-    error_mm, error_rad = inverse.error_mm.copy(), inverse.error_rad.copy()
-    beyond = {}
-    for k, i in enumerate(rows.tolist()):
-        if not free.usable[k]:
-            continue
-        reason = _beyond(robot, free.q[k])
-        if not reason or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
-            continue
-        beyond[i] = reason
-        if inverse.usable[i]:
-            least, most = np.minimum(near[i], free.q[k]), np.maximum(near[i], free.q[k])
-            limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
-            at = joints_of(_between(robot, limits), targets[rows[[k]]], poses[[i]], near[[i]])
-            q[i], error_mm[i], error_rad[i], status[i] = at.q[0], at.error_mm[0], at.error_rad[0], LIMIT
-    return Inverse(q, tuple(status), error_mm, error_rad), beyond
-
-
-def _between(robot: Robot, limits: np.ndarray) -> Robot:
-    """Returns the robot with other limits (n, 2); those of a joint that cannot move differ in the last bit."""
-    low, high = limits[:, 0], np.maximum(limits[:, 1], np.nextafter(limits[:, 0], np.inf))
-    joints = (Joint(own.type, *ends) for own, *ends in zip(robot.joints, low.tolist(), high.tolist(), strict=True))
-    return replace(robot, joints=tuple(joints))
-
-
-def _beyond(robot: Robot, q: np.ndarray) -> str:
-    """Returns the joints of (n,) that are beyond their limits, with both values, as text; empty if there is none."""
-    said = []
-    for number, (value, joint) in enumerate(zip(q.tolist(), robot.joints, strict=True), 1):
-        limit = min(max(value, joint.lower), joint.upper)
-        if abs(value - limit) > SAME_BRANCH:
-            unit, factor = (" mm", 1.0) if joint.type == "prismatic" else ("°", float(np.degrees(1.0)))
-            said.append(f"J{number} at {value * factor:.6g}{unit}, limit {limit * factor:.6g}{unit}")
-    return " and ".join(said)
-
-
 FAR_RAD = np.radians(1.0)
-"""Largest usual motion of a joint, as arms are made to milliradians.
-
-A joint moves by more only if others cannot move.
-"""
+"""Largest usual motion of a joint, as arms are made to milliradians."""
 AMPLIFIED = 10.0
 """Ratio of a joint's motion to the error of the pose, in rad, from which the arm is near a singular pose."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
 """Largest plausible deviation of a tool from its drawing, mm and rad."""
+FEW_ROWS = 3
+ROUND_MM = 0.01
+"""Lengths as drawn are multiples of this."""
 MEANING = {
     LIMIT: "only joint values beyond the limits reach it",
     UNREACHABLE: "no joint values reach it",
@@ -113,21 +61,15 @@ class Compensated(Brief):
     Parameters
     ----------
     targets : Targets
-    poses : Poses
-        Commanded base_from_tool.
-    found : Inverse
-        By the identified robot.
-    nominal : Inverse or None
-        By the nominal robot: what would be commanded without calibration.
+    poses : commanded base_from_tool.
+    found : by the identified robot.
+    nominal : by the nominal robot: what would be commanded without calibration.
     before_mm, before_rad : (m,) arrays
         Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
         robot.
-    identified : Robot
-        The identified robot, with the tools that were taken.
-    beyond : dict of int to str
-        Joints, and their values, of rows that only joint values beyond the limits reach.
-    doubts : tuple of str
-        Notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
+    identified : the identified robot, with the tools that were taken.
+    beyond : joints, and their values, of rows that only joint values beyond the limits reach.
+    doubts : notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
     """
 
     targets: Targets
@@ -165,23 +107,22 @@ class Compensated(Brief):
 
     def notes(self) -> list[str]:
         """Returns doubts about targets and robots, then notes on rows not simply reached or far from nominal values."""
-        found, lines, far = self.found, self.targets.lines, []
-        left = zip(lines, found.status, found.error_mm, found.error_rad, strict=True)
-        hardly = [
-            f"line {line}: {MEANING[status]}{f' ({self.beyond[i]})' if i in self.beyond else ''}; {mm:.4g} mm and "
-            f"{np.degrees(rad):.4g}° remain"
-            for i, (line, status, mm, rad) in enumerate(left)
-            if status in MEANING
-        ]
-        if self.nominal is not None:
-            moved = np.abs(found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
-            expected = self.before_rad + self.before_mm / reach_mm(self.identified, self.targets.tools[:1])
-            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist():
-                mm, rad = self.before_mm[i], self.before_rad[i]
-                errs = f"the nominal joint values err by {mm:.4g} mm and {np.degrees(rad):.3g}°"
-                why = "near a singular pose" if moved[i] > AMPLIFIED * expected[i] else errs
-                far.append(f"line {lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: {why}")
-        return [*self.doubts, *hardly, *far]
+        found, lines, notes = self.found, self.targets.lines, [*self.doubts]
+        for i, (line, status) in enumerate(zip(lines, found.status, strict=True)):
+            if status in MEANING:
+                beyond = f" ({self.beyond[i]})" if i in self.beyond else ""
+                mm, deg = found.error_mm[i], np.degrees(found.error_rad[i])
+                notes.append(f"line {line}: {MEANING[status]}{beyond}; {mm:.4g} mm and {deg:.4g}° remain")
+        if self.nominal is None:
+            return notes
+        moved = np.abs(found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
+        expected = self.before_rad + self.before_mm / reach_mm(self.identified, self.targets.tools[:1])
+        for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist():
+            deg = np.degrees(self.before_rad[i])
+            why = f"the nominal joint values err by {self.before_mm[i]:.4g} mm and {deg:.3g}°"
+            why = "near a singular pose" if moved[i] > AMPLIFIED * expected[i] else why
+            notes.append(f"line {lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: {why}")
+        return notes
 
 
 def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
@@ -195,7 +136,7 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
         mm, rad = np.linalg.norm(own.translation - other.translation), (own.inverse() @ other).angle_rad()
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
             apart[name] = f"differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between the two files"
-    with_own = replace(nominal, tools=dict(nominal.tools) | {name: identified.tools[name] for name in apart})
+    with_own = replace(nominal, tools={**nominal.tools, **{name: identified.tools[name] for name in apart}})
     taken = "identified file is taken in both"
     if (
         apart.keys() <= nominal.tools.keys()
@@ -204,8 +145,8 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
         and position_misfit_mm(nominal, targets) < position_misfit_mm(with_own, targets)
     ):
         taken = "nominal file is taken in both (joint values beside the poses say so)"
-        own = {name: nominal.tools[name] for name in apart}
-        identified, with_own = replace(identified, tools=dict(identified.tools) | own), nominal
+        own_tools = {name: nominal.tools[name] for name in apart}
+        identified, with_own = replace(identified, tools={**identified.tools, **own_tools}), nominal
     notes = (f"tool {name or 'of the robot files'} {said}: that of the {taken}" for name, said in apart.items())
     return identified, with_own, tuple(notes)
 
@@ -222,32 +163,29 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
 
     Parameters
     ----------
-    identified : Robot
-        As it is; mm, rad.
-    targets : Targets or Poses
-        m commanded poses base_from_tool; of files from :func:`read_targets`.
-    nominal : Robot, optional
-        The model in its controller.
+    identified : as it is; mm, rad.
+    targets : m commanded poses base_from_tool; of files from :func:`read_targets`.
+    nominal : the model in its controller.
 
     Returns
     -------
-    Compensated
-        Joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of reach raise
-        no error.
+    Compensated : joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of
+        reach raise no error.
 
     Raises
     ------
-    InputError
-        Joint values without poses need the nominal robot; robots of different joints, or too far apart to be one; an
-        unknown tool; poses to which their joint values lead in another unit or convention only.
+    InputError : joint values without poses need the nominal robot; robots of different joints, or too far apart to be
+        one; an unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if isinstance(targets, Poses):
         targets = Targets.from_poses(targets)
-    if nominal is not None and _built(nominal) != _built(identified):
+    both = [identified] if nominal is None else [identified, nominal]
+    builds = [[(joint.type, each.carrier(i)[0]) for i, joint in enumerate(each.joints)] for each in both]
+    if builds[0] != builds[-1]:
         raise InputError(
             "E-ROBOT-MISMATCH",
-            f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number, type or "
-            "order; files of the same robot needed",
+            f"nominal robot {both[-1].name} and identified robot {identified.name}: joints of different number, type "
+            "or order; files of the same robot needed",
         )
     if nominal is None and targets.poses is None:
         raise InputError(
@@ -284,11 +222,6 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     )
 
 
-FEW_ROWS = 3
-ROUND_MM = 0.01
-"""Lengths as drawn are multiples of this."""
-
-
 def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     """Returns a doubt if the files seem exchanged, or hold the same arm."""
     one, other = ((robot.rows, robot.elasticity, robot.tools) for robot in (identified, nominal))
@@ -320,9 +253,52 @@ def _in_radians(targets: Targets, sliding: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def _built(robot: Robot) -> list[tuple[str, int]]:
-    """Returns for each joint its type and the joint that carries it."""
-    return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
+def _stayed(
+    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None, inverse: Inverse, known: np.ndarray
+) -> tuple[Inverse, dict[int, str]]:
+    """Returns solutions in the configuration of ``near`` (m, n) where ``known`` (m,), and by row limits against it."""
+    if near is None or not known.any() or len(robot.rows) > ISOLATED:
+        return inverse, {}
+    away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
+    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
+    if not len(rows):
+        return inverse, {}
+    unlimited = _between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1)))
+    free = joints_of(unlimited, targets[rows], poses[rows], near[rows])
+    q, status = inverse.q.copy(), list(inverse.status)
+    error_mm, error_rad = inverse.error_mm.copy(), inverse.error_rad.copy()
+    beyond = {}
+    for k, i in enumerate(rows.tolist()):
+        if not free.usable[k]:
+            continue
+        reason = _beyond(robot, free.q[k])
+        if not reason or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
+            continue
+        beyond[i] = reason
+        if inverse.usable[i]:
+            least, most = np.minimum(near[i], free.q[k]), np.maximum(near[i], free.q[k])
+            limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
+            at = joints_of(_between(robot, limits), targets[rows[[k]]], poses[[i]], near[[i]])
+            q[i], error_mm[i], error_rad[i], status[i] = at.q[0], at.error_mm[0], at.error_rad[0], LIMIT
+    return Inverse(q, tuple(status), error_mm, error_rad), beyond
+
+
+def _between(robot: Robot, limits: np.ndarray) -> Robot:
+    """Returns the robot with other limits (n, 2); those of a joint that cannot move differ in the last bit."""
+    low, high = limits[:, 0], np.maximum(limits[:, 1], np.nextafter(limits[:, 0], np.inf))
+    ends = zip(robot.joints, low.tolist(), high.tolist(), strict=True)
+    return replace(robot, joints=tuple(Joint(own.type, *limit) for own, *limit in ends))
+
+
+def _beyond(robot: Robot, q: np.ndarray) -> str:
+    """Returns the joints of (n,) that are beyond their limits, with both values, as text; empty if there is none."""
+    said = []
+    for number, (value, joint) in enumerate(zip(q.tolist(), robot.joints, strict=True), 1):
+        limit = min(max(value, joint.lower), joint.upper)
+        if abs(value - limit) > SAME_BRANCH:
+            unit, factor = (" mm", 1.0) if joint.type == "prismatic" else ("°", float(np.degrees(1.0)))
+            said.append(f"J{number} at {value * factor:.6g}{unit}, limit {limit * factor:.6g}{unit}")
+    return " and ".join(said)
 
 
 def joint_columns(robot: Robot) -> list[str]:
@@ -347,15 +323,12 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
 
     Parameters
     ----------
-    result : Compensated
-        Of :func:`~stcal.robot.compensate`.
-    robot : Robot
-        The identified robot.
+    result : of :func:`~stcal.robot.compensate`.
+    robot : the identified robot.
 
     Returns
     -------
-    str
-        CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    str : CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
     columns = joint_columns(robot)
     names = result.targets.names
@@ -397,20 +370,14 @@ class CompensationFile(ResultFile):
         Shape((None, 4, 4)),
         BeforeValidator(lambda poses: poses.matrix() if isinstance(poses, Poses) else poses),
     ] = Field(description="commanded base_from_tool, mm")
-    joints: list[dict[str, float] | None] = Field(
-        description="joint values to command, by column name; null where the pose is not reached"
-    )
+    joints: list[dict[str, float] | None] = Field(description="joint values by column name; null if not reached")
     found: Reached = Field(description="`status` of each pose, and what remains: `error_mm`, `error_rad`")
     nominal_joints: list[dict[str, float] | None] | None = Field(description="the same of the nominal robot")
     nominal: Reached | None = Field(description="the same of the nominal robot: `status`, `error_mm`, `error_rad`")
-    before_mm: Vector = Field(
-        description="error of the nominal joint values by the identified robot, where `nominal.status` is reached"
-    )
+    before_mm: Vector = Field(description="error of the nominal joint values by the identified robot, where reached")
     before_rad: Vector = Field(description="the same of the orientation")
     notes: list[str] = Field(
-        validation_alias="remarks",
-        description="columns that were not read, angles by their convention; doubts of targets and robots, and rows "
-        "that are not simply reached",
+        validation_alias="remarks", description="columns not read, doubts of targets and robots, rows hardly reached"
     )
 
 

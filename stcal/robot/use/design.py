@@ -46,18 +46,10 @@ class DesignFile(ResultFile):
     parameters: int = Field(description="of the robot and its tool")
     seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
     exchanges: int = Field(description="single poses exchanged after the greedy choice")
-    chosen: ObservabilityIndices = Field(
-        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as `identify --json` has them"
-    )
-    random: list[ObservabilityIndices] = Field(
-        description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many poses"
-    )
-    sigma_mm: float = Field(
-        description="σ per axis of the position that the identified robot predicts, RMS over random poses"
-    )
-    random_sigma_mm: Finite = Field(
-        description="the same, median of the random sets (null where they leave parameters open)"
-    )
+    chosen: ObservabilityIndices = Field(description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses")
+    random: list[ObservabilityIndices] = Field(description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many")
+    sigma_mm: float = Field(description="σ per axis of positions that the identified robot predicts, RMS")
+    random_sigma_mm: Finite = Field(description="median of the random sets (null where they leave parameters open)")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -96,20 +88,13 @@ class DesignOptions:
 
     Parameters
     ----------
-    count : int
-        Poses to choose.
-    seed : int
-        Of the candidates and of the random sets.
-    observe : {"pose", "position"}
-        What the instrument measures.
-    candidates : int
-        Random poses to choose from, more than ``count``.
-    sigma_mm, sigma_rad : float
-        σ of the instrument, of one coordinate of a position, mm, and of an orientation, rad.
-    box : tuple of six floats, optional
-        Lowest x, y, z and highest x, y, z of the tool in the base, mm.
-    tool : str
-        Name of the tool that is measured.
+    count : poses to choose.
+    seed : of the candidates and of the random sets.
+    observe : what the instrument measures.
+    candidates : random poses to choose from, more than ``count``.
+    sigma_mm, sigma_rad : σ of the instrument, of one coordinate of a position, mm, and of an orientation, rad.
+    box : lowest x, y, z and highest x, y, z of the tool in the base, mm.
+    tool : name of the tool that is measured.
 
     Raises
     ------
@@ -139,13 +124,10 @@ class DesignOptions:
                 f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed, "
                 "1e-9 to 1e4 mm and 1e-12 to 4 rad",
             )
-        if self.box is not None and (
-            len(self.box) != 6 or any(not a < b for a, b in zip(self.box[:3], self.box[3:], strict=True))
-        ):
-            shown = ",".join(f"{v:g}" for v in self.box)
+        if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
             raise InputError(
                 "E-DESIGN-OPTIONS",
-                f"design: box {shown}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
+                f"design: box {_shown(self.box)}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
             )
 
 
@@ -158,22 +140,17 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 
     Parameters
     ----------
-    robot : Robot
-        The nominal robot, with joint limits; mm, rad.
-    options : DesignOptions, optional
-        How many poses, of how many candidates, for which instrument.
+    robot : the nominal robot, with joint limits; mm, rad.
+    options : how many poses, of how many candidates, for which instrument.
 
     Returns
     -------
-    PoseDesign
-        Joint vectors with their poses base_from_tool, and their observability beside random ones.
+    PoseDesign : joint vectors with their poses base_from_tool, and their observability beside random ones.
 
     Raises
     ------
-    InputError
-        A prismatic joint without limits, or no poses in the box.
-    DegenerateError
-        So few poses that the parameters cannot be determined.
+    InputError : a prismatic joint without limits, or no poses in the box.
+    DegenerateError : so few poses that the parameters cannot be determined.
 
     References
     ----------
@@ -196,7 +173,10 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         )
     chosen, exchanges = choose(rows, options.count)
     sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
-    predict = _prediction(robot, q[:TEST_POSES], options) * scale @ basis
+    predict = identification_jacobian(robot, q[:TEST_POSES], "position", tool=options.tool)
+    if options.observe == "pose":  # the tool's rotation does not move it
+        predict = np.insert(predict, [predict.shape[2] - 3] * 3, 0.0, axis=2)
+    predict = predict * scale @ basis
     return PoseDesign(
         q=q[chosen],
         poses=forward(robot, q[chosen], options.tool),
@@ -208,17 +188,6 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         random_sigma_mm=float(np.median([_predicted_mm(rows[s], predict) for s in sets])),
         exchanges=exchanges,
     )
-
-
-def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarray:
-    """Returns the derivative (m, 3, k) of the tool's position by all parameters.
-
-    The tool's rotation does not move it.
-    """
-    positions = identification_jacobian(robot, q, "position", tool=options.tool)
-    if options.observe == "position":
-        return positions
-    return np.insert(positions, [positions.shape[2] - 3] * 3, 0.0, axis=2)
 
 
 def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) -> np.ndarray:
@@ -234,23 +203,26 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
     low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
     high = np.where(np.isfinite(high), high, low + 2 * np.pi)
     batches: list[np.ndarray] = []
-    count, drawn = 0, 0
+    count, drawn, box = 0, 0, options.box
     while count < options.candidates:
-        if options.box is not None and drawn >= DRAWS * options.candidates:
-            shown = ",".join(f"{v:g}" for v in options.box)
+        if box is not None and drawn >= DRAWS * options.candidates:
             raise InputError(
                 "E-DESIGN-BOX",
-                f"design: of {drawn} random joint vectors {count} bring the tool into the box {shown} mm, "
+                f"design: of {drawn} random joint vectors {count} bring the tool into the box {_shown(box)} mm, "
                 f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates",
             )
         q = rng.uniform(low, high, (options.candidates, len(low)))
         drawn += len(q)
-        if options.box is not None:
+        if box is not None:
             at = forward(robot, q, options.tool).translation
-            q = q[((at >= options.box[:3]) & (at <= options.box[3:])).all(axis=1)]
+            q = q[((at >= box[:3]) & (at <= box[3:])).all(axis=1)]
         batches.append(q)
         count += len(q)
     return np.concatenate(batches)[: options.candidates]
+
+
+def _shown(box: tuple[float, ...]) -> str:
+    return ",".join(f"{v:g}" for v in box)
 
 
 def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
@@ -261,8 +233,7 @@ def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
-    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ; returns them and the number of
-    exchanges. The greedy choice starts with almost no information; then poses are exchanged until nothing helps."""
+    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ; returns them and the exchanges."""
     k = rows.shape[2]
     mean = np.einsum("mri,mrj->ij", rows, rows) / len(rows)
     start = 1e-6 * np.trace(mean) / k * np.eye(k)
@@ -320,15 +291,12 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
     Parameters
     ----------
-    result : PoseDesign
-        Of :func:`~stcal.robot.design`.
-    robot : Robot
-        The robot for which they were designed.
+    result : of :func:`~stcal.robot.design`.
+    robot : the robot for which they were designed.
 
     Returns
     -------
-    str
-        CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
+    str : CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
     """
     rows: list[Sequence] = [["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)]]
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):

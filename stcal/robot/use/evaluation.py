@@ -22,14 +22,13 @@ from stcal.robot.identification.adjustment import (
     frame_motions,
     jacobian,
     observed,
-    only_of,
-    require_enough,
+    position_errors,
     residuals,
     tips_of,
     tool_motions,
 )
 from stcal.robot.identification.prior import Placed
-from stcal.robot.identification.result import Figures, PlacedPose, position_errors
+from stcal.robot.identification.result import Figures, PlacedPose
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements
@@ -37,8 +36,7 @@ from stcal.robot.kinematics.model import Robot
 
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5
-"""False-alarm probability of one row in a set with normal errors. An error beyond ``SURELY`` times this limit is always
-gross, as residuals of a model have longer tails than noise: 8 σ for 50 positions."""
+"""False-alarm probability per row, and factor on its limit, as a model's residuals have longer tails than noise."""
 LEAST_MM = 1e-3
 """Error below which a row is never wrong, as no instrument shows less."""
 ROUNDS = 5
@@ -146,24 +144,18 @@ class Evaluation:
         return [line for line, wrong in zip(self.lines, self.wrong, strict=True) if wrong]
 
 
+FINDING = "`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`"
+
+
 class EvaluatedRobot(Part):
     name: str
     position_mm: Figures
     good_mm: Figures
     orientation_rad: Figures | None
     placed: list[PlacedPose] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
-    left: list[Finding] | None = Field(
-        description="what the residuals go with, `what`, `joint`, `turns`, `effect_mm`, `effect_rad`, "
-        "`share`, `p`, `line`, `advice`; null where rows are too few to tell"
-    )
-    beyond: list[Finding] | None = Field(
-        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`) of "
-        "what parameters identified from these rows would leave"
-    )
-    residuals: Matrix = Field(
-        description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "
-        "distance"
-    )
+    left: list[Finding] | None = Field(description=f"what the residuals go with: {FINDING}; null of too few rows")
+    beyond: list[Finding] | None = Field(description=f"what an identification from these rows would leave: {FINDING}")
+    residuals: Matrix = Field(description="of each row: measured minus modelled position in the base, or distance, mm")
 
 
 class EvaluationFile(ResultFile):
@@ -173,9 +165,7 @@ class EvaluationFile(ResultFile):
     refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
     observed: str = Field(description="positions or distances")
     lines: list[int] = Field(description="of the data file, of each row")
-    wrong_lines: list[int] = Field(
-        description="those that no robot explains (wrong, or something all models lack); nothing was fitted to them"
-    )
+    wrong_lines: list[int] = Field(description="those that no robot explains; nothing was fitted to them")
     best: str = Field(description="the robot that is better than all others by more than chance; empty: none is")
     robots: list[EvaluatedRobot] = Field(
         description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
@@ -193,12 +183,9 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Parameters
     ----------
-    robots : dict of Robot
-        Robots by name; mm, rad.
-    data : Measurements
-        Joint values with the measurements made at them, in the instrument's frame.
-    refit : {"none", "base", "tool", "base-tool"}
-        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
+    robots : robots by name; mm, rad.
+    data : joint values with the measurements made at them, in the instrument's frame.
+    refit : what is fitted by least squares with each robot's own axes; the rest is as its file has it.
 
     Returns
     -------
@@ -207,10 +194,8 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Raises
     ------
-    InputError
-        A robot of other joints, or that does not fit the data; a tool that it does not have.
-    DegenerateError
-        Too few rows for what is fitted, or positions that do not show it.
+    InputError : a robot of other joints, or that does not fit the data; a tool that it does not have.
+    DegenerateError : too few rows for what is fitted, or positions that do not show it.
     """
     fit: Fit = frozenset(part for part in ("base", "tool") if part in refit.split("-"))
     named = {name: replace(robot, name=name) for name, robot in robots.items()}
@@ -222,8 +207,8 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
             )
     seen = observed(data, None if data.positions is None else "position")
     what = f"parameters of {' and '.join(sorted(fit))}"
-    require_enough(seen, _parameters(seen, fit), what, "or fit less (--refit)")
-    states, wrong = _fitted(list(named.values()), data, seen, fit)
+    seen.require_more_than(_parameters(seen, fit), what, "or fit less (--refit)")
+    states, wrong = _fitted(list(named.values()), seen, fit)
     found = tuple(
         _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
     )
@@ -235,66 +220,51 @@ def _parameters(measured: Observed, fit: Fit) -> int:
     return base + (3 * len(set(measured.data.targets)) if "tool" in fit else 0)
 
 
-def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
+def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
     """Returns the states of all robots, and a mask (r,) of rows (never of distances) that none explains: not fitted."""
-    wrong = np.zeros(len(measured), bool)
-    freedom = WIDTH[measured.kind] * len(measured) - _parameters(measured, fit)
+    wrong, width, targets = np.zeros(len(measured), bool), WIDTH[measured.kind], np.array(measured.data.targets)
+    freedom = width * len(measured) - _parameters(measured, fit)
     for _ in range(ROUNDS):
-        kept = data if measured.kind == "distance" else data[~wrong]
+        kept = measured[~wrong].data
         states = [start(robot, kept, fit) for robot in robots]
         errors = np.array([position_errors(residuals(state, measured)) for state in states])
-        share = freedom / WIDTH[measured.kind] / len(measured)
-        sigma = min(robust_sigma(each[~wrong], WIDTH[measured.kind], share) for each in errors)
-        limit = SURELY * sigma * length_limit(WIDTH[measured.kind], FALSE_ALARM / len(measured))
-        now = errors.min(0) > max(limit, LEAST_MM)
-        if freedom < LEAST_FREEDOM or (now == wrong).all() or set(_targets(measured, ~now)) < set(_targets(measured)):
+        sigma = min(robust_sigma(each[~wrong], width, freedom / width / len(measured)) for each in errors)
+        now = errors.min(0) > max(SURELY * sigma * length_limit(width, FALSE_ALARM / len(measured)), LEAST_MM)
+        left_out = set(targets[measured.first]) - set(targets[measured.first[~now]])
+        if freedom < LEAST_FREEDOM or (now == wrong).all() or left_out:
             break
         wrong = now
     return states, wrong
 
 
-def _targets(measured: Observed, among: np.ndarray | slice = slice(None)) -> list[str]:
-    return np.array(measured.data.targets, object)[measured.first[among]].tolist()
-
-
 def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
     base = state.chain.gap(0) @ replace(robot, world_from_base=Rigid()).chain().gap(0).inverse()
-    found = residuals(state, measured)
-    rotation = np.zeros(0)
+    in_base, rotation = residuals(state, measured), np.zeros(0)
     if measured.data.rotations is not None:
         whole = observed(measured.data, "pose")
         rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
-    good = only_of(measured, np.flatnonzero(~wrong))
-    fitted = _derivatives(state, base, good, fit)
-    one, full = Weighting(1.0, 1.0), jacobian(state, good)
-    seeks = np.concatenate([fitted, full], axis=2)
-    in_base = found
-    if found.shape[1] == 3:
-        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
-        in_base = np.einsum("nji,nj->ni", np.array(stations), found) @ base.rotation
-    placed = _placed(state, base, residuals(state, good), fitted, fit, measured.kind != "distance")
-    return Evaluated(
-        replace(robot, world_from_base=base, tools=state.tools),
-        state,
-        in_base,
-        ~wrong,
-        rotation,
-        placed,
-        left(state, base, good, one, fitted),
-        left(state, base, good, one, seeks),
-    )
-
-
-def _derivatives(state: State, base: Rigid, measured: Observed, fit: Fit) -> np.ndarray:
-    """Returns the derivatives (r, w, k) by the base (rotation about its origin, translation) and the tools' points."""
-    parts = [np.zeros((len(measured), WIDTH[measured.kind], 0))]
-    tip = tips_of(state, measured.data)
-    if "base" in fit and measured.kind != "distance":
-        parts.append(as_seen(state, measured, tip, frame_motions(tip, base.translation)))
+    good = measured[np.flatnonzero(~wrong)]
+    tip, parts = tips_of(state, good.data), [np.zeros((len(good), WIDTH[good.kind], 0))]
+    if "base" in fit and good.kind != "distance":
+        parts.append(as_seen(state, good, tip, frame_motions(tip, base.translation)))
     if "tool" in fit:
-        tools = (tool_motions(tip, measured.data.targets, name, measured.kind) for name in state.tools)
-        parts += [as_seen(state, measured, tip, moves) for moves in tools]
-    return np.concatenate(parts, axis=2)
+        tools = (tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools)
+        parts += [as_seen(state, good, tip, moves) for moves in tools]
+    fitted, one = np.concatenate(parts, axis=2), Weighting(1.0, 1.0)
+    seeks = np.concatenate([fitted, jacobian(state, good)], axis=2)
+    if in_base.shape[1] == 3:
+        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
+        in_base = np.einsum("nji,nj->ni", np.array(stations), in_base) @ base.rotation
+    return Evaluated(
+        robot=replace(robot, world_from_base=base, tools=state.tools),
+        state=state,
+        residuals=in_base,
+        good=~wrong,
+        rotation_rad=rotation,
+        placed=_placed(state, base, residuals(state, good), fitted, fit, good.kind != "distance"),
+        left=left(state, base, good, one, fitted),
+        beyond=left(state, base, good, one, seeks),
+    )
 
 
 def _placed(

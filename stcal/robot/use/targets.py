@@ -14,6 +14,7 @@ from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.observability import over_ranges
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
@@ -33,22 +34,14 @@ class Targets(Brief):
 
     Parameters
     ----------
-    where : str
-        The file, for messages.
-    lines : sequence of int
-        (m,) its lines.
-    tools : tuple of str
-        (m,) names.
-    poses : Poses or None
-        base_from_tool, mm; None where joint values command.
-    q : (m, n) array or None
-        Commanded joint values, or those whose branch is wanted, rad or mm.
-    names : dict
-        Of the columns :data:`NAMES` that are there, (m,) each.
-    notes : tuple of str
-        On columns that were not read, and angles by their convention.
-    conditions : Conditions
-        What the flange carries.
+    where : the file, for messages.
+    lines : (m,) its lines.
+    tools : (m,) names.
+    poses : base_from_tool, mm; None where joint values command.
+    q : (m, n) array or None: commanded joint values, or those whose branch is wanted, rad or mm.
+    names : of the columns :data:`NAMES` that are there, (m,) each.
+    notes : on columns that were not read, and angles by their convention.
+    conditions : what the flange carries.
     """
 
     where: str
@@ -118,27 +111,21 @@ def read_targets(
 
     Parameters
     ----------
-    path : str or Path or Table
-        Table (CSV; form: ``data_layout.md``).
-    robot : Robot
-        The robot with the tools of the targets, and with the joints if joint values are given.
+    path : table (CSV; form: ``data_layout.md``).
+    robot : the robot with the tools of the targets, and with the joints if joint values are given.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    rotation : str, optional
-        Convention of angles, if their columns do not name it; see :func:`read_measurements`.
-    payload_kg : float, optional
-        Mass at the flange in all rows, if there is no column ``payload_kg``.
+    rotation : convention of angles, if their columns do not name it; see :func:`read_measurements`.
+    payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------
-    Targets
-        base_from_tool, mm; joint values, rad or mm.
+    Targets : base_from_tool, mm; joint values, rad or mm.
 
     Raises
     ------
-    InputError
-        Neither poses nor joint values, positions without orientation, angles whose convention is open, bad rows, masses
-        that no arm carries; the message names the line.
+    InputError : neither poses nor joint values, positions without orientation, angles whose convention is open, bad
+        rows, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)
@@ -180,32 +167,23 @@ def read_targets(
     )
 
 
-def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
-    """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
-    mass = targets.conditions.payload_kg
-    masses = [None] * len(targets) if mass is None else mass.tolist()
-    rows: dict[tuple[str, float | None], list[int]] = {}
-    for row, pair in enumerate(zip(targets.tools, masses, strict=True)):
-        rows.setdefault(pair, []).append(row)
-    return [(*pair, np.array(own)) for pair, own in rows.items()]
-
-
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
     """Returns base_from_tool of joint values (m, n), with each row's tool and load."""
-    rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
-    for name, mass, rows in rows_alike(targets):
-        part = forward(robot, q[rows], name, mass)
-        rotation[rows], translation[rows] = part.rotation, part.translation
-    return Poses(rotation, translation)
+    arm = State(replace(robot, world_from_base=Rigid()).chain(), {name: robot.tool(name) for name in targets.tools})
+    return tips(arm, q, targets.tools, targets.conditions)
 
 
 def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
     """Returns joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
-    m = len(poses)
+    m, mass = len(poses), targets.conditions.payload_kg
+    alike: dict[tuple[str, float | None], list[int]] = {}
+    for row, pair in enumerate(zip(targets.tools, [None] * m if mass is None else mass.tolist(), strict=True)):
+        alike.setdefault(pair, []).append(row)
     q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
     error_mm, error_rad = np.empty(m), np.empty(m)
-    for name, mass, rows in rows_alike(targets):
-        part = inverse(robot, poses[rows], None if near is None else near[rows], name, mass)
+    for (name, kg), own in alike.items():
+        rows = np.array(own)
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name, kg)
         q[rows], status[rows] = part.q, part.status
         error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
     return Inverse(q, tuple(status), error_mm, error_rad)
@@ -218,8 +196,7 @@ USUAL_SHARE = 0.01
 SAMPLE = 50
 """Number of joint vectors at which two robots are compared."""
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
-"""Share and number of targets out of reach from which another convention is tried, and the number that it must all
-bring within reach. By chance each is, half the time, so that one of six conventions is in 2 of 100 sets of 8."""
+"""Share and number of targets out of reach from which others are tried, and number that these must all reach."""
 INVERSE = "poses were inverse (base seen from the tool); give the tool in the base's frame"
 
 
@@ -281,8 +258,7 @@ def _rms(shift: np.ndarray) -> float:
 
 
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
-    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row within 5 % of the reach
-    and 11°."""
+    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row."""
 
     def misfit(case: tuple[Poses, np.ndarray]) -> float:
         off = case[0].difference(poses_of(robot, targets, case[1]))
@@ -298,22 +274,21 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
 
 def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
     """Yields frequent mistakes with the poses and the joint values that were meant."""
-    for unit in UNITS:
-        meant = Poses(poses.rotation, LENGTHS[unit] * poses.translation)
-        yield Candidate(f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …", partial(tuple, (meant, q)))
-    yield Candidate(INVERSE, lambda: (poses.inverse(), q))
     turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
-    yield Candidate(
-        "joint values were radians in columns of degrees; call the columns q1_rad …", lambda: (poses, turned)
-    )
-    for names, places in other_axes(poses.translation):
-        words = f"x, y, z were {names}; correct order and signs of the columns of positions"
+    meant = [(f"lengths were {UNIT_WORDS[u]}; call the columns x_{u} …", LENGTHS[u] * poses.translation) for u in UNITS]
+    meant += [
+        (f"x, y, z were {names}; correct order and signs of the columns of positions", places)
+        for names, places in other_axes(poses.translation)
+    ]
+    for words, places in meant:
         yield Candidate(words, partial(tuple, (Poses(poses.rotation, places), q)))
+    yield Candidate(INVERSE, lambda: (poses.inverse(), q))
+    radians = "joint values were radians in columns of degrees; call the columns q1_rad …"
+    yield Candidate(radians, lambda: (poses, turned))
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
-    """Returns a note on joint values that miss poses by (m, 6), unless all rows have the same, as to choose a
-    branch."""
+    """Returns a note on joint values that miss poses by (m, 6), unless they only choose a branch."""
     mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
     away = (mm > FITS * reach) | (rad > TURNED_RAD)
     if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):
@@ -350,11 +325,9 @@ def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str,
     poses = targets.poses[some]
     guesses = {f"quaternions were {each.held}; {each.remedy}": each.poses(poses) for each in READINGS}
     guesses[INVERSE] = poses.inverse()
-    for reason, meant in guesses.items():
-        # Most guesses fail at once: a pose out of reach takes a third of a second.
-        if all(
-            joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]).usable[0] for i in range(len(some))
-        ):
+    for reason, meant in guesses.items():  # most fail at once: a pose out of reach takes a third of a second
+        tried = (joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]) for i in range(len(some)))
+        if all(each.usable[0] for each in tried):
             return (
                 f"{len(lost)} of {len(inverse)} poses are out of reach; {len(some)} of {len(some)} of these that were "
                 f"tried would be within if {reason}",

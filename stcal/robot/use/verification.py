@@ -19,19 +19,17 @@ from stcal.io.json import Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
+from stcal.robot.urdf import few
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
-"""Largest RMS deviation of measured from commanded distances of all pairs, as a share and in mm. Arms err by under 1 %
-of their 2 m. Another robot's model, or rows in another order, cause more."""
+"""Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
-"""Largest share of the poses that may be named as not where they were commanded, and number of poses up to which all
-are compared with all."""
+"""Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
 OFF, OFF_MM, LEAST_TO_COMPARE = 6.0, 0.1, 6
-"""How many times as much as that of most poses one's typical distance error must be, and how large, to name the pose;
-and smallest number of poses in which that is looked for."""
+"""Ratio of a pose's typical error to that of most, its size, and number of poses, from which on the pose is named."""
 NO_BETTER, WORSE = 0.8, 1.2
 """How many times as much as the first set another errs about as it does, and more than it does."""
 MOST_OF_IT = 0.75
@@ -39,10 +37,7 @@ MOST_OF_IT = 0.75
 LEAST_SPREAD_MM = 20.0
 """Largest commanded distance below which the unit is doubted."""
 SCALE_WITHIN = 0.005
-"""Largest relative difference of scale.
-
-Arms are off by parts of a thousand; more indicates another unit or other poses.
-"""
+"""Largest relative difference of scale; more is another unit, or other poses."""
 
 
 BySet = Annotated[str, "set"]
@@ -109,9 +104,8 @@ class VerificationFile(ResultFile):
     distance_mm: Vector = Field(description="commanded distances of the others from it")
     sets: list[SetResult] = Field(
         description="`name`; `error_mm` measured minus commanded; `mean_mm`, `std_mm` (sample), `max_mm` of their "
-        "absolute values; `pairs_rms_mm` of the errors of all pairs, `pairs_mm` of their commanded distances (RMS); "
-        "`scale` measured over commanded distances of all pairs by least squares; `elsewhere`: the poses that alone "
-        "are not where they were commanded, in words"
+        "absolute values; `pairs_rms_mm`, `pairs_mm` RMS of errors and of commanded distances of all pairs, `scale` of "
+        "measured over commanded ones; `elsewhere`: poses that alone are not where they were commanded"
     )
     missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
     warnings: Texts = Field(description="what to look at")
@@ -142,7 +136,7 @@ class Verification(Brief):
     def warnings(self) -> list[str]:
         """Returns warnings of missing poses and of doubtful sets."""
         found = [
-            f"set {name}: missing poses, left out of all sets ({len(poses)}): {_few(poses)}"
+            f"set {name}: missing poses, left out of all sets ({len(poses)}): {few(poses)}"
             for name, poses in self.missing.items()
             if poses
         ]
@@ -211,18 +205,15 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
 
     Parameters
     ----------
-    path : str or Path or Table
-        Table (CSV; form: ``data_layout.md``).
+    path : table (CSV; form: ``data_layout.md``).
 
     Returns
     -------
-    MeasuredPoses
-        Positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
+    MeasuredPoses : positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
 
     Raises
     ------
-    InputError
-        Missing columns, bad rows, or a pose twice in one set; the message names the line.
+    InputError : missing columns, bad rows, or a pose twice in one set; the message names the line.
     """
     table = read_table(path, WHAT)
     commanded, measured = table.points("commanded_"), table.points()
@@ -260,18 +251,15 @@ def verify(data: MeasuredPoses) -> Verification:
 
     Parameters
     ----------
-    data : MeasuredPoses
-        Commanded and measured positions of one or more sets, mm.
+    data : commanded and measured positions of one or more sets, mm.
 
     Returns
     -------
-    Verification
-        Mean, standard deviation and maximum of each set's distance errors, mm.
+    Verification : mean, standard deviation and maximum of each set's distance errors, mm.
 
     Raises
     ------
-    InputError
-        Fewer than three poses in common, or one pose commanded to different places.
+    InputError : fewer than three poses in common, or one pose commanded to different places.
     """
     rows: dict[str, dict[str, int]] = {}
     for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
@@ -329,7 +317,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     good = np.setdiff1d(np.arange(len(names)), wrong)
     if not len(wrong) or len(wrong) > MOST_ELSEWHERE * len(names) or missed[np.ix_(good, good)].max() > MISSES_MM:
         return ""
-    listed = _few([name for i, name in enumerate(names) if i in wrong])
+    listed = few([name for i, name in enumerate(names) if i in wrong])
     if len(wrong) == 2:
         exchanged = measured.copy()
         exchanged[wrong] = measured[wrong[::-1]]
@@ -362,8 +350,3 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
         scale=product / commanded_squares,
         elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
     )
-
-
-def _few(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(names[:most])
-    return shown + (f" and {len(names) - most} more" if len(names) > most else "")

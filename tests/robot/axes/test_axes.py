@@ -379,7 +379,7 @@ def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
     assert "foot 59" in pair.refused
     assert "1 mm needed" in pair.refused
     assert result.robot.rows[1].beta != 0
-    assert [p.refused for p in result.pairs if p.joint != 1] == [""] * 4
+    assert [p.refused for p in result.pairs if p.joint != 2] == [""] * 4
     distance, normal = (result.without_one.spread(key)[1] for key in ("distance", "normal"))
     assert len(result.without_one.lines) == 36
     assert 0.005 < distance < 0.1

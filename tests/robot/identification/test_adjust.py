@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import adjusted, dh_values
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed

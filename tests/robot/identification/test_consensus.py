@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
 from tests.levels import sampled
 from tests.scripts import load_script

@@ -7,8 +7,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import State, Weighting, jacobian, observed
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.identification.unexplained import _Effect, _size, left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements

@@ -8,8 +8,8 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import inverse
 from stcal.robot.identification.adjustment import State, tips
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import made, measured, placed
 from tests.levels import sampled

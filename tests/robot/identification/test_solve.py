@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import State, jacobian, moved, observed, residuals, tip_jacobian, tips
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import dh_values
-from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.identification.solve import identify
+from stcal.robot.identified_report import identified_report
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements

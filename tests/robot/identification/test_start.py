@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.identification.solve import identify
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import mh80
 from tests.outcome import fails_with

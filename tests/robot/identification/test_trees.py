@@ -18,9 +18,9 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips,
 )
-from stcal.robot.identification.report import Drawn, joints_figure
+from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.identification.solve import identify
+from stcal.robot.identified_report import joints_figure
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames, moved_chain
@@ -174,8 +174,8 @@ def test_joints_are_drawn_with_the_rows_that_they_move():
     robot, rng = two_arms(), np.random.default_rng(3)
     seen = observed(seen_by(robot, rng, each=4))
     state = State(robot.chain(), dict(robot.tools))
-    drawn = Drawn(state, seen, residuals(state, seen), np.ones(12, bool))
-    dots = re.findall(r'd="([^"]*)" stroke="[^"]*" stroke-opacity', joints_figure(drawn, ()).svg())
+    drawn = joints_figure(state, seen, residuals(state, seen), np.ones(12, bool), ())
+    dots = re.findall(r'd="([^"]*)" stroke="[^"]*" stroke-opacity', drawn.svg())
     points = [path.count("M") for path in dots]
     assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
 

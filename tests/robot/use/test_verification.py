@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.use.report import verification_report
+from stcal.robot.robot_report import verification_report
 from stcal.robot.use.verification import MeasuredPoses, Verification, VerificationFile, read_measured, verify
 from tests.outcome import refuses
 

@@ -1,7 +1,7 @@
 """Text and page of an identified robot, and the table of mastering offsets for its controller."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -83,8 +83,7 @@ def identified_report(result: Identified) -> Document:
         listed("kept nominal, as the data do not determine it", result.undetermined),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
-    good = result.weights >= OUTLIER_WEIGHT
-    drawn = Drawn(result.state, result.seen, result.residuals, good)
+    drawn = result.state, seen, result.residuals, result.weights >= OUTLIER_WEIGHT
     return Document(
         f"{result.nominal.name}: identified",
         f"robot {result.nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
@@ -95,7 +94,7 @@ def identified_report(result: Identified) -> Document:
             Section("What the data determine", determined, terminal=True),
             Section(
                 "What the model leaves",
-                [*left_lines(result.left), residual_plot(drawn, result.left or ())],
+                [*left_lines(result.left), residual_plot(*drawn, result.left or ())],
                 name="left",
             ),
             Section(
@@ -235,8 +234,7 @@ LENGTH_AT, ANGLE_AT = DIMENSIONS.index("d"), DIMENSIONS.index("theta")
 
 
 def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns joint values that the controller should have at its present 0, their σ, and a mask of determined ones,
-    (n,). Rows have θ + Δ where nominal ones have θ; with the coupling C, that is q + C⁻¹ Δ."""
+    """Returns the controller's values at its present 0, their σ, and a mask (n,) of determined ones: q + C⁻¹ Δθ."""
     at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
     joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
     change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]
@@ -254,15 +252,12 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
 
     Parameters
     ----------
-    result : Identified
-        The robot as identified, of :func:`~stcal.robot.identify`.
-    nominal : Robot
-        The robot from which it was identified.
+    result : the robot as identified, of :func:`~stcal.robot.identify`.
+    nominal : the robot from which it was identified.
 
     Returns
     -------
-    str
-        CSV in mm and degrees, with σ (form: ``data_layout.md``).
+    str : CSV in mm and degrees, with σ (form: ``data_layout.md``).
     """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)
@@ -287,35 +282,31 @@ FEW = 200
 """Number of rows beyond which points are drawn small."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """Residuals for a figure: (r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm in the world's axes, of the
-    observations ``seen`` by ``state``; ``good`` : (r,) mask of the rows that are not errors."""
-
-    state: State
-    seen: Observed
-    residuals: np.ndarray
-    good: np.ndarray
-    colour: str = COLOURS[0]
-
-
-def joints_figure(shown: Drawn, findings: Iterable[Finding]):
-    """Returns a figure of good rows' residuals along each joint's motion by its value, with the findings' curves."""
-    observations, chain, tip = shown.seen, shown.state.chain, tips_of(shown.state, shown.seen.data)
-    data = observations.data
+def joints_figure(
+    state: State,
+    seen: Observed,
+    residuals: np.ndarray,
+    good: np.ndarray,
+    findings: Iterable[Finding],
+    colour: str = COLOURS[0],
+) -> Drawing:
+    """Returns a figure of residuals (r, w) of good rows (r,), in the world's axes, along each joint's motion by its
+    value, with the findings' curves."""
+    data, chain = seen.data, state.chain
+    tip = tips_of(state, data)
     twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]
     values, n = data.q @ chain.coupling.T, len(chain)
-    errors = shown.residuals[:, -3:]
+    errors = residuals[:, -3:]
     across = min(n, 3)
     down = -(-n // across)
     turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
     points = []
     for i, (twist, sliding) in enumerate(zip(twists, chain.prismatic, strict=True)):
-        motion = as_seen(shown.state, observations, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
+        motion = as_seen(state, seen, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
-        moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))
+        moves = good & (size > LEAST_MOTION * max(size.max(), 1e-300))
         along = np.einsum("rw,rw->r", motion[moves], errors[moves]) / size[moves]
-        at = values[observations.first[moves], i] * (1 if sliding else np.degrees(1))
+        at = values[seen.first[moves], i] * (1 if sliding else np.degrees(1))
         points.append((at, along, "mm" if sliding else "deg"))
     y = limits(np.concatenate([along for _, along, _ in points]))
     drawing = Drawing(9, 0.35 + 1.75 * down)
@@ -324,7 +315,7 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
         axes = Axes(drawing, box, limits(at), y)
         axes.frame(f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
         axes.level(0, "#9aa0a8")
-        axes.marks(at, along, "dot", 3 if len(at) <= FEW else 1.4, shown.colour)
+        axes.marks(at, along, "dot", 3 if len(at) <= FEW else 1.4, colour)
         if turns_of.get(i + 1) and len(at) > 3:
             fitted = np.linalg.lstsq(_wave(at, turns_of[i + 1]), along, rcond=None)[0]
             x = np.linspace(at.min(), at.max(), 100)
@@ -338,7 +329,15 @@ def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
     return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
 
 
-def residual_plot(shown: Drawn, findings: Iterable[Finding]) -> Html:
-    """Returns the figure of residuals by joint."""
+def residual_plot(
+    state: State,
+    seen: Observed,
+    residuals: np.ndarray,
+    good: np.ndarray,
+    findings: Iterable[Finding],
+    colour: str = COLOURS[0],
+) -> Html:
+    """Returns the figure of residuals by joint; see :func:`joints_figure`."""
     caption = "Residual along each joint's own motion, by the joint's value; a curve where residuals go with its angle"
-    return plot(lambda: joints_figure(shown, findings), "Residuals by joint", caption)
+    draw = partial(joints_figure, state, seen, residuals, good, findings, colour)
+    return plot(draw, "Residuals by joint", caption)

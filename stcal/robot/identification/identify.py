@@ -1,0 +1,388 @@
+"""Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.cross_validation import dealt
+from stcal.errors import DegenerateError
+from stcal.geometry.arrays import require_arguments, rms
+from stcal.geometry.rigid import skew
+from stcal.parallel import one_thread
+from stcal.robot.identification.adjustment import (
+    UNSEEN,
+    WIDTH,
+    Kind,
+    Observed,
+    State,
+    Weighting,
+    jacobian,
+    observed,
+    parameter_names,
+    parameter_units,
+    position_errors,
+    residuals,
+    tips_of,
+)
+from stcal.robot.identification.consensus import agreeing
+from stcal.robot.identification.observability import (
+    ObservabilityIndices,
+    directions_named,
+    doubts,
+    parameter_scale,
+    predicted,
+    widened,
+)
+from stcal.robot.identification.prior import NominalRows, bending, placed
+from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, ArmProblem, ArmSolution, Relaxation, mostly
+from stcal.robot.identification.result import (
+    LEAST_FOLDS,
+    Gain,
+    HeldOutRows,
+    Identified,
+    IdentifyOptions,
+    misgivings,
+)
+from stcal.robot.identification.start import start
+from stcal.robot.identification.unexplained import left, moved_meanwhile
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.forward import with_values
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+
+LEAST_MM, LEAST_RAD = 1e-3, 1e-6
+"""Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""
+TYPICAL = Weighting(0.1, 5e-4)
+"""σ of typical instruments, for which it is decided what the joint values determine."""
+VARIANCE_ROUNDS = 10
+"""Largest number of rounds of estimating σ. Two to four suffice for most data; a robot without noise needs the most."""
+VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
+"""Changes of the logarithm of a σ: convergence below the first, a note above the second."""
+FOLD_ROUNDS = 3
+"""Number of rounds of estimating the σ without some of the rows, starting from those of all rows."""
+FALLS = 0.5
+"""Ratio of successive medians of residuals above which they are near enough to start the actual estimation."""
+STILL_RAD, STILL_MM = 1e-5, 1e-2
+"""Motion, in rad or mm, below which a joint did not move."""
+OUTLIER_ROUNDS = 5
+"""Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
+REPEATED = "joint values were measured several times: what the model lacks there counts once in σ"
+MOST_OF_IT = 0.5
+"""Share of the squared residuals that a jump along the rows must explain to be named before open parameters."""
+ROUNDED_RAD, BEYOND, BEYOND_MM = 2e-5, 20.0, 0.3
+"""Difference of the turns of the tool from those of the robot file by rounding; and how many times what it does across
+the positions these must err, and by how much at least, for the controller to have computed the orientations."""
+COMPUTED = (
+    "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
+    "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
+)
+TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
+REPEATS, FEW_ROWS = 5, 300
+"""Number of divisions of the cross-validation for few rows, and largest number of few rows; more are divided once."""
+
+
+@require_arguments
+@one_thread()
+def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
+    """Identify the axes, base and tools of ``robot`` from ``data``.
+
+    The parameters are complete, minimal and continuous (:func:`stcal.robot.kinematics.forward.chain_parameters`). They
+    are adjusted by a trust-region method with Huber weights, have a covariance, and are converted back to D-H rows,
+    with Hayati's β for nearly parallel axes.
+
+    Parameters
+    ----------
+    robot : the nominal robot: mm, rad. The search starts at it, and dimensions are expected to be near it.
+    data : joint values with the measurements made at them, in the instrument's frame.
+    options : σ, robustness, cross-validation.
+
+    Returns
+    -------
+    Identified : the robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Its notes name
+        iterations of the σ that did not converge.
+
+    Raises
+    ------
+    ConvergenceError : the adjustment reaches no minimum.
+    DegenerateError : a joint or a target never moved, too few observations, or directions that the data do not
+        determine (kept nominal with ``partial``).
+    InputError : the nominal robot does not fit the data.
+
+    References
+    ----------
+    S. A. Hayati, "Robot arm geometric link parameter estimation", IEEE CDC 1983. H. Zhuang, Z. S. Roth, F. Hamano, "A
+    complete and parametrically continuous kinematic model for robot manipulators", IEEE Trans. Robotics and Automation
+    8, 1992. K. Okamura, F. C. Park, "Kinematic calibration using the product of exponentials formula", Robotica 14,
+    1996.
+    """
+    options = options or IdentifyOptions()
+    _still_joints(robot, data, options.partial)
+    first = start(robot, data)
+    computed = options.observe is None and _turns_as_computed(first, data)
+    seen = observed(data, "position" if computed else options.observe)
+    slope = jacobian(first, seen)
+    rows = NominalRows.about(first, parameter_units(slope), robot, options.adjust)
+    seeks = len(parameter_names(first, seen.kind)) - UNSEEN[seen.kind] - int(rows.fixed.sum())
+    seen.require_more_than(seeks, "parameters", "better twice that")
+    solution, held_out, gain = _modelled(robot, first, seen, options, rows)
+    state, rows = solution.state, solution.rows
+    names = parameter_names(state, seen.kind)
+    undetermined = _undetermined(solution, names, options.partial)
+    full_covariance, rank = solution.covariance(), solution.rank() - _place(seen)
+    named = slice(len(names))
+    covariance = full_covariance[named, named]
+    identified = robot_from_chain(state.chain, state.tools, robot)
+    prediction = predicted(state, robot, seen, full_covariance)
+    findings = left(state, identified.world_from_base, seen, solution.problem.weighting, weights=solution.weights)
+    wider, remarks = widened(prediction, findings or ())
+    of_arm = any(not each.advice for each in findings or ())
+    tested = held_out is not None or options.folds < LEAST_FOLDS
+    elasticity_sigma = None
+    if state.elastic and state.chain.elasticity is not None:
+        template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
+        elasticity_sigma = with_values(template, np.sqrt(np.diag(full_covariance))[-state.elastic_count :])
+    every = None
+    if rows.fixed.any():  # a rigid arm with all dimensions adjusted
+        free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
+        all_rows = NominalRows.about(first, parameter_units(slope), free)
+        every = _cross_validated(_adjusted(first, seen, options, all_rows), options)
+    result = Identified(
+        robot=identified,
+        nominal=robot,
+        seen=seen,
+        adjustment=solution,
+        names=tuple(names),
+        covariance=covariance,
+        rank=rank,
+        ranks=_ranks(state, data),
+        undetermined=undetermined,
+        nominal_mm=position_errors(residuals(first, seen)),
+        held_out=held_out,
+        predicted=wider,
+        placed=placed(state, seen.kind, covariance, solution.units[named], robot),
+        left=findings,
+        dh_sigma=rows.sigma(identified, covariance),
+        observability=_observability(identified, solution, rank),
+        deviations=solution.problem.deviations.of(rows.groups),
+        elasticity_sigma=elasticity_sigma,
+        gain=gain,
+        all_held_out=every,
+        notes=data.notes
+        + ((COMPUTED,) if computed else ())
+        + rows.notes(identified)
+        + solution.notes
+        + ((REPEATED,) if solution.places() is not None else ())
+        + doubts(prediction, seen, solution.units[named], covariance, names, tested)
+        + tuple(each.sentence() for each in findings or ())
+        + remarks
+        + ((TRY_ELASTIC,) if remarks and of_arm and not state.elastic else ())
+        + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
+    )
+    return replace(result, notes=result.notes + misgivings(result))
+
+
+def _modelled(
+    robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
+) -> tuple[ArmSolution, HeldOutRows | None, Gain | None]:
+    """Returns the solution by the model asked for, or by the better one, with its held-out errors, and the gain."""
+    rigid = _adjusted(first, seen, options, rows)
+    if options.model == "rigid":
+        return rigid, _cross_validated(rigid, options), None
+    _undetermined(rigid, parameter_names(first, seen.kind), options.partial)
+    conditions, deviations = seen.data.conditions, rigid.problem.deviations
+    state = bending(rigid.state, robot, deviations.axis_rad, conditions)
+    elasticity, units = state.chain.elasticity, parameter_units(jacobian(state, seen))
+    carried = conditions.loaded  # if no row states a load, by the payload of the chain
+    if conditions.payload_kg is None:
+        carried = elasticity is not None and elasticity.payload_kg > 0
+    rows = NominalRows.about(state, units, robot, options.adjust, carried)
+    elastic = _without_errors(replace(rigid.problem, rows=rows), state, mostly(rigid.weights >= GROSS))
+    held_out = [_cross_validated(each, options) for each in (rigid, elastic)]
+    if held_out[0] is None or held_out[1] is None:
+        return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
+    gain = Gain.between(held_out[0], held_out[1])
+    if options.model == "elastic" or gain.beyond_chance:
+        return elastic, held_out[1], gain
+    return rigid, held_out[0], gain
+
+
+def _turns_as_computed(first: State, data: Measurements) -> bool:
+    """True if the tool turns from row to row exactly as the robot file says, although its positions are elsewhere."""
+    if data.rotations is None or data.positions is None:
+        return False
+    same = np.flatnonzero(np.array(data.targets[1:]) == np.array(data.targets[:-1]))
+    measured, modelled = (
+        Rotation.from_matrix(np.swapaxes(turn[same], 1, 2) @ turn[same + 1]).magnitude()
+        for turn in (data.rotations, tips_of(first, data).rotation)
+    )
+    turned = rms(measured - modelled) if len(same) else np.inf
+    away = rms(position_errors(residuals(first, observed(data, "position"))))
+    return turned < ROUNDED_RAD and away > max(BEYOND_MM, BEYOND * turned * float(np.ptp(data.positions, axis=0).max()))
+
+
+def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
+    moves = np.ptp(data.q @ robot.coupling.T, axis=0)
+    still = np.flatnonzero(moves < np.where(robot.prismatic, STILL_MM, STILL_RAD)) + 1
+    if len(still) and not partial:
+        raise DegenerateError(
+            "E-IDENTIFY-UNMOVED",
+            f"{data.where}: joint {still[0]} never moved, so that its axis is not determined; measure with other "
+            f"values of q{still[0]}, or keep its nominal values with --partial",
+        )
+
+
+def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
+    """Returns the weighting at the start. If all σ are given, they are weights that σ₀ multiplies; one of two σ is
+    exact. σ that are not given start at the misfit, so that no observation is an outlier at first."""
+    sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
+    needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
+    missing = tuple(name for name in needed if sigma[name] is None)
+    with_covariances = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    estimated = ("factor",) if with_covariances or not missing else missing
+    weighting = Weighting(
+        options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, with_covariances, estimated=estimated
+    )
+    misfit = weighting.medians(weighting.whiten(residuals(state, seen), seen))
+    return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
+
+
+def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> ArmSolution:
+    """Solves with the observations that agree, and estimates σ: at first by medians, which outliers do not move."""
+    problem = ArmProblem(seen, _weighting(state, seen, options), options.robust, rows)
+    good = np.ones(len(seen), bool)
+    if options.robust:
+        good = mostly(agreeing(problem, state))
+    some = problem.of(good).measured
+    weighting = _weighting(state, some, options)
+    for _ in range(VARIANCE_ROUNDS):
+        state = replace(problem, measured=some, weighting=weighting).solve(state).state
+        before, weighting = weighting, _weighting(state, some, options)
+        if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
+            break
+    return _without_errors(replace(problem, weighting=weighting), state, good)
+
+
+def _without_errors(problem: ArmProblem, state: State, good: np.ndarray, rounds: int = VARIANCE_ROUNDS) -> ArmSolution:
+    """Solves, removes gross errors, and solves again until their set (``good`` is the first) stays the same. Huber
+    weights bound an outlier's pull, but no covariance shows it."""
+    for _ in range(OUTLIER_ROUNDS + 1):
+        solution = _settled(problem.of(good), state, rounds)
+        if not good.all():
+            solution = solution.among(problem.measured)
+        now_good = solution.weights >= GROSS
+        if (now_good == good).all() or now_good.mean() < MOSTLY_GOOD:
+            return solution
+        good, state, problem = now_good, solution.state, solution.problem
+    note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
+    return replace(solution, notes=(*solution.notes, note))
+
+
+def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
+    """Solves and estimates σ in turns."""
+    relaxation = Relaxation()
+    for _ in range(rounds):
+        solution = problem.solve(state)
+        solution = replace(solution, spread=(spread := solution.estimated()))
+        best = spread.best()
+        change = float(np.abs(best).max())
+        if change < VARIANCE_SETTLED:
+            return solution
+        state, problem = solution.state, problem.scaled(relaxation.step(best))
+    note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
+    return replace(solution, problem=problem, notes=(note,) if change > VARIANCE_UNSETTLED else ())
+
+
+def _undetermined(solution: ArmSolution, names: list[str], partial: bool) -> tuple[str, ...]:
+    """Returns names of the directions that the data leave open, beyond those that distances never show."""
+    measured, (_, directions, determined) = solution.problem.measured, solution.spectrum()
+    expected = UNSEEN[measured.kind]
+    if (~determined).sum() <= expected:
+        return ()
+    open_directions = directions_named(directions[:, ~determined][:, expected:], names)
+    if partial:
+        return open_directions
+    first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
+    moved = moved_meanwhile(solution.state, measured, MOST_OF_IT)
+    said = (
+        f"the data determine {solution.rank()} of {solution.seeks()} parameters, open are {first}; measure more varied "
+        "poses (`stcal robot design`), or keep the nominal values of these with --partial"
+    )
+    if moved is not None and moved.advice:
+        said = f"{first} stay open with residuals that no robot leaves; {moved.sentence()}"
+    raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{measured.data.where}: {said}")
+
+
+def _ranks(state: State, data: Measurements) -> dict[str, int]:
+    """Returns how many parameters each kind of measurement at these joint values would determine."""
+    tip, none = tips_of(state, data), dict.fromkeys(("covariance", "common", "distances", "from_row"))
+    exact = replace(data, positions=tip.translation, rotations=tip.rotation, **none)
+    seen = {kind: observed(exact, kind) for kind in get_args(Kind)}
+    return {kind: ArmProblem(own, TYPICAL, robust=False).at(state).rank() - _place(own) for kind, own in seen.items()}
+
+
+def _observability(robot: Robot, solution: ArmSolution, rank: int) -> ObservabilityIndices:
+    state, weighting, measured = solution.state, solution.problem.weighting, solution.problem.measured
+    scale = parameter_scale(robot, measured.kind, state.tools)
+    rows = weighting.whiten(jacobian(state, measured)[:, :, : len(scale)], measured) * scale
+    if measured.frameless:  # remove what a motion of all points of a station can produce
+        blocks, points = [], measured.data.points()
+        for rows_of_station in measured.data.by_station().values():
+            lever = (points - points[rows_of_station].mean(0)) * rows_of_station[:, None]
+            shift = np.eye(3) * rows_of_station[:, None, None]
+            blocks.append(np.concatenate([-skew(lever) / np.linalg.norm(lever), shift], axis=2))
+        motions = np.concatenate(blocks, axis=2)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, measured).reshape(-1, motions.shape[2]), full_matrices=False)
+        u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
+        rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
+    return ObservabilityIndices.of_jacobian(rows, rank)
+
+
+def _place(measured: Observed) -> int:
+    """Returns in how many directions positions that count by distances move together: 6 a station, 5 if on a line."""
+    if not measured.frameless:
+        return 0
+    directions = 0
+    for rows in measured.data.by_station().values():
+        at = measured.data.points()[rows] - measured.data.points()[rows].mean(0)
+        directions += 3 + int(np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM))
+    return directions
+
+
+def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRows | None:
+    """Returns errors of rows that took no part in the parameters, if few not in σ either; None if too few."""
+    problem, measured = whole.problem, whole.problem.measured
+    rows = len(measured)
+    if min(options.folds, rows) < LEAST_FOLDS:
+        return None
+    repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
+    rng, good = np.random.default_rng(options.seed), mostly(whole.weights >= GROSS)
+    position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
+    for repeat in range(repeats):
+        for test_rows in dealt(rows, options.folds, rng):
+            train_rows = np.setdiff1d(np.arange(rows), test_rows)
+            train, test = replace(problem, measured=measured[train_rows]), measured[test_rows]
+            state = _of_targets(whole.state, train.measured)
+            if WIDTH[measured.kind] * len(train_rows) <= replace(whole, state=state).seeks():
+                return None
+            few = rows <= FEW_ROWS
+            found = _without_errors(train, state, good[train_rows], FOLD_ROUNDS) if few else train.solve(state)
+            state = found.state
+            if measured.kind != "distance":
+                named = zip(test.data.targets, test.data.stations, strict=True)
+                known = np.array([target in state.tools and station in state.stations for target, station in named])
+                test, test_rows = test[known], test_rows[known]
+            errors = residuals(state, test)
+            position[repeat, test_rows] = position_errors(errors)
+            if measured.kind == "pose":
+                rotation[repeat, test_rows] = np.linalg.norm(errors[:, :3], axis=1)
+    return HeldOutRows(min(options.folds, rows), position, rotation)
+
+
+def _of_targets(state: State, measured: Observed) -> State:
+    """Returns the state with the tools and stations that ``measured`` shows, and the first station."""
+    tools = {name: tool for name, tool in state.tools.items() if name in measured.data.targets}
+    first = next(iter(state.stations))
+    stations = {name: each for name, each in state.stations.items() if name in {first, *measured.data.stations}}
+    return replace(state, tools=tools, stations=stations)
