@@ -210,7 +210,7 @@ def handeye_charuco(scratch: Path) -> None:
 def rows(data: Path, stream: Path, film: Path, scratch: Path) -> Iterator[tuple[str, Callable]]:
     """What is timed: titles and functions, which may return a remark."""
     paths = sorted((data / "images").glob("*/*"))
-    fine = replace(reference_board(), rows=30, columns=30, pitch_mm=13.0, radius_mm=4.0, corner=None)
+    fine = replace(reference_board(), rows=100, columns=100, pitch_mm=4.0, radius_mm=1.2, corner=None)
     (scratch / "fine.toml").write_text(board_toml(replace(fine, corner_radius_mm=None)), encoding="utf-8")
     yield "decoding alone", lambda: decode_all(paths)
     yield "stcal-sfm run", lambda: call(run_words(data, scratch / "run"))
@@ -219,7 +219,7 @@ def rows(data: Path, stream: Path, film: Path, scratch: Path) -> Iterator[tuple[
     yield "OpenCV, its own 17 thresholds", lambda: detected_by_opencv(data)
     yield "advise", lambda: call(["advise", scratch / "run"])
     plan = ["plan", "--board", scratch / "fine.toml"]
-    yield "plan, board of 30 × 30 dots", lambda: f"{call(plan):.0f} MiB"
+    yield "plan, board of 100 × 100 dots", lambda: f"{call(plan):.0f} MiB"
     yield "stcal-sfm --help", lambda: call(["--help"])
     call(run_words(stream, scratch / "stream"))
     yield "measure, 2 Mpx, one core", lambda: measured_stream(stream, scratch / "stream" / "faces.json")

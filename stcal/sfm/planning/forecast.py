@@ -17,11 +17,11 @@ from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.json import read_result
-from stcal.labels import CircleLabel, Label
+from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.file import FacePoses
-from stcal.sfm.adjust.joint import Extensible, unmoved
+from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
@@ -234,10 +234,22 @@ class Setup:
     common: float  # see :func:`stcal.sfm.adjust.joint.covariance_of`
     sigma0: float = 1.0  # factor on all σ
     rims_mm2: np.ndarray | None = None  # (3c, 3c) by the heights of rims, which no view changes, None if not estimated
+    stands_for: float = 1.0  # dots of the board for which each dot of the models stands
 
     def circle_covariance(self, adjusted_mm2: np.ndarray) -> np.ndarray:
         """Returns the covariance of the circles, (3c, 3c) mm², from that of an adjustment whose σ₀ is 1."""
         return self.sigma0**2 * adjusted_mm2 + (0.0 if self.rims_mm2 is None else self.rims_mm2)
+
+    def centres(self, model: MetricModel) -> np.ndarray:
+        """Returns the number of real centres (n,) for which each observation stands."""
+        is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])
+        return np.where(is_dot[model.point_index], self.stands_for, 1.0)
+
+    def adjusted(self, models: Sequence[MetricModel]) -> Adjusted:
+        """Returns the adjustment of models; a dot that stands for several has the σ of their mean."""
+        seen = [replace(m, covariance_px2=m.covariance_px2 / self.centres(m)[:, None, None]) for m in models]
+        board = self.board if self.stands_for == 1 else self.better_board(self.stands_for**-0.5).board
+        return unmoved(seen, board, self.camera, self.flatness_mm, self.prior, self.common)
 
     def radius_mm(self) -> dict[Label, float]:
         return self.target.radius_of() | self.board.radius_of()
@@ -278,7 +290,7 @@ def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
 def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
     """Returns the σ of metric models, mm, target frame, as the joint adjustment would state them. ``known``:
     derivatives of an earlier forecast of the same circles."""
-    joint = unmoved(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common).result(1.0)
+    joint = setup.adjusted(models).result(1.0)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
     reference = setup.start.reference_face
@@ -304,7 +316,7 @@ class PositionsWith:
     @classmethod
     def of(cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> "PositionsWith":
         """Prepares views in addition to these models. ``known`` is as in :func:`forecast`."""
-        now = unmoved(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common).extensible()
+        now = setup.adjusted(models).extensible()
         faces = known.face_covariance(setup.circle_covariance(now.covariance_mm2))
         variance = {f: position_sigma_mm(c) ** 2 for f, c in faces.items() if f != setup.start.reference_face}
         jacobian = np.concatenate([known.faces[face][3:] for face in variance])

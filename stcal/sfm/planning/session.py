@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
-from stcal.labels import CircleLabel, Label, circle_labels
-from stcal.parallel import one_thread, run_in_order
+from stcal.labels import BOARD, CircleLabel, DotLabel, Label, circle_labels
+from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
@@ -40,15 +39,12 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
 from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene
 
-R = TypeVar("R")
 GROUP = "."
 DISTANCE_SIGMA_MM = 0.02  # σ of a distance that is measured with a caliper, as a remedy
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)  # tried from the largest down, as tilts often forbid wide ones
 NEARER = 0.8  # distance of the remedy of nearer cameras, relative to the plan's
 MIN_IMAGES = 2
-MANY_DOTS = 2000  # from which on remedies are forecast in processes of their own, whose start takes time
-MAX_DOTS = 10_000  # largest number of dots of a board
-FINE_DOTS, MAX_CENTRES = 500, 450_000  # of boards of more than FINE_DOTS dots: about a minute and 0.8 GB
+MOST_DOTS = 200  # of a board in a forecast; of one with more, each dot that is kept stands for several
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -185,7 +181,7 @@ def plan(
     ------
     InputError
         If a face has no nominal pose, a group names an unknown face, a board or groups are given for a body with boards
-        or tags, or there are more dots than ``MAX_DOTS`` or ``MAX_CENTRES``.
+        or tags.
     DegenerateError
         If a group cannot be photographed as planned.
     """
@@ -197,38 +193,25 @@ def plan(
     poses = dict(nominal) if isinstance(nominal, Mapping) else nominal_poses(target, nominal)
     if printed:
         faces = (replace(face, rough_target_from_face=poses[face.id]) for face in target.faces)
-        make, workers = partial(planned_photographs, target=replace(target, faces=tuple(faces))), 1
+        make = partial(planned_photographs, target=replace(target, faces=tuple(faces)))
     else:
         board = reference_board() if board is None else board
         make = partial(_beside_board, target=target, board=board, nominal=poses)
-        workers = _workers(options, target, board, poses)
-    jobs = [
-        (_as_asked, make, options),
-        (_remedy, make, replace(options, images=2 * options.images), "twice the images"),
-        (_remedy, make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %"),
-        *([] if printed else [(_wider, make, options)]),
-    ]
-    now, more, near, *wider = run_in_order(_called, jobs, workers)
+    more = _remedy(make, replace(options, images=2 * options.images), "twice the images")
+    wider = [] if printed else [_wider(make, options)]
+    near = _remedy(make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %")
+    now = _as_asked(make, options)
     return replace(now, remedies=(more, *wider, *now.remedies, near))
 
 
-def _workers(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> int | None:
-    """Refuses plans of too many dots; returns the number of processes, None for one per core."""
-    dots = board.rows * board.columns
-    images = options.images * len(_scene(options, target, board, nominal).groups) if FINE_DOTS < dots <= MAX_DOTS else 1
-    for count, most, what in (
-        (dots, MAX_DOTS, f"a board of {board.rows}×{board.columns} has {dots} dots"),
-        (dots * images, MAX_CENTRES, f"{dots} dots in {images} images are {dots * images} centres"),
-    ):
-        if count > most:
-            remedy = "plan fewer images, or fewer dots over the same area: the σ of the faces hardly change"
-            raise InputError("E-PLAN-TOO-LARGE", f"plan: {what}, up to {most} possible; {remedy}")
-    return None if dots > MANY_DOTS else 1
-
-
-def _called(function: Callable[..., R], *arguments) -> R:
-    with one_thread():
-        return function(*arguments)
+def _kept_dots(board: BoardDesign) -> set[DotLabel]:
+    """Returns the dots of a board, or about ``MOST_DOTS`` of them in rows and columns from edge to edge."""
+    times = max(1.0, float(np.sqrt(board.rows * board.columns / MOST_DOTS)))
+    rows, columns = (
+        np.linspace(0, count - 1, max(2, round(count / times))).round().astype(int).tolist()
+        for count in (board.rows, board.columns)
+    )
+    return {DotLabel(row, column) for row in rows for column in columns}
 
 
 def _as_asked(make: Photographs, options: PlanOptions) -> Plan:
@@ -241,7 +224,7 @@ def _as_asked(make: Photographs, options: PlanOptions) -> Plan:
         options,
         setup,
         tuple(model.group for model in models),
-        sum(len(model.image_index) for model in models),
+        round(sum(setup.centres(model).sum() for model in models)),
         rms(np.concatenate([model.sigma_px() for model in models])),
         widest_aperture_mm(models, setup.camera),
         now,
@@ -315,6 +298,7 @@ def _beside_board(
     """Returns the photographs of a plan with a board: scene, models with their σ, input of a forecast."""
     scene = _scene(options, target, board, nominal)
     run = options.run.adjustment(scene.target)
+    kept = _kept_dots(board)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
     start = CalibratedTarget(
         run.reference_face,
@@ -331,10 +315,12 @@ def _beside_board(
         flatness_mm=run.flatness_mm,
         prior=camera_prior(refinable(scene.camera)) if run.refine_camera else None,
         common=ONE_PLATE if options.one_board else 0.0,
+        stands_for=board.rows * board.columns / len(kept),
     )
-    exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    every = observe(scene, 0.0, np.random.default_rng(0))
+    seen = [image.select([k for k, x in enumerate(image.labels) if x in kept or x.plane != BOARD]) for image in every]
     radius = scene.target.radius_of() | scene.board.radius_of()
-    return scene, [options.noise.applied(model, scene.camera, radius) for model in exact], setup
+    return scene, [options.noise.applied(m, scene.camera, radius) for m in true_models(scene, seen)], setup
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:

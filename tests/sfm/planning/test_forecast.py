@@ -463,12 +463,16 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
 
 
-@pytest.mark.parametrize(
-    ("rows", "images", "said"),
-    [(101, 10, "E-PLAN-TOO-LARGE … 10201 … 10000"), (100, 100, "E-PLAN-TOO-LARGE … 4000000")],
-)
-def test_a_board_of_too_many_dots_is_refused_at_once(rows, images, said):
-    board = replace(reference_board(), rows=rows, columns=rows if rows > 100 else 100, pitch_mm=4.0, radius_mm=1.2)
-    board = replace(board, corner=None, corner_radius_mm=None)
-    with fails_with(said):
-        make_plan(PlanOptions(images=images), reference_target(), board, reference_target().rough_poses())
+@pytest.mark.parametrize("one_board", [True, False])
+def test_a_fine_board_is_forecast_by_some_of_its_dots(one_board, monkeypatch):
+    """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
+    board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
+    board = replace(board, corner_radius_mm=None)
+    options, target = PlanOptions(images=4, one_board=one_board), reference_target()
+    some = make_plan(options, target, board, target.rough_poses())
+    monkeypatch.setattr(session, "MOST_DOTS", 1000)
+    every = make_plan(options, target, board, target.rough_poses())
+    found, expected = (each.forecast.position_sigma_mm() for each in (some, every))
+    np.testing.assert_allclose([found[face] for face in expected], list(expected.values()), rtol=0.05)
+    assert some.observations == pytest.approx(every.observations, rel=0.05)
+    assert some.setup.stands_for > every.setup.stands_for == 1
