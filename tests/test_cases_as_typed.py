@@ -94,7 +94,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         Typed(INPUT, "", ("before line 10, and those from it on, fit by themselves", "tool (TCP)")),
     ),
     "isoluminant_circles": (Typed(says=("Part: 2 of 5 faces", "17 checks passed")),),
-    "keem_cube_folds": (Typed(says=("held near none", "Part, with care: 2 of 5 faces")),),
+    "keem_cube_folds": (Typed(says=("Part, with care: 2 of 5 faces", "held near none")),),
     "kitti": (Typed(INPUT, "E-CAMERA-CONTENT", ("COLMAP, OpenCV, ROS", "camera_matrix")),),
     "kuka_semicolon_comma": (Typed(says=("With care", "pose 2 contradicts the others")),),
     "loc_apriltag_ros_yaml": (Typed(COMPUTATION, says=(*HALF_A_TURN, "upright: true"), never=("accept ",)),),

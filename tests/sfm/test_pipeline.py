@@ -64,7 +64,7 @@ def test_every_promised_file_is_there_and_agrees(small_result):
     np.testing.assert_allclose(faces["circles"]["1:1"], 0, atol=0.01)
     with open(out / "labels.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == sum(len(o) for o in result.observations())
+    assert len(rows) == sum(len(o) for o in result.observations)
     report = json.loads((out / "report.json").read_text())
     assert report["summary"]["images_mapped"] == 8
     assert len(report["groups"][0]["pairs"]) == 6
@@ -77,7 +77,7 @@ def test_every_promised_file_is_there_and_agrees(small_result):
 def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_path):
     """Mapped again from the file alone, without any correction: the board keeps its shape and the faces their place."""
     result = small_result
-    observations = result.observations()
+    observations = result.observations
     ids = image_ids(observations)
     group = [o for o in observations if o.group == "12"]
     pairs = rank_pairs(group, result.camera, PairOptions())

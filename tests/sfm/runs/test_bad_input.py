@@ -452,7 +452,7 @@ def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     kinds = Counter(name.rpartition("-")[0] for name in before)
     assert kinds.pop("overlay") >= 8  # it crosses out what the result does not use, which another group may decide
     assert kinds == {"": 8, "group": 2}  # a group alone is what it was beside another one
-    assert out.replace(str(small.out), "RUN").splitlines()[-1] == "report: RUN/report.html"
+    assert "report: RUN/report.html" in out.replace(str(small.out), "RUN").splitlines()
     own = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("14/")}
     assert detections(small.out) == own
 
