@@ -23,7 +23,7 @@ from stcal.report.svg import COLOURS, FAINT, INK, LETTER, Axes, Drawing, arrows,
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,10 +23,10 @@ from .errors import StcalError as StcalError
 from .geometry.camera import Camera as Camera
 from .geometry.rigid import Poses as Poses
 from .geometry.rigid import Rigid as Rigid
+from .io.cameras.camera_model import CameraPrior as CameraPrior
+from .io.cameras.camera_model import camera_prior as camera_prior
 from .io.cameras.difference import compare_cameras as compare_cameras
 from .io.cameras.difference import load_lens as load_lens
-from .io.cameras.model import CameraPrior as CameraPrior
-from .io.cameras.model import camera_prior as camera_prior
 from .io.cameras.read import load_camera as load_camera
 from .io.cameras.read import save_camera as save_camera
 from .io.device import OpenCVSource as OpenCVSource

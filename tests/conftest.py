@@ -30,7 +30,7 @@ from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.data.model import ImageObservations, WorldModel
+from stcal.sfm.data.group_model import ImageObservations, WorldModel
 from stcal.sfm.pipeline import RunOptions, RunResult, run
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.dataset import write_dataset

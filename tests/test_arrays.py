@@ -15,8 +15,8 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.io.images import decode, grey_of
-from stcal.robot.kinematics.model import mh80
-from stcal.sfm.detect.files import files_of_arrays
+from stcal.robot.kinematics.robot_model import mh80
+from stcal.sfm.detect.detect_files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
 from tests.outcome import fails_with, refuses
 

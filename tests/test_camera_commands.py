@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 from stcal.cli.cameras import app
 from stcal.geometry.camera import Camera
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.difference import compare_cameras
-from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.report.camera import shown
+from stcal.report.camera_figures import shown
 from tests.outcome import fails_with, refuses
 
 CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])

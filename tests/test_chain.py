@@ -15,12 +15,12 @@ from scipy.special import chdtrc
 from stcal.cli.main import main, main_sfm
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -15,7 +15,7 @@ from PIL import Image
 import stcal
 from stcal import robot
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from tests.levels import FULL, SLOW
 from tests.locate.test_arrays import CAMERA, LAYOUT, TRUTH
 from tests.support.areas import homography, rendered

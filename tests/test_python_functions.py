@@ -22,7 +22,7 @@ import stcal
 from stcal import handeye, locate, register, robot, synthetic
 from stcal.cli.main import app
 from stcal.io.files import json_text
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from tests.commands import COMMANDS
 from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
 from tests.outcome import fails_with, refuses

@@ -32,7 +32,7 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import InverseProblem
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot, mh80
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import made
 from stcal.workflows.register_robot import grown, positions
 

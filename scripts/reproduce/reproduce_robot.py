@@ -20,7 +20,7 @@ from scripts.runner import options_of
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
-from stcal.robot.axes.model import robot_from_sweeps
+from stcal.robot.axes.axes_model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals
 from stcal.robot.identification.identify import identify
@@ -28,7 +28,7 @@ from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scripts.runner import options_of
-from stcal.boards.design import CharucoDesign
+from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.errors import StcalError
@@ -24,7 +24,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.sfm import RunOptions, pipeline
 from stcal.sfm.report.compare import FaceErrors, compare
-from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import second_design, tag_cube, tag_dodecahedron
 
 

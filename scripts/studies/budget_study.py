@@ -25,7 +25,7 @@ from scipy.stats import norm
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import SigmaFactors, calibrate, with_sigma
@@ -35,9 +35,9 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
 from stcal.sfm.budget.combine import Budget, budget
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 

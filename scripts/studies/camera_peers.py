@@ -36,14 +36,14 @@ from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
+from stcal.io.cameras.camera_model import CameraModel, camera_from_colmap
 from stcal.io.cameras.difference import compare_cameras
-from stcal.io.cameras.model import CameraModel, camera_from_colmap
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import run
 from stcal.sfm.camera.calibrate import FOLDS, calibrate_camera, foretold
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera, start_pose
-from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])

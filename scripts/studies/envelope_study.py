@@ -32,10 +32,10 @@ from scripts.runner import options_of
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.labels import BOARD
 from stcal.sfm.pipeline import run
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.run_result import RunResult
 from tests.support import degrade
 from tests.support.photograph import Photograph, Plane, RenderedSet, read_set

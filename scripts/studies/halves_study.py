@@ -23,8 +23,8 @@ from same_results import prepare
 from scipy.spatial.transform import Rotation
 
 from scripts.runner import options_of
+from stcal.boards.board_designs import ChessboardDesign
 from stcal.boards.board_file import load_flat_board
-from stcal.boards.design import ChessboardDesign
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
@@ -37,12 +37,12 @@ from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import read_measurements
+from stcal.robot.kinematics.robot_file import load_robot
 from stcal.sfm import measure, pipeline
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.measurement.known_target import read_target
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 from stcal.workflows.handeye_inputs import read_handeye

@@ -25,7 +25,7 @@ from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
 from stcal.handeye.solving import handeye
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import CAMERA, Truth, simulated, simulated_views

@@ -24,7 +24,7 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot, mh80
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, two_arms

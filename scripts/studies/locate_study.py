@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import CharucoDesign, TagLayout
+from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.tags import Tags, find_tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
 from stcal.locate.estimate import locate, merge

@@ -15,8 +15,8 @@ from same_results import prepare
 from scripts.runner import options_of
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import read_measurements
+from stcal.robot.kinematics.robot_file import load_robot
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 

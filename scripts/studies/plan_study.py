@@ -20,7 +20,7 @@ from stcal.design import reference_board, reference_target
 from stcal.sfm.planning import forecast
 from stcal.sfm.planning.forecast import nominal_poses
 from stcal.sfm.planning.session import PlanOptions, pairs_of_faces, plan
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 
 BASE = PlanOptions()
 FOCAL_MM, SENSOR_MM, WAVELENGTH_MM = 24.0, 36.0, 550e-6

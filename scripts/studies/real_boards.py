@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.boards.board_designs import CharucoDesign, ChessboardDesign
 from stcal.boards.board_file import load_flat_board
-from stcal.boards.design import CharucoDesign, ChessboardDesign
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign

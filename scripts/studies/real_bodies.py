@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import CharucoDesign
+from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.sfm import pipeline

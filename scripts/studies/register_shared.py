@@ -32,10 +32,10 @@ from stcal.register.liu2017 import affine_least_squares
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Chain, DHRow, Joint, Robot
+from stcal.robot.kinematics.robot_file import robot_toml
+from stcal.robot.kinematics.robot_model import Chain, DHRow, Joint, Robot
 
 DEFAULT = Path(__file__).resolve().parents[3] / "shared" / "data" / "hilti_stationing"
 TIP, BASE = "prism", "base_link"

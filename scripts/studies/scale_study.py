@@ -19,11 +19,11 @@ import numpy as np
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.groups import solve_groups
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import simulate_centres
 

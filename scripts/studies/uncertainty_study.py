@@ -15,12 +15,12 @@ from scripts.runner import options_of
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 

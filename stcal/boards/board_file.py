@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, create_model, model_validator
 
-from stcal.boards.design import (
+from stcal.boards.board_designs import (
     UNIT_SQUARE,
     AprilGridDesign,
     AsymmetricCirclesDesign,

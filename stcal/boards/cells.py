@@ -8,7 +8,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign, TagLayout
+from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 
 SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign

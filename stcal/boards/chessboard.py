@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.boards.design import BoardView, CharucoDesign, ChessboardDesign, view_of
+from stcal.boards.board_designs import BoardView, CharucoDesign, ChessboardDesign, view_of
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.edges import Crossings, crossings
 from stcal.boards.tags import detector_settings

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, ConfigDict, Field
 
-from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
+from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
 from stcal.io.poses.rotations import of_quaternions

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from stcal.boards.board_designs import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
-from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
 from stcal.boards.tags import APART_PX, Unseen, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
 from stcal.boards.target_file import tags_on

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.board_designs import BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.boards.board_file import SET, board_content, design_of, flat_board, load_flat_board
-from stcal.boards.design import BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.boards.target_file import tags_on
 from stcal.design import BoardDesign
 from stcal.errors import InputError, named

@@ -7,7 +7,7 @@ from itertools import compress
 import cv2
 import numpy as np
 
-from stcal.boards.design import AprilGridDesign, BoardView, TagLayout, view_of
+from stcal.boards.board_designs import AprilGridDesign, BoardView, TagLayout, view_of
 from stcal.boards.dictionaries import FAMILIES, cells_of, dictionary_of, find_family
 from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import freeze, frozen

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from stcal.boards.board_designs import TAG_SIGMA_MM, AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
 from stcal.boards.board_file import INIT, TYPES, RimHeight, flat_board, keys_of, number, tag_rows
-from stcal.boards.design import TAG_SIGMA_MM, AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
 from stcal.design import POINT_RADIUS_MM, FaceDesign, KnownDistance, Polarity, TargetDesign, reference_target
 from stcal.errors import InputError, named
 from stcal.geometry.plane import inside

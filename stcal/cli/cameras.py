@@ -59,7 +59,7 @@ def show(
     plot: PlotFile = None,
 ) -> None:
     """Print a camera's parameters with σ, its field of view, and how far the lens moves points."""
-    from stcal.report.camera import field_figure, moved_px, shown
+    from stcal.report.camera_figures import field_figure, moved_px, shown
     from stcal.report.svg import save
 
     camera = _lens(source, name, size).camera
@@ -79,7 +79,7 @@ def compare(
 ) -> None:
     """Compare two cameras: by how many pixels their images of a ray differ, after the rotation that fits best."""
     from stcal.io.cameras.difference import compare_cameras
-    from stcal.report.camera import comparison_text, field_figure
+    from stcal.report.camera_figures import comparison_text, field_figure
     from stcal.report.svg import save
 
     first_lens, second_lens = _lens(first, name, size, False), _lens(second, name, size, False)
@@ -97,7 +97,7 @@ def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
     """
     from stcal.io.cameras.difference import SizedLens, load_lens
     from stcal.io.cameras.photograph import SIGMA_FOCAL
-    from stcal.report.camera import fitted_text
+    from stcal.report.camera_figures import fitted_text
 
     sides = size.lower().split("x") if size else ["0", "0"]
     if len(sides) != 2 or not all(side.isdigit() for side in sides):

@@ -95,7 +95,7 @@ def register(
         sections.append(sample_size_section(pairs.xyz_a, pairs.xyz_b, limits, seed))
     if robot_file:
         from stcal.robot.identification.result import require_identified_written
-        from stcal.robot.kinematics.file import load_robot, robot_toml
+        from stcal.robot.kinematics.robot_file import load_robot, robot_toml
         from stcal.workflows.register_robot import comparison_section, register_with_robot
 
         try:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from stcal.robot.kinematics.measurements import Measurements
-    from stcal.robot.kinematics.model import Chain, Robot
+    from stcal.robot.kinematics.robot_model import Chain, Robot
 
 
 XML = (".urdf", ".xml")
@@ -42,7 +42,7 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
-    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.kinematics.robot_file import load_robot
     from stcal.robot.universal import read_universal
     from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
@@ -95,7 +95,7 @@ def convert(
 
 def _write_robot(path: Path | None, robot: "Robot", *comments: str, chain: "Chain | None" = None) -> None:
     """Writes a robot file, and reads it again, if a path is given."""
-    from stcal.robot.kinematics.file import require_robot_written, robot_toml
+    from stcal.robot.kinematics.robot_file import require_robot_written, robot_toml
 
     if path is not None:
         write(path, robot_toml(robot, comments))
@@ -125,7 +125,7 @@ def init(
     file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
-    from stcal.robot.kinematics.model import mh80
+    from stcal.robot.kinematics.robot_model import mh80
 
     comments = (
         "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
@@ -156,7 +156,7 @@ def axes(
 ) -> None:
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot import load_robot, read_measurements, robot_from_sweeps
-    from stcal.robot.axes.model import AxesFile
+    from stcal.robot.axes.axes_model import AxesFile
     from stcal.robot.axes.sweeps import ring
     from stcal.robot.robot_report import axes_report
 
@@ -388,9 +388,9 @@ def design(
     report: shared.ReportFile = None,
 ) -> None:
     """Choose the measurement poses that determine the robot's parameters best."""
-    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.kinematics.robot_file import load_robot
     from stcal.robot.robot_report import design_report
-    from stcal.robot.use import design as pose_design
+    from stcal.robot.use import pose_design as pose_design
 
     options = pose_design.DesignOptions(
         count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target

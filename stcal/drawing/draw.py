@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.board_designs import BoardSet, FlatBoard
 from stcal.boards.board_file import board_content
-from stcal.boards.design import BoardSet, FlatBoard
 from stcal.boards.several import load_boards
 from stcal.boards.target_file import load_target
 from stcal.design import BoardDesign, TargetDesign

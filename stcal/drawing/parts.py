@@ -6,8 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from stcal.boards.cells import SquaresOrTags, black_areas, clear_mm
-from stcal.boards.design import (
+from stcal.boards.board_designs import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     BoardSet,
@@ -15,6 +14,7 @@ from stcal.boards.design import (
     FlatBoard,
     TagLayout,
 )
+from stcal.boards.cells import SquaresOrTags, black_areas, clear_mm
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.geometry.rigid import Rigid
 

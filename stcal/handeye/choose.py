@@ -21,7 +21,7 @@ from stcal.handeye.validate import (
     with_common_errors,
     with_jackknife,
 )
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread, run_parallel
 
 AS_GOOD = 1.0

@@ -16,7 +16,7 @@ from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.solving import HandEyeOptions, HandEyeProblem
 from stcal.handeye.validate import LEAST_LEFT, refitted, splits
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
 
 

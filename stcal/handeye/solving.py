@@ -26,7 +26,7 @@ from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve,
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import CAMERA_GAIN, AdjustedCorners, adjust_views, in_common, of_poses, resected
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
 
 S = TypeVar("S", PoseSolution, AdjustedCorners)

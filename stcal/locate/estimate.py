@@ -35,7 +35,7 @@ from stcal.geometry.plane import (
     weights_of,
 )
 from stcal.geometry.rigid import ImageFit, Poses, Rigid, by_pose
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.layout import TargetLayout
 
 SETTLED = 1e-5

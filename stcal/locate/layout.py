@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.board_designs import UNIT_SQUARE, require_tags
+from stcal.boards.board_designs import TagLayout as TagLayout
 from stcal.boards.board_file import TagsFile, load_tags, require_sizes
-from stcal.boards.design import UNIT_SQUARE, require_tags
-from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields

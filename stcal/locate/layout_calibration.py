@@ -11,7 +11,7 @@ from scipy.optimize import root_scalar
 from stcal.adjust.blocks import Huber, Vector
 from stcal.adjust.components import sigma_factor
 from stcal.adjust.engine import Adjustment, Solution
-from stcal.boards.design import UNIT_SQUARE, BoardView
+from stcal.boards.board_designs import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError

@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.boards.design import TagLayout
+from stcal.boards.board_designs import TagLayout
 from stcal.boards.on_faces import shift_by_curves
 from stcal.boards.tags import seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
 from stcal.locate.estimate import Merged, ObjPose, locate, merge

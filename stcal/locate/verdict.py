@@ -13,7 +13,7 @@ from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import deciding_delta
 from stcal.geometry.rigid import Poses
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import ObjPose, SeenTags, covering_both, locate, reprojection_rms
 from stcal.locate.layout import TargetLayout
 

@@ -23,9 +23,9 @@ from stcal.register.consensus import (
     chance,
     robust_fit,
 )
-from stcal.register.groups import Shifted, moved_meanwhile, neighbours_alike, order_note
 from stcal.register.liu2017 import ASSUMED
 from stcal.register.registered import Registration
+from stcal.register.row_groups import Shifted, moved_meanwhile, neighbours_alike, order_note
 from stcal.register.transforms import AFFINE, MODELS, SHOWN, Model, Problem, Transform, parts, some_of
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}

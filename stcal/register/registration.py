@@ -33,9 +33,9 @@ from stcal.register.doubts import (
     notes_of,
     wider,
 )
-from stcal.register.groups import moved_meanwhile, order_note, shifted_rows, two_groups
 from stcal.register.liu2017 import Liu2017Options, liu2017
 from stcal.register.registered import Alternative, Registration, held_out
+from stcal.register.row_groups import moved_meanwhile, order_note, shifted_rows, two_groups
 from stcal.register.transforms import MODELS, RIGID, Problem, problem_of, rotation_of
 
 METHODS = ("robust", "least-squares", "liu2017")

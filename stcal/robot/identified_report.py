@@ -29,7 +29,7 @@ from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_value
 from stcal.robot.identification.result import ERRORS, OUTLIER_WEIGHT, Identified
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_motions, links, torques
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 MDEG = 1000 * 180 / np.pi

@@ -24,9 +24,9 @@ from stcal.report.document import (
 )
 from stcal.report.svg import AXIS_COLOURS, COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
+from stcal.robot.axes.axes_model import AxesResult
 from stcal.robot.axes.checks import Pair
 from stcal.robot.axes.fit import AxisFit
-from stcal.robot.axes.model import AxesResult
 from stcal.robot.axes.sweeps import called
 from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.observability import MEANING
@@ -34,10 +34,10 @@ from stcal.robot.identification.prior import SHOWN
 from stcal.robot.identification.result import Figures
 from stcal.robot.identified_report import left_lines, placed_table, residual_plot
 from stcal.robot.kinematics.inverse import Inverse
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
-from stcal.robot.use.design import PoseDesign
 from stcal.robot.use.evaluation import Evaluated, Evaluation
+from stcal.robot.use.pose_design import PoseDesign
 from stcal.robot.use.verification import Verification
 
 

@@ -18,9 +18,9 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.poses.programs import METRE_MM, from_roll_pitch_yaw
 from stcal.io.toml import Strict, load_yaml, validated
 from stcal.robot.kinematics.dh import robot_between
-from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import fixed_values, forward
-from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
+from stcal.robot.kinematics.robot_file import load_robot
+from stcal.robot.kinematics.robot_model import Convention, DHRow, Joint, Robot
 from stcal.robot.urdf import UrdfJoint, product, require_near, robot_of
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

@@ -18,7 +18,7 @@ from stcal.io.table import pose_values
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
-from stcal.robot.kinematics.model import Chain, Convention, DHRow, Joint, JointType, Robot, Tree
+from stcal.robot.kinematics.robot_model import Chain, Convention, DHRow, Joint, JointType, Robot, Tree
 
 WHAT = "URDF"
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"

@@ -28,7 +28,7 @@ from .report.check import Check as Check
 from .report.compare import compare as compare
 from .report.compare import compare_poses as compare_poses
 from .runs.folder import report_again as report_again
-from .runs.options import RunOptions as RunOptions
+from .runs.run_options import RunOptions as RunOptions
 from .runs.run_result import ImageResult as ImageResult
 from .runs.run_result import RunResult as RunResult
 from .runs.saved import load_run as load_run

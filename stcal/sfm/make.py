@@ -23,7 +23,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, images_px

@@ -16,7 +16,7 @@ from stcal.design import BoardDesign, TargetDesign, scale_reference, with_drawn_
 from stcal.errors import ConvergenceError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CameraModel, camera_prior, model_of
+from stcal.io.cameras.camera_model import CameraModel, camera_prior, model_of
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import TOP_GROUP, chosen_images
 from stcal.io.video import AUTO, write_frames
@@ -30,7 +30,7 @@ from stcal.sfm.checks.significance import MOST_SIGMAS
 from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
-from stcal.sfm.detect.files import PHOTOGRAPHS, files_of_arrays
+from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.placed import plain_lens
 from stcal.sfm.report.check import Check
 from stcal.sfm.runs.folder import overlays_beside, write_run
@@ -45,11 +45,11 @@ from stcal.sfm.runs.groups import (
     unseen_circles,
     wrong_file,
 )
-from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.paper import Answer, compare_with_paper, require_comparable
 from stcal.sfm.runs.report_file import unadjusted
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.run_result import RunResult
-from stcal.sfm.runs.start import (
+from stcal.sfm.runs.task import (
     DetectedImages,
     Task,
     camera_for_a_look,

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.boards.design import TAG_SIGMA_MM, TagLayout
+from stcal.boards.board_designs import TAG_SIGMA_MM, TagLayout
 from stcal.boards.dictionaries import dictionary_of, known_tags
 from stcal.boards.target_file import printed_face, tags_on
 from stcal.design import BoardDesign, FaceDesign, TargetDesign

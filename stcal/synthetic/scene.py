@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments, require_fields
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel, Label
 from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point_frame

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
-from stcal.boards.design import (
+from stcal.boards.board_designs import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     BoardSet,
@@ -21,6 +20,7 @@ from stcal.boards.design import (
     TagLayout,
     turns,
 )
+from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
 from stcal.boards.on_faces import shift_by_curves, straightened
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
@@ -30,7 +30,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit
@@ -48,11 +48,11 @@ from stcal.sfm.camera.calibrate import (
     unsized,
 )
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.defocus import correct_defocus
-from stcal.sfm.detect.files import load_image, sized_by
+from stcal.sfm.detect.detect_files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import labelled_image
 

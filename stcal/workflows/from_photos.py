@@ -15,7 +15,7 @@ from stcal.errors import StcalError
 from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import json_text, require_text_written, save
 from stcal.io.images import find_images
@@ -41,12 +41,12 @@ from stcal.robot import (
     robot_from_sweeps,
     robot_toml,
 )
-from stcal.robot.axes.model import AxesFile, AxesResult
+from stcal.robot.axes.axes_model import AxesFile, AxesResult
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
 from stcal.robot.identified_report import identified_report
-from stcal.robot.kinematics.file import require_robot_written
 from stcal.robot.kinematics.measurements import joint_values, targets_of
+from stcal.robot.kinematics.robot_file import require_robot_written
 from stcal.robot.robot_report import axes_report, compensation_report
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
 from stcal.sfm.measurement.known_target import TargetCircles

@@ -20,7 +20,7 @@ from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.conventions import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.solving import HandEyeProblem
-from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
+from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables

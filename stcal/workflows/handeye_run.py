@@ -23,7 +23,7 @@ from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.solving import HandEyeProblem
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED

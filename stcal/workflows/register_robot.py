@@ -26,7 +26,7 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.conditions import read_conditions
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 FIRST_NAMES = 6
 ROUNDS, CLEAN_SETS = 3, 0.01

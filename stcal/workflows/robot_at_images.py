@@ -19,7 +19,7 @@ from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
 from stcal.robot.kinematics.measurements import joint_values
-from stcal.robot.kinematics.model import Chain
+from stcal.robot.kinematics.robot_model import Chain
 
 TIME = "time_s"
 """Column of a stream of poses, in place of ``image``."""

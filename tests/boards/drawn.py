@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from stcal.boards.design import AprilGridDesign
+from stcal.boards.board_designs import AprilGridDesign
 
 IMAGE_FROM_MM = np.array([[2.6, -0.5, 330.0], [0.4, 2.3, 180.0], [-2e-4, 3e-4, 1.0]])
 """A view with perspective, pixels of the image from millimetres on the sheet."""

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.design import AprilGridDesign
+from stcal.boards.board_designs import AprilGridDesign
 from stcal.boards.tags import find_aprilgrid
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography

@@ -6,8 +6,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.area import solved
+from stcal.boards.board_designs import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.chessboard import find_charuco, find_chessboard
-from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.edges import crossings, integrated_step
 from stcal.boards.tags import corner_blocks, find_tags

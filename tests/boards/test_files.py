@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+)
 from stcal.boards.board_file import load_flat_board
-from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, BoardSet, CharucoDesign, ChessboardDesign
 from stcal.boards.several import load_boards
 from stcal.errors import InputError
 

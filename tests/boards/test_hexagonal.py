@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from stcal.boards.board_designs import HexagonalCirclesDesign
 from stcal.boards.board_file import board_toml, load_board, load_flat_board
-from stcal.boards.design import HexagonalCirclesDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.workflows.board_views import find_board

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stcal.boards.design import ChessboardDesign
-from stcal.io.cameras.model import camera_from_opencv
+from stcal.boards.board_designs import ChessboardDesign
+from stcal.io.cameras.camera_model import camera_from_opencv
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards
 

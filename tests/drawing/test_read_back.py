@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    CharucoDesign,
+    ChessboardDesign,
+    TagLayout,
+)
 from stcal.boards.chessboard import find_charuco, find_chessboard
-from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.tags import find_aprilgrid, find_tags
 from stcal.boards.target_file import target_toml
 from stcal.design import BoardDesign, TargetDesign, reference_target

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import photograph
 from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA

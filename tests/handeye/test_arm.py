@@ -11,9 +11,9 @@ from stcal.handeye import HandEyeOptions, cross_validate, splits
 from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.solving import handeye
 from stcal.robot import Joint, forward, inverse, load_robot
-from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import save_robot
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.workflows.robot_at_images import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs

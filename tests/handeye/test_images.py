@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import (
+from stcal.boards.board_designs import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     BoardSet,
@@ -17,7 +17,7 @@ from stcal.boards.design import (
 )
 from stcal.design import BoardDesign
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several

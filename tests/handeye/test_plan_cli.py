@@ -9,8 +9,8 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import Joint, forward, inverse, load_robot
-from stcal.robot.kinematics.file import save_robot
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import save_robot
+from stcal.robot.kinematics.robot_model import mh80
 from tests.handeye.test_cli import NOISE, poses_file
 from tests.outcome import INPUT, assert_error
 from tests.support.handeye import simulated

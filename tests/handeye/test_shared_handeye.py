@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, pairs_of_views
 from stcal.handeye.solving import handeye
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 

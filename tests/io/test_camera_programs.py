@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 
 from stcal.errors import InputError, InputNote
-from stcal.io.cameras.foreign import ForeignLens
+from stcal.io.cameras.camera_model import CameraModel
+from stcal.io.cameras.foreign_lenses import ForeignLens
 from stcal.io.cameras.forms import name_to_write
-from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_chosen, read_camera, read_lens
 from tests.io.camera_files import (
     CAMERA_INFO,

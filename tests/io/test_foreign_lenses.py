@@ -9,9 +9,9 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.difference import SizedLens, compare_cameras, fit_lens
-from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.foreign_lenses import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_camera, read_lens
 from tests.outcome import fails_with, refuses
 

@@ -8,8 +8,8 @@ from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
-from stcal.robot.kinematics.file import load_robot, robot_toml
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
 from stcal.robot.urdf import load_urdf
 from tests.outcome import fails_with, refuses
 

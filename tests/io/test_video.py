@@ -15,7 +15,7 @@ from stcal.io.images import find_images
 from stcal.io.video import AUTO, MOVED, chosen_frames, sharpness, write_frames
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
-from stcal.synthetic.body import (
+from stcal.synthetic.body_scene import (
     BodyOptions,
     body_camera,
     body_truth,

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.chessboard import find_charuco
-from stcal.boards.design import CharucoDesign, TagLayout
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import locate_image
 from tests.outcome import fails_with, refuses

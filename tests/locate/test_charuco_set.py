@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.design import CharucoDesign
+from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
 from stcal.locate.estimate import merge

@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml, load_layout
 from tests.boards.drawn import photograph

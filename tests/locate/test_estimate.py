@@ -8,7 +8,7 @@ import pytest
 from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import SeenTags, covering_both, locate, merge
 from stcal.locate.verdict import VerdictOptions, judge
 from tests.outcome import fails_with

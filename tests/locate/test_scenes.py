@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import LocateOptions, locate_scene, run

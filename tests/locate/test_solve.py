@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import BoardView, ChessboardDesign, view_of
+from stcal.boards.board_designs import BoardView, ChessboardDesign, view_of
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid

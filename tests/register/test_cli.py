@@ -8,10 +8,10 @@ import pytest
 from stcal import register, workflows
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import ended, fails_with
 from tests.support.arms import elastic

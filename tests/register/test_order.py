@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.groups import moved_meanwhile
+from stcal.register.row_groups import moved_meanwhile
 from stcal.register.transforms import MODELS, problem_of
 from tests.outcome import fails_with
 

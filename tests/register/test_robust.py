@@ -8,7 +8,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
 from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
-from stcal.register.groups import lies_together, sphericity, two_groups, wilks_bound
+from stcal.register.row_groups import lies_together, sphericity, two_groups, wilks_bound
 from stcal.register.transforms import MODELS, Problem, problem_of
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, scene

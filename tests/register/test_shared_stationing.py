@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.robot_file import load_robot
 from tests.scripts import load_script
 
 pytestmark = pytest.mark.slow  # a set that lies beside the repository

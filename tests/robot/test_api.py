@@ -11,7 +11,7 @@ import pytest
 from stcal import robot
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
 

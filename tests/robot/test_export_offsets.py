@@ -11,7 +11,7 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identified_report import HEAD, offsets_csv, zeros
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed
 
 COUPLING = np.eye(6)

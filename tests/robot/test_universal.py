@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.file import load_robot, save_robot
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.robot_file import load_robot, save_robot
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
 from stcal.robot.universal import LINKS, is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from tests.outcome import fails_with
 

@@ -12,15 +12,15 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.causes import cause_of_drawing
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import load_run
-from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import tag_cube
 from tests.levels import sampled
 from tests.outcome import fails_with

@@ -4,8 +4,8 @@ its dots."""
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import AsymmetricCirclesDesign, HexagonalCirclesDesign, LatticePart
 from stcal.boards.board_file import board_toml, load_board
-from stcal.boards.design import AsymmetricCirclesDesign, HexagonalCirclesDesign, LatticePart
 from stcal.labels import DotLabel
 from stcal.sfm import run
 from stcal.sfm.report.compare import compare

@@ -16,7 +16,7 @@ from stcal.drawing.draw import net_text
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
@@ -26,7 +26,7 @@ from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.budget.sources import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
@@ -35,9 +35,9 @@ from stcal.sfm.planning.plan_report import plan_text
 from stcal.sfm.planning.session import PlanOptions, plan, planned_photographs
 from stcal.sfm.report.compare import compare
 from stcal.sfm.report.judgement import TESTED_BY
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import FULL, sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with, refuses

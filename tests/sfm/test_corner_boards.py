@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign, CornerBoard
 from stcal.boards.board_file import board_toml, load_board, load_flat_board
-from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign, CornerBoard
 from stcal.boards.dictionaries import dictionary_of
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid

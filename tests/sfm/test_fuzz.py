@@ -140,7 +140,7 @@ INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
 )
 def test_a_writer_without_a_check_is_found(stock, case, monkeypatch, kind, instead):
     """Every file that a call writes is read again (`test_calls_go_through`), and its check sees another number."""
-    monkeypatch.setattr("stcal.robot.kinematics.file.require_robot_written", instead)
+    monkeypatch.setattr("stcal.robot.kinematics.robot_file.require_robot_written", instead)
     assert went_through(stock, case, INIT).failures == ((kind, "robot.toml"),)
 
 

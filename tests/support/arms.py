@@ -8,7 +8,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
 from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
+from stcal.robot.kinematics.robot_model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
 TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])

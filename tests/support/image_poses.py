@@ -13,7 +13,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import unmoved
 from stcal.sfm.adjust.uncertainty import derivatives
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.planning.forecast import observe, true_models

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.boards.design import CharucoDesign
+from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.on_faces import find_on_faces
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.synthetic.body import BLACK, WHITE, BodyOptions, body_camera, drawing_of, make_body_scene, render_body
+from stcal.synthetic.body_scene import BLACK, WHITE, BodyOptions, body_camera, drawing_of, make_body_scene, render_body
 from stcal.synthetic.designs import tag_cube
 
 TIE_MM = 70.0

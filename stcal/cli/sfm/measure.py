@@ -59,7 +59,7 @@ def plan(
     from stcal.sfm.planning.plan_report import PlanFile, plan_text
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
     from stcal.sfm.planning.session import plan as planned
-    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.run_options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
     design = target_of(target)

@@ -20,7 +20,7 @@ from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
 from stcal.handeye.methods.noise import CAUTION, FARTHEST, UNKNOWNS, Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """Residuals (rotation; translation as share of the distance) above which a pose is wrong from the start. No error of

@@ -10,8 +10,8 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError, named
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.cameras.foreign import ForeignLens
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
+from stcal.io.cameras.foreign_lenses import ForeignLens
 from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
 from stcal.io.cameras.read import read_lens, sized_camera
 

@@ -15,10 +15,11 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera, parameter_names
-from stcal.io.cameras import foreign, metashape
+from stcal.io.cameras import foreign_lenses as foreign
+from stcal.io.cameras import metashape
+from stcal.io.cameras.camera_model import CameraModel, cameras_txt
 from stcal.io.cameras.keys import pass_over, require_known
 from stcal.io.cameras.matlab import mat
-from stcal.io.cameras.model import CameraModel, cameras_txt
 
 CameraForm = Literal[
     "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"

@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
+from stcal.io.cameras.camera_model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
+from stcal.io.cameras.foreign_lenses import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
 from stcal.io.cameras.keys import Keys, is_neutral, note, numbers_of, plain, require_known
 from stcal.io.cameras.matlab import MARKS, from_structure
-from stcal.io.cameras.model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
 from stcal.io.toml import load_documents
 
 TAB = 4

@@ -19,9 +19,9 @@ from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.foreign import ForeignLens, of_opencv, one_of, refused
+from stcal.io.cameras.camera_model import CameraModel
+from stcal.io.cameras.foreign_lenses import ForeignLens, of_opencv, one_of, refused
 from stcal.io.cameras.keys import require_known
-from stcal.io.cameras.model import CameraModel
 
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 PIXEL_ORIGIN = 1.0

@@ -9,7 +9,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import camera_from_opencv
+from stcal.io.cameras.camera_model import camera_from_opencv
 from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, read_bytes
 

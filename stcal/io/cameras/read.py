@@ -16,11 +16,11 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
-from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
+from stcal.io.cameras.camera_model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
+from stcal.io.cameras.foreign_lenses import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, CameraForm, name_to_write, written
 from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
 from stcal.io.cameras.keys import reading
-from stcal.io.cameras.model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written, save, text_of

@@ -14,7 +14,7 @@ from stcal.robot.identification.unexplained import moved_meanwhile
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Chain, Robot
+from stcal.robot.kinematics.robot_model import Chain, Robot
 
 USABLE_MM = 1.0
 """σ of a common normal's length or foot beyond which the Denavit–Hartenberg value is refused: arms repeat to 0.1 mm."""

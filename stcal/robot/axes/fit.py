@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 from stcal.robot.axes.sweeps import Arc, VirtualReflectors
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 GROSS = 6.0
 """Residual, in σ, beyond which a point is left out and named: 1 in 10⁷ of normal ones."""

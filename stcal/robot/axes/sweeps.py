@@ -8,7 +8,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid, align_rigid, skew
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 STILL_RAD = np.radians(1.5e-3)
 """Difference up to which joint values are equal: a controller shows 0.001°, and coupling adds two of them."""

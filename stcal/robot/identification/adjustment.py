@@ -21,7 +21,7 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Chain
+from stcal.robot.kinematics.robot_model import Chain
 
 Kind = Literal["pose", "position", "distance"]
 WIDTH = {"pose": 6, "position": 3, "distance": 1}

@@ -26,7 +26,6 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips_of,
 )
-from stcal.robot.identification.consensus import agreeing
 from stcal.robot.identification.observability import (
     ObservabilityIndices,
     directions_named,
@@ -45,12 +44,13 @@ from stcal.robot.identification.result import (
     IdentifyOptions,
     misgivings,
 )
+from stcal.robot.identification.row_consensus import agreeing
 from stcal.robot.identification.start import start
 from stcal.robot.identification.unexplained import left, moved_meanwhile
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""

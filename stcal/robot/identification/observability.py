@@ -13,7 +13,7 @@ from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import chain_parameters
 from stcal.robot.kinematics.inverse import reach_mm
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 SEEN = 1e-9
 """Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""

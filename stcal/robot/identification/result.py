@@ -17,8 +17,8 @@ from stcal.robot.identification.observability import ObservabilityIndices, Predi
 from stcal.robot.identification.prior import Adjusted, Placed, dh_values
 from stcal.robot.identification.problem import ArmSolution
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.kinematics.file import WRITTEN_MM, RobotText, load_robot
-from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.robot.kinematics.robot_file import WRITTEN_MM, RobotText, load_robot
+from stcal.robot.kinematics.robot_model import Elasticity, Robot
 
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2

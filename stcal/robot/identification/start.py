@@ -21,7 +21,7 @@ from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))

@@ -12,7 +12,7 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Rigid
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.robot.kinematics.forward import joint_frames
-from stcal.robot.kinematics.model import (
+from stcal.robot.kinematics.robot_model import (
     Chain,
     Convention,
     DHRow,

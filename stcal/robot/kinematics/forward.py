@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.kinematics.conditions import USUAL, Conditions, loaded
-from stcal.robot.kinematics.model import Chain, Elasticity, Robot, warn_of_degrees
+from stcal.robot.kinematics.robot_model import Chain, Elasticity, Robot, warn_of_degrees
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 ROUNDS = 60
 """Largest number of iterations. At a fold every step halves the distance, so that 1 to 1e-12 takes 40."""

@@ -22,7 +22,7 @@ from stcal.robot.kinematics.conditions import (
     unread,
 )
 from stcal.robot.kinematics.inverse import reach_mm
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 WHAT = "robot data"
 STATUS, AMBIGUOUS = "status", "ambiguous"

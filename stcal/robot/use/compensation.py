@@ -22,7 +22,7 @@ from stcal.robot.kinematics.inverse import (
     Inverse,
     reach_mm,
 )
-from stcal.robot.kinematics.model import Joint, Robot
+from stcal.robot.kinematics.robot_model import Joint, Robot
 from stcal.robot.use.targets import (
     Targets,
     joints_of,

@@ -32,7 +32,7 @@ from stcal.robot.identification.result import Figures, PlacedPose
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5

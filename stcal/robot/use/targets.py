@@ -21,7 +21,7 @@ from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse, reach_mm
 from stcal.robot.kinematics.measurements import ORIENTATION, joint_values, targets_of, within
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 
 WHAT = "targets"
 NAMES = ("pose", "image", "name", "scene", PAYLOAD)

@@ -13,7 +13,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
@@ -25,7 +25,7 @@ from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
 from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
-from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
+from stcal.sfm.data.group_model import GroupModel, M, MetricModel, WorldModel
 
 FLATNESS_MM = 0.02  # σ of the circles off the plane of their face where none is stated
 MOST_FLATNESS_MM = 1e6

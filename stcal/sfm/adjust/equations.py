@@ -22,7 +22,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import Shape
 from stcal.sfm.adjust.refine import placed, projection_jacobians, reproject
 from stcal.sfm.adjust.scale import known_points
-from stcal.sfm.data.model import GroupModel, MetricModel
+from stcal.sfm.data.group_model import GroupModel, MetricModel
 
 CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
 """Names of blocks; those of a group end with its name. The first three are kinds of rows, too."""

@@ -16,7 +16,7 @@ from stcal.geometry.print_modes import AMPLITUDES, PrintModes, Told
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.refine import projection_jacobians
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 
 SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
 """Most steps of a design that is laid over points, and the step (rad, mm) at which they end."""

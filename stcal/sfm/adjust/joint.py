@@ -19,7 +19,7 @@ from stcal.geometry.least_squares import Minimum, minimise
 from stcal.geometry.print_modes import AMPLITUDES, found_amplitude
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import HUBER, robust_sigma
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust.equations import (
     CAMERA,
@@ -40,7 +40,7 @@ from stcal.sfm.adjust.equations import (
     shapes,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 
 Values = dict[str, Any]  # unknowns by block
 EXACTLY = 1e-15

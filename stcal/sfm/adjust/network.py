@@ -9,7 +9,7 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
 from stcal.sfm.adjust.refine import projection_jacobians
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.group_model import GroupModel
 
 MIN_SHARE = 1e-6
 """Smallest share of a parameter's information that poses and points leave to it. Below this share, the parameter cannot

@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Poses, by_pose
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
 
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""

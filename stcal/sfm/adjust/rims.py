@@ -8,7 +8,7 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import huber_weights, robust_sigma
 from stcal.labels import DotLabel, Label
-from stcal.sfm.data.model import GroupModel, ImageObservations
+from stcal.sfm.data.group_model import GroupModel, ImageObservations
 
 MAX_TAN = 2.75
 """Largest tangent of the tilt (70°) of views that are used for a rim: beyond it, the short axis of the ellipse is a few

@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, ScaleError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid, align_similarity
 from stcal.labels import CircleLabel, Label, dot_cells
-from stcal.sfm.data.model import ImageObservations, WorldModel
+from stcal.sfm.data.group_model import ImageObservations, WorldModel
 
 MIN_DOTS = 4
 EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share

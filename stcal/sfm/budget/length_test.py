@@ -15,7 +15,7 @@ from stcal.io.table import LENGTHS, read_table
 from stcal.report.text import number
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
 from stcal.sfm.budget.sources import reference_temperature_c
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 
 WHAT = "lengths"
 BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from stcal.boards.board_designs import TAG_SIGMA_MM
 from stcal.boards.board_file import BoardSizeEntry, SizeEntry
-from stcal.boards.design import TAG_SIGMA_MM
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze

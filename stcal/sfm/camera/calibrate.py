@@ -15,7 +15,7 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Poses
-from stcal.io.cameras.model import OF_IMAGES, CameraModel
+from stcal.io.cameras.camera_model import OF_IMAGES, CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, Label, unseen_lines
 from stcal.parallel import Progress, counted, one_thread, run_in_order, scratch_folder
@@ -30,11 +30,11 @@ from stcal.sfm.camera.intrinsics import (
     of_some_views,
     start_camera,
 )
-from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
-from stcal.sfm.detect.files import DetectionResult, detect_files
+from stcal.sfm.detect.detect_files import DetectionResult, detect_files
 
 R = TypeVar("R")
 GRID = (13, 9)

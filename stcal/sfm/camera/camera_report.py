@@ -11,7 +11,7 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, parameter_names
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.json import ByName, Matrix, NamedReason, ResultFile
-from stcal.report.camera import field_figure, moved_px
+from stcal.report.camera_figures import field_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number

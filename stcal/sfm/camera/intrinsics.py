@@ -23,8 +23,8 @@ from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import image_cost, normalised, robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px, placed, reproject
-from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
-from stcal.sfm.detect.files import DetectedImage
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
+from stcal.sfm.detect.detect_files import DetectedImage
 from stcal.sfm.detect.labelling import labelled_image
 
 MAX_STEPS = 200

@@ -17,7 +17,7 @@ from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
 from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
 from stcal.sfm.checks.significance import Trial, assess
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05

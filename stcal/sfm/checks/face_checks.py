@@ -21,7 +21,7 @@ from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
 from stcal.sfm.checks.significance import Guilt, Trial, assess
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_HALF = 2

@@ -12,7 +12,7 @@ from scipy.special import bdtrc, chdtri
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
@@ -27,7 +27,7 @@ from stcal.sfm.checks.significance import (
     culprits_by_score,
     on_face,
 )
-from stcal.sfm.data.model import ImageObservations, Outlier
+from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_CIRCLES = 3

@@ -19,7 +19,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import GroupModel, WorldModel
+from stcal.sfm.data.group_model import GroupModel, WorldModel
 from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 
 KNOWN = 1e9

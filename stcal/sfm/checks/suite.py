@@ -18,7 +18,7 @@ from stcal.design import (
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import align_similarity
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, image_sigma_factors, with_sigma
@@ -29,7 +29,7 @@ from stcal.sfm.adjust.scale import MIN_DOTS, known_points
 from stcal.sfm.checks import board_checks, face_checks, image_checks
 from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.significance import Trial, assess
-from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
+from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
 JOINT = ("agreement", "halves", "groups", "loops")

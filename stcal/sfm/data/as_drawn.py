@@ -10,7 +10,7 @@ from scipy.spatial.distance import pdist
 
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 
 MOST_TURNED_DEG = 25.0

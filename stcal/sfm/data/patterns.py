@@ -23,7 +23,7 @@ from stcal.geometry.plane import (
 )
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import BOARD, DotLabel, Label, dot_cells
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 
 MAX_TILT_RAD = np.radians(70.0)
 """Largest angle between a circle's normal and the line of sight. Circles seen more obliquely need not be found."""

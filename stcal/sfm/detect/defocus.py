@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import huber_weights, ratio_limit, robust_sigma
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import Pattern, planar_pose
 
 MIN_PLANE = 5

@@ -7,14 +7,14 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from stcal.boards.design import CornerBoard
+from stcal.boards.board_designs import CornerBoard
 from stcal.boards.on_faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.dot_grid import BoardReading, by_rings, find_boards

@@ -24,24 +24,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stcal.boards.board_designs import CornerBoard
 from stcal.boards.board_file import board_of
-from stcal.boards.design import CornerBoard
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.as_drawn import FAR_DEG
-from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, SINGLE, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import Focus, correct_defocus
-from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
+from stcal.sfm.detect.detect_files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,
     Arrangement,

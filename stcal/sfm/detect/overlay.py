@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.io.cache import keep, kept, made_by
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]

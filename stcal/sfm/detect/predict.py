@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
 from stcal.sfm.detect.circles.candidates import (
     MAX_POSITION_ERROR,

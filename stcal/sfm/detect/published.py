@@ -19,7 +19,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.detect.circles.candidates import (
     Candidates,
     EllipseOptions,

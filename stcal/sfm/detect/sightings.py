@@ -10,7 +10,7 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.data.patterns import planar_pose
 
 SECOND_BOARD_SHARE = 0.8

@@ -12,11 +12,11 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import camera_from_colmap
+from stcal.io.cameras.camera_model import camera_from_colmap
 from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
 from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.interop.export_content import BOARD_RGB, colours
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import from_colmap_px

@@ -20,8 +20,8 @@ from stcal.io.files import json_text, save
 from stcal.io.json import require_result_written
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
-from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.model import WorldModel
+from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run

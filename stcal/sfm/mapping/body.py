@@ -19,7 +19,7 @@ from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
-from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier
 
 MIN_CORNERS = 4  # smallest number of corners of a view of a face: they determine its homography
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25

@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.io.table import csv_text
 from stcal.labels import CircleLabel
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 
 CAMERA_ID = 1

@@ -12,7 +12,7 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier, WorldModel
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, unwritable
 from stcal.sfm.mapping.models import assemble, points_by_votes, rigid_from_colmap

@@ -17,7 +17,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Rigid, best_rotations
 from stcal.labels import DotLabel
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import planar_pose
 from stcal.sfm.mapping.database import match_labels
 

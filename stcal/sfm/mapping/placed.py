@@ -11,7 +11,7 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
+from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel
 from stcal.sfm.mapping.body import (
     FOCAL_STEPS,
     MIN_CORNERS,

@@ -18,7 +18,7 @@ from stcal.io.covariance import Rows, require_covariance
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.faces_file import FacesFile
 
 SAME_DESIGN_MM = 0.5  # largest RMS deviation of a face from the design; another design is off by far more
 SAME_RADIUS_MM = 1e-6

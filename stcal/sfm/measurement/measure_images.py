@@ -18,17 +18,17 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
-from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
-from stcal.sfm.detect.files import copy_of, detect_files, load_image, sized_by
+from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
 from stcal.sfm.detect.predict import (

@@ -27,10 +27,10 @@ from stcal.geometry.plane import (
     weights_of,
 )
 from stcal.geometry.rigid import ImageFit, Poses, Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
-from stcal.sfm.data.model import ImageObservations, Outlier
+from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
 from stcal.sfm.measurement.known_target import TargetCircles
 

@@ -16,7 +16,7 @@ from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,

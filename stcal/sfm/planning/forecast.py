@@ -15,16 +15,16 @@ from stcal.geometry.arrays import require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.file import FacePoses
+from stcal.sfm.adjust.faces_file import FacePoses
 from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
-from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
 from stcal.sfm.mapping.models import assemble
 from stcal.synthetic.scene import Scene, image_circles
 

@@ -14,13 +14,13 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel, camera_prior, refinable
+from stcal.io.cameras.camera_model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, circle_labels
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.scale import with_edge_sigma
-from stcal.sfm.data.model import ImageObservations, MetricModel
+from stcal.sfm.data.group_model import ImageObservations, MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.placed import unknown_lens
@@ -35,8 +35,8 @@ from stcal.sfm.planning.forecast import (
     true_models,
     variance_shares,
 )
-from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.synthetic.body_scene import BodyOptions, BodyScene, body_camera, make_body_scene
 from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene
 
 GROUP = "."

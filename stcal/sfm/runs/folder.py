@@ -36,8 +36,8 @@ from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
 from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, plots, require_pdf
 from stcal.report.text import join
-from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.model import GroupModel, ImageObservations, detections_csv
+from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.sfm.data.group_model import GroupModel, ImageObservations, detections_csv
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
@@ -49,7 +49,7 @@ from stcal.sfm.runs.report_file import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.run_result import AnyRun, RunResult, SavedRun, folder_of
 from stcal.sfm.runs.run_text import found_in_all
 from stcal.sfm.runs.saved import require_run, verify
-from stcal.sfm.runs.start import DetectedImages, Task
+from stcal.sfm.runs.task import DetectedImages, Task
 from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
 
 LONGEST_NAME = 200

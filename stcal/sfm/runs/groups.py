@@ -16,7 +16,7 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleE
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
-from stcal.io.cameras.model import CameraModel, refinable
+from stcal.io.cameras.camera_model import CameraModel, refinable
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_in_order
@@ -26,7 +26,7 @@ from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
-from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
+from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel, by_group
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.labelling import LabelledImage, is_board_alone
@@ -36,8 +36,8 @@ from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model, place_with_camera
 from stcal.sfm.report.check import Check
-from stcal.sfm.runs.options import RunOptions, unknown_faces
-from stcal.sfm.runs.start import DetectedImages, Task
+from stcal.sfm.runs.run_options import RunOptions, unknown_faces
+from stcal.sfm.runs.task import DetectedImages, Task
 
 CACHE_VERSION = 8
 LEAST_WITHOUT, MOST_WITHOUT = 3, 40

@@ -14,7 +14,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.data.model import GroupModel, WorldModel
+from stcal.sfm.data.group_model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
 from stcal.sfm.runs.groups import GroupSolution
 from stcal.sfm.runs.run_result import ComparedRow, Comparison, FaceOff, RunResult

@@ -14,26 +14,26 @@ from stcal.geometry.arrays import Brief, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.files import DATABASE, RUN_MARKER
 from stcal.io.json import ByFace, Part, checked, read_result
 from stcal.labels import CircleLabel, Label, circle_labels
 from stcal.report.document import html
 from stcal.sfm.adjust.calibration import Calibration, SigmaFactors
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.suite import Evidence
-from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
-from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
+from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
 from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.groups import GroupSolution
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.transaction import AGAIN, MarkerFile, as_written
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from stcal.io.files import REFINED_CAMERA
 from stcal.labels import DotLabel
 from stcal.report.document import Block, Document, Printed, Section, Table
 from stcal.report.text import join, wrapped
-from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.predict import REMEDIES
 from stcal.sfm.report.check import BY_CHANCE, Check, count_verdicts, ranked

@@ -15,7 +15,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior, camera_prior
+from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.files import (
@@ -35,17 +35,17 @@ from stcal.io.json import checked, read_json
 from stcal.io.table import csv_rows
 from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.adjust.uncertainty import with_differences
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report_file import ReportRead
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.run_result import AnyRun, SavedRun, by_circle, folder_of, no_faces
 from stcal.sfm.runs.transaction import AGAIN, RESULTS, MarkerFile, as_written, complete_interrupted, files_below
 

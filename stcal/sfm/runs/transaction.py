@@ -30,7 +30,7 @@ from stcal.io.files import (
     save,
 )
 from stcal.io.json import ResultFile, read_result
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 
 ByFile = Annotated[str, "file"]
 AGAIN = "run it again"

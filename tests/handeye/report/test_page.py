@@ -15,7 +15,7 @@ from stcal.handeye.report.handeye_page import outcome_report
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.solving import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
 from tests.support.handeye import simulated, simulated_views
 

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
+from stcal.robot.axes.axes_model import robot_from_sweeps
 from stcal.robot.axes.checks import pairs_of
 from stcal.robot.axes.fit import fit_axes
-from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses

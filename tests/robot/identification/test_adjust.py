@@ -8,8 +8,8 @@ import pytest
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import adjusted, dh_values
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.file import load_robot, robot_toml
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed
 from tests.outcome import refuses
 from tests.support.arms import TOOL, WORLD, seen_arm

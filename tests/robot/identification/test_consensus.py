@@ -7,7 +7,7 @@ import pytest
 
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from tests.levels import sampled
 from tests.scripts import load_script
 

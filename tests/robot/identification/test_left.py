@@ -12,7 +12,7 @@ from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions
 from stcal.robot.identification.unexplained import _Effect, _size, left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot, mh80
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
 from stcal.row_order import Change
 from tests.levels import sampled

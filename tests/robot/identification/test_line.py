@@ -10,7 +10,7 @@ from stcal.robot import inverse
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import made, measured, placed
 from tests.levels import sampled
 from tests.outcome import fails_with

@@ -8,7 +8,7 @@ import pytest
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors
 from tests.support.arms import seen_arm
 

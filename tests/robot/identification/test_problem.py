@@ -12,7 +12,7 @@ from stcal.robot.identification.adjustment import Weighting, jacobian, moved, ob
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.problem import MOST_BENT, ArmProblem, Bent, Relaxation, Spread, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

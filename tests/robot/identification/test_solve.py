@@ -16,10 +16,10 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identified_report import identified_report
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.scripts import load_script
 

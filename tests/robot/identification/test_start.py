@@ -10,9 +10,9 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.start import start
-from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_file import robot_toml
+from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

@@ -9,7 +9,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import mh80
+from stcal.robot.kinematics.robot_model import mh80
 from tests.outcome import fails_with
 from tests.support.arms import seen_arm
 

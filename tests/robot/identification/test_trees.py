@@ -22,11 +22,11 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identified_report import joints_figure
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames, moved_chain
 from stcal.robot.kinematics.forward import jacobian as by_joints
 from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.simulated import joint_vectors, made, measured
 from tests.outcome import fails_with
 from tests.support.arms import MARKERS, RIGHT, elastic, two_arms

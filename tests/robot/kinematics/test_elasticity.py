@@ -10,7 +10,6 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward, inverse
 from stcal.robot.kinematics.conditions import Conditions, loaded
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import (
     chain_parameters,
     elasticity_jacobian,
@@ -20,7 +19,8 @@ from stcal.robot.kinematics.forward import (
     moved_chain,
     with_values,
 )
-from stcal.robot.kinematics.model import Elasticity, Robot, mh80
+from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import Elasticity, Robot, mh80
 from stcal.robot.simulated import joint_vectors
 from tests.outcome import fails_with
 

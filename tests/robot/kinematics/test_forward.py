@@ -20,7 +20,7 @@ from stcal.robot.kinematics.forward import (
     jacobian,
     moved_chain,
 )
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 
 

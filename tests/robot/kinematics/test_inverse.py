@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import branches, inverse
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from tests.outcome import refuses
 

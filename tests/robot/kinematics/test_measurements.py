@@ -7,9 +7,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
-from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_file import save_robot
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from tests.outcome import fails_with, refuses

@@ -11,9 +11,9 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import Joint, mh80
+from stcal.robot.kinematics.robot_file import robot_toml
+from stcal.robot.kinematics.robot_model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv
 from stcal.robot.use.targets import read_targets

@@ -11,10 +11,10 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
-from stcal.robot.kinematics.model import Joint, mh80
+from stcal.robot.kinematics.robot_model import Joint, mh80
 from stcal.robot.robot_report import design_report
 from stcal.robot.simulated import joint_vectors, made, measured
-from stcal.robot.use.design import DesignOptions, choose, design
+from stcal.robot.use.pose_design import DesignOptions, choose, design
 from tests.outcome import fails_with, refuses
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])

@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.robot_report import evaluated_csv, evaluation_report, names_of
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate

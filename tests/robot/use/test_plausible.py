@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets, on_targets, robots_apart

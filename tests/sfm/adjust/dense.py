@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.group_model import GroupModel
 
 STEP = 1e-6
 

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.geometry.normal_equations import free_motions
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.uncertainty import (

@@ -7,8 +7,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
-from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.sfm.runs.run_options import RunOptions
 
 
 @pytest.fixture(scope="module")

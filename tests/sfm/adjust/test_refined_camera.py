@@ -7,11 +7,11 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 

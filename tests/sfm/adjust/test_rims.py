@@ -15,7 +15,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import sampled

@@ -6,7 +6,7 @@ import pytest
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import WorldModel
+from stcal.sfm.data.group_model import WorldModel
 from tests.outcome import fails_with
 
 BOARD = reference_board()

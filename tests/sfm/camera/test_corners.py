@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import (
+from stcal.boards.board_designs import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     CharucoDesign,

@@ -15,13 +15,13 @@ from stcal.design import reference_board
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.plane import circle_image_offset
-from stcal.io.cameras.model import camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera import intrinsics
 from stcal.sfm.camera.calibrate import image_grid, projection_sigma, require_determined
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, board_views, closed_form, model_parameters, start_camera
-from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
 

@@ -10,7 +10,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.checks.image_checks import UNEVEN_BY_CHANCE, evenness_check
 from stcal.sfm.pipeline import run
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from tests.scripts import load_script
 from tests.support.photograph import read_set
 

@@ -8,7 +8,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.labelling import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles

@@ -8,11 +8,11 @@ import pytest
 
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputNote
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import MAJORITY, find_images
 from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.detect.files import PHOTOGRAPHS, detect_files, sized_by
+from stcal.sfm.detect.detect_files import PHOTOGRAPHS, detect_files, sized_by
 from tests.outcome import fails_with
 
 IMAGE = "12/IMG_1000.jpg"

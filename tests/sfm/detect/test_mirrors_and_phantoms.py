@@ -13,7 +13,7 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
-from stcal.sfm.detect.files import DetectedImage, require_upright
+from stcal.sfm.detect.detect_files import DetectedImage, require_upright
 from stcal.sfm.detect.labelling import label_groups
 from stcal.sfm.detect.sightings import BoardSighting, mirror_images
 from stcal.synthetic.dataset import write_dataset

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.overlay import draw_overlay
 
 FOCAL = np.array([2000.0, 2000.0])

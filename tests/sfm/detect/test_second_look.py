@@ -8,7 +8,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labelling import _second, labelled_image
 from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, SecondLook, contradictions, measure_predicted

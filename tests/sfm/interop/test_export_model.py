@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_model import export_model
 from tests.outcome import fails_with

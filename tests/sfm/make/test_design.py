@@ -7,7 +7,7 @@ import pytest
 
 from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target, target_toml
-from stcal.cli.sfm.designs import design as command
+from stcal.cli.sfm.design_commands import design as command
 from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.lookalikes import MIN_COMMON

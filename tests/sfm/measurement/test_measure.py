@@ -12,11 +12,11 @@ from stcal.design import reference_target
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.cameras.read import read_camera
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.measurement.known_target import TargetCircles, read_target

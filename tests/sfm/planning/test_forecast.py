@@ -12,11 +12,11 @@ from scipy.stats import chi2
 from stcal.design import reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
+from stcal.io.cameras.camera_model import CameraModel, CameraPrior, model_of
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjusted, unmoved
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning import session
 from stcal.sfm.planning.advise import KnownRun, PlannedView, advise, candidates, known_of, known_scene

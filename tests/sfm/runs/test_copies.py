@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stcal.io.images import ImageFile, same_photograph
-from stcal.sfm.detect.files import _same_pixels
+from stcal.sfm.detect.detect_files import _same_pixels
 from tests.conftest import SMALL
 
 pytestmark = pytest.mark.usefixtures("no_page")

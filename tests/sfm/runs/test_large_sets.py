@@ -23,7 +23,7 @@ from stcal.sfm.mapping.pairs import (
     track_parts,
 )
 from stcal.sfm.runs.groups import solve_groups
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 

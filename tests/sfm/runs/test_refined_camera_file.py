@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputNote
-from stcal.io.cameras.model import model_of
+from stcal.io.cameras.camera_model import model_of
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import CAMERA, REFINED_CAMERA
 from stcal.sfm.camera.intrinsics import model_parameters

@@ -17,7 +17,7 @@ from stcal.sfm import run, uncertainty_budget
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.known_target import read_target
-from stcal.sfm.runs.options import RunOptions, unknown_faces
+from stcal.sfm.runs.run_options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, fails_with, refuses

@@ -10,7 +10,7 @@ import pytest
 
 from stcal.errors import DetectionError
 from stcal.io.files import INTERNAL, RUN_MARKER
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import READY, STAGE, MarkerFile, added_results, complete_interrupted, run_folder
 from tests.outcome import fails_with
@@ -127,7 +127,7 @@ def test_an_addition_that_is_killed_is_completed_and_takes_nothing_away(tmp_path
 HOLD = """
 import sys
 from stcal.sfm.runs.transaction import MarkerFile
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.transaction import run_folder
 with run_folder(sys.argv[1], MarkerFile.of("images", RunOptions()), {}):
     print("held", flush=True)

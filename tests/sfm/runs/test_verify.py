@@ -8,7 +8,7 @@ import pytest
 
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import crosscheck as interop
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
 from tests.outcome import INPUT, assert_error, fails_with, refuses

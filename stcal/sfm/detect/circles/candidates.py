@@ -13,7 +13,7 @@ from stcal.geometry.arrays import freeze, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
-from stcal.sfm.data.model import CircleRows
+from stcal.sfm.data.group_model import CircleRows
 
 WINDOWS_PX = (41, 193)
 """Sides of the windows whose mean is the threshold, on every level of the pyramid."""

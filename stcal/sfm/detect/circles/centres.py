@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders, local_ideal_maps
 

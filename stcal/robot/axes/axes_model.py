@@ -28,9 +28,9 @@ from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
-from stcal.robot.kinematics.file import RobotText
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Chain, Robot
+from stcal.robot.kinematics.robot_file import RobotText
+from stcal.robot.kinematics.robot_model import Chain, Robot
 
 ByLine = Annotated[int, "line"]
 Rows = Annotated[list[list[Finite]], BeforeValidator(lambda rows: np.asarray(rows, float).tolist())]

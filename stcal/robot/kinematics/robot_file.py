@@ -17,7 +17,7 @@ from stcal.io.toml import Finite, PoseEntry, Sized, Strict, load_toml, toml_stri
 from stcal.lengths import require_millimetres, stated_unusual
 from stcal.robot.kinematics.conditions import MOST_KG
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, joint_frames
-from stcal.robot.kinematics.model import (
+from stcal.robot.kinematics.robot_model import (
     Chain,
     Convention,
     DHRow,

@@ -14,8 +14,8 @@ from scipy.ndimage import map_coordinates
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
 from stcal.geometry.plane import inside
+from stcal.io.cameras.camera_model import CameraModel, camera_from_colmap, camera_from_opencv
 from stcal.io.cameras.keys import pass_over
-from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
 COLMAP_FOREIGN = {
     "FOV": (7, 5),

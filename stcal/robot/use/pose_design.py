@@ -24,7 +24,7 @@ from stcal.robot.identification.observability import (
     parameter_scale,
 )
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 
 RANDOM_SETS = 20

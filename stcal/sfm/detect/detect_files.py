@@ -19,7 +19,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, keep_packed, kept, made_by, packed
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
@@ -37,7 +37,7 @@ from stcal.io.images import (
     without_excluded,
 )
 from stcal.labels import parse_label, parse_labels
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.group_model import Centres
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted

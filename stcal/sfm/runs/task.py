@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import CornerBoard
+from stcal.boards.board_designs import CornerBoard
 from stcal.boards.on_faces import why_unseen
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CameraModel, model_of
+from stcal.io.cameras.camera_model import CameraModel, model_of
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.images import ImageFile, ImageFiles, require_common_size
 from stcal.parallel import Progress, counted
 from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
-from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
+from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, unknown_lens
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.transaction import RunFolder
 
 VAGUE = 0.01

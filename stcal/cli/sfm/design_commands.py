@@ -82,7 +82,7 @@ def simulate(
     target.toml, board.toml, truth.json."""
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
-    from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+    from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
     from stcal.synthetic.scene import SceneOptions
@@ -180,8 +180,8 @@ def _scene(
     fisheye: float | None,
 ) -> "Scene":
     """Returns a scene of the files' designs, or the second ones, before the camera of a file or the options."""
+    from stcal.boards.board_designs import CornerBoard
     from stcal.boards.board_file import board_of
-    from stcal.boards.design import CornerBoard
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.forecast import nominal_poses
@@ -247,7 +247,7 @@ def demo(
     """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
     from stcal.sfm.pipeline import run
     from stcal.sfm.report.compare import compare, comparison_table
-    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.run_options import RunOptions
     from stcal.sfm.runs.run_text import run_text
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.scene import SceneOptions, make_scene
