@@ -311,6 +311,7 @@ def _of_distortion(more: Size = lambda *_: "") -> Size:
 
 ANEW = "calibrate the camera again with this lens, zoom and focus, or run with --refine-camera"
 AS_RECORDED = "use them as the sensor recorded them, without the rotation that a viewer or converter applied"
+ANOTHER_CAMERA = "the intrinsics are not those of the camera file"
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -335,7 +336,7 @@ def _hypotheses(camera: Camera) -> list[Hypothesis]:
                    _listed(INTRINSICS[2:4]), unit[:, 2:4]),
         Hypothesis("the distortion is not that of the camera file", "another lens or focus, or its signs or order are "
                    f"wrong in the file: {ANEW}", _listed(INTRINSICS[4:]), unit[:, 4:8]),
-        Hypothesis("the intrinsics are not those of the camera file", "the camera file belongs to another camera: "
+        Hypothesis(ANOTHER_CAMERA, "the camera file belongs to another camera: "
                    f"{ANEW}", _listed(INTRINSICS), unit[:, :8]),
         Hypothesis("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom "
                    "and focus, and take the photographs again; or run each group with a camera file of its own",

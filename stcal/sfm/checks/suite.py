@@ -27,7 +27,7 @@ from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
 from stcal.sfm.checks import board_checks, face_checks, image_checks
-from stcal.sfm.checks.causes import whole_set_cause
+from stcal.sfm.checks.causes import ANOTHER_CAMERA, whole_set_cause
 from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
@@ -140,13 +140,16 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         step(None)
     failed = {check.key: check for check in checks if check.verdict == "failed"}
     cause = evidence.cause
-    if cause is None and any(check.verdict in ("failed", "suspicious") for check in checks):
+    # That all intrinsics differ explains a board in nearly any photographs: what all circles tell goes before it.
+    if (cause is None or cause.cause == ANOTHER_CAMERA) and any(
+        check.verdict in ("failed", "suspicious") for check in checks
+    ):
         moved = "moved" in failed and not failed["moved"].names
         # A group without which all is well is the cause, unless another one explains far more of the residuals.
         of_group = "groups" in failed and len(failed["groups"].names) == 1
         most_left = BESIDE_A_GROUP if of_group else 1.0
-        cause = whole_set_cause(networks, camera, moved, evidence.camera_given, most_left)
-        cause = replace(cause, verdict="failed" if failed else "suspicious") if cause else None
+        if of_set := whole_set_cause(networks, camera, moved, evidence.camera_given, most_left):
+            cause = replace(of_set, verdict="failed" if failed else "suspicious")
     return (cause, *checks) if cause else tuple(checks)
 
 

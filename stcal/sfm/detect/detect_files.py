@@ -188,6 +188,8 @@ def _detect_file(
         detection = (detector or detect_image)(image, camera, *seen)
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
+    except DetectionError as error:
+        return Skipped(file.name, str(error))
     digest, key = _key(data, settings)
     picture, scale = thumbnail(grey_8bit(image)) if pictures else (np.zeros(0, np.uint8), 1.0)
     return key, _packed(detection, key, digest, picture, scale)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.design import BoardDesign
-from stcal.errors import DegenerateError
+from stcal.errors import DegenerateError, DetectionError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian, singular_values
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern
@@ -198,13 +198,15 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 def by_rings(
     reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
 ) -> BoardReading:
-    """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates."""
+    """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates.
+    DetectionError: it shows as many holes as are stated, at other places by any numbering."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     cells = board.cells()
     rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
     middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
-    wrong = []
+    wrong: list[int] = []
+    seen: list[np.ndarray] = []
     for numbering in reading.numberings:
         xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
         homography = fit_homography(xy_mm, xy[reading.candidates])
@@ -218,8 +220,16 @@ def by_rings(
         middle, body, outside = values
         holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
         wrong.append(int((holes != rings)[inside].sum()))
+        seen.append(holes & inside)
     kept = [i for i, count in enumerate(wrong) if count == min(wrong)]
     if min(wrong) > MOST_WRONG:
+        found = seen[kept[0]]
+        if found.sum() == rings.sum():
+            where = ", ".join(str(cell) for cell in cells[found].tolist())
+            raise DetectionError(
+                "E-BOARD-RINGS",
+                f"board: dots with a hole are at [row, column] {where}, other than in its file; correct rings",
+            )
         return reading
     return replace(reading, numberings=reading.numberings[kept])
 

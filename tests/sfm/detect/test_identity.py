@@ -1,5 +1,8 @@
 """Faces and boards among candidates, without pixels: naming, hiding, reflections, clutter, numbering."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
-from stcal.sfm.detect.dot_grid import find_boards
+from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
+from stcal.sfm.detect.dot_grid import by_rings, find_boards
 from stcal.sfm.detect.face_patterns import FaceFinder
+from stcal.sfm.detect.image import image_corners
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection, confusable, is_named, mirror_images
+from tests.outcome import fails_with
 from tests.sfm.detect.test_arrangement import centres_of
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
@@ -295,3 +300,25 @@ def test_discs_around_the_board_are_not_taken_into_it(seed):
 
 def test_random_discs_are_no_board():
     assert find(junk(300, 1), BOARD) == []
+
+
+def test_rings_at_other_places_than_stated_are_refused():
+    """A board seen from the front, three of its dots with a hole: the file that states them orients it, one that states
+    them a column further is named with their places."""
+    stated = replace(BOARD, corner=None, corner_radius_mm=None, rings=((2, 4), (3, 2), (3, 3)))
+    camera = Camera(960, 760, [1000.0, 1000.0], [479.5, 379.5], np.zeros(8))
+    scale = 3.0  # px a mm
+    large = np.zeros((4 * camera.height, 4 * camera.width), np.uint8)
+    for (row, column), xy in zip(stated.cells().tolist(), stated.xy_mm(), strict=True):
+        centre = tuple((4 * (scale * xy + 110)).astype(int).tolist())
+        cv2.circle(large, centre, round(4 * scale * stated.radius_mm), 220, -1)
+        if (row, column) in stated.rings:
+            cv2.circle(large, centre, round(2 * scale * stated.radius_mm), 0, -1)
+    grey = cv2.GaussianBlur(cv2.resize(large, (camera.width, camera.height), interpolation=cv2.INTER_AREA), None, 0.7)
+    dots = Candidates.of(find_ellipses(grey, "bright", EllipseOptions()), camera)
+    (reading,) = find_boards(dots, stated, image_corners(camera))
+    assert len(reading.numberings) == 2
+    assert len(by_rings(reading, stated, grey, camera, dots.xy).numberings) == 1
+    further = replace(stated, rings=tuple((row, column + 1) for row, column in stated.rings))
+    with fails_with("E-BOARD-RINGS … [2, 4], [3, 2], [3, 3]"):
+        by_rings(reading, further, grey, camera, dots.xy)
