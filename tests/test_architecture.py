@@ -21,6 +21,8 @@ def test_folders_can_be_seen_at_a_glance_and_names_stand_for_one_thing():
     entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
     assert len(entries) <= MOST_ENTRIES
     assert [path for path in FILES if path.stem == path.parent.name] == []
+    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
+    assert {stem: n for stem, n in stems.items() if n > 1} == {}
     for system in SYSTEMS:
         names = importlib.import_module(f"stcal.{system}").__all__
         assert {each.stem for each in (ROOT / system).iterdir()} & set(names) == set()

@@ -166,8 +166,8 @@ def run(
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import require_pose_table_written
     from stcal.io.video import images_or_frames
+    from stcal.locate.base_chain import goal_chain, goals
     from stcal.locate.exposures import find_scenes
-    from stcal.locate.goal_chain import goal_chain, goals
     from stcal.locate.layout import load_layout
     from stcal.locate.located_report import LocatedFile, accepted, poses_csv, run_report, uncertain
     from stcal.locate.patent import PatentOptions

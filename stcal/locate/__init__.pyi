@@ -1,3 +1,7 @@
+from .base_chain import GoalChain as GoalChain
+from .base_chain import Goals as Goals
+from .base_chain import goal_chain as goal_chain
+from .base_chain import goals as goals
 from .estimate import ObjPose as ObjPose
 from .estimate import SeenTags as SeenTags
 from .estimate import locate as locate
@@ -5,10 +9,6 @@ from .exposures import SceneFiles as SceneFiles
 from .exposures import capture as capture
 from .exposures import exposure_times as exposure_times
 from .exposures import find_scenes as find_scenes
-from .goal_chain import GoalChain as GoalChain
-from .goal_chain import Goals as Goals
-from .goal_chain import goal_chain as goal_chain
-from .goal_chain import goals as goals
 from .layout import LayoutPlan as LayoutPlan
 from .layout import TagLayout as TagLayout
 from .layout import TargetLayout as TargetLayout

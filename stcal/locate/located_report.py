@@ -13,9 +13,9 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.io.json import Finite, Keys, Part, Pose, ResultFile, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
+from stcal.locate.base_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.estimate import Merged, ObjPose
 from stcal.locate.exposures import Exposure, SceneFiles
-from stcal.locate.goal_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.layout import TargetLayout
 from stcal.locate.layout_calibration import AdjustedLayout, CalibratedLayout
 from stcal.locate.patent import ASSUMED, PatentPose

@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid, UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.goal_chain import goal_chain
+from stcal.locate.base_chain import goal_chain
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
