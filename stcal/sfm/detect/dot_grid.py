@@ -227,7 +227,7 @@ def by_rings(
         if found.sum() == rings.sum():
             where = ", ".join(str(cell) for cell in cells[found].tolist())
             raise DetectionError(
-                "E-BOARD-RINGS",
+                "E-RINGS-ELSEWHERE",
                 f"board: dots with a hole are at [row, column] {where}, other than in its file; correct rings",
             )
         return reading

@@ -320,5 +320,5 @@ def test_rings_at_other_places_than_stated_are_refused():
     assert len(reading.numberings) == 2
     assert len(by_rings(reading, stated, grey, camera, dots.xy).numberings) == 1
     further = replace(stated, rings=tuple((row, column + 1) for row, column in stated.rings))
-    with fails_with("E-BOARD-RINGS … [2, 4], [3, 2], [3, 3]"):
+    with fails_with("E-RINGS-ELSEWHERE … [2, 4], [3, 2], [3, 3]"):
         by_rings(reading, further, grey, camera, dots.xy)
