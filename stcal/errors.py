@@ -62,6 +62,16 @@ class StcalError(Exception):
     def __str__(self) -> str:
         return self.args[1] if COMMAND_LINE in os.environ else in_python(self.args[1])
 
+    @property
+    def fault(self) -> str:
+        """What is wrong, measured and needed: the message up to its first semicolon."""
+        return str(self).partition("; ")[0]
+
+    @property
+    def remedy(self) -> str:
+        """What to do: the message behind its first semicolon."""
+        return str(self).partition("; ")[2]
+
     def append(self, text: str) -> None:
         """Appends text to the message."""
         self.args = (self.code, f"{self.args[1]}{text}")

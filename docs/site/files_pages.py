@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from stcal.io.json import Keys, Part, ResultFile, Shape
+from stcal.io.json import Named, Part, ResultFile, Shape
 
 PACKAGE = Path(__file__).resolve().parents[2] / "stcal"
 WORDS = {str: "string", int: "integer", float: "number", bool: "true or false", type(None): "null", Any: "any"}
@@ -74,7 +74,7 @@ def names_of(annotation: Any, within: type) -> list[str]:
     """The keys of an object: those that its annotation names, or all fields of its dataclass."""
     own = get_args(annotation)
     if get_origin(annotation) is Annotated:
-        named = " ".join(each.names for each in own[1:] if isinstance(each, Keys))
+        named = " ".join(each.names for each in own[1:] if isinstance(each, Named))
         return [part for name in named.split() for part in name.split(".")] or names_of(own[0], within)
     of_parts = [names_of(each, within) for each in own if inner(each)[0] is within]
     return of_parts[0] if of_parts else [each.name for each in fields(within)]
@@ -86,7 +86,7 @@ def inner(annotation: Any) -> tuple[type | None, str]:
     if isinstance(annotation, type) and (issubclass(annotation, Part) or is_dataclass(annotation)):
         return annotation, ""
     if origin is Annotated:
-        return (object, "") if own[0] is Any and any(isinstance(each, Keys) for each in own) else inner(own[0])
+        return (object, "") if own[0] is Any and any(isinstance(each, Named) for each in own) else inner(own[0])
     if origin in (Union, types.UnionType):
         return next((found for each in own if (found := inner(each))[0]), (None, ""))
     if origin in (list, tuple):
@@ -101,7 +101,7 @@ def inner(annotation: Any) -> tuple[type | None, str]:
 def words(annotation: Any) -> str:
     """A type as the documents call it."""
     origin, own = get_origin(annotation), get_args(annotation)
-    if origin is Annotated and any(isinstance(each, Keys) for each in own):
+    if origin is Annotated and any(isinstance(each, Named) for each in own):
         return "object"
     if origin is Annotated:
         shape = next((each for each in own[1:] if isinstance(each, Shape)), None)

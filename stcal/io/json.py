@@ -155,16 +155,16 @@ class CovarianceShape(Shape):
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
+class Named:
     """An object of a file that holds attributes of a result: those named, in words, or all fields of a dataclass.
 
-    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result, Keys()]``.
+    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result, Named()]``.
     """
 
     names: str = ""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(Keys(self.names or _names(source)).checked)
+        return core_schema.no_info_plain_validator_function(Named(self.names or _names(source)).checked)
 
     def checked(self, value: Any) -> dict[str, Any]:
         """Return the object as plain values; a dict is one already."""
@@ -194,7 +194,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     if is_dataclass(value):
-        return Keys(_names(type(value))).checked(value)
+        return Named(_names(type(value))).checked(value)
     if isinstance(value, dict):
         return {str(name): _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple | range):

@@ -11,7 +11,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
-from stcal.io.json import Finite, Keys, Part, Pose, ResultFile, Shape
+from stcal.io.json import Finite, Named, Part, Pose, ResultFile, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
 from stcal.locate.base_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.estimate import Merged, ObjPose
@@ -197,9 +197,9 @@ def _picture(
 Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
 """Rows of the layout's tags."""
 Corners = Annotated[np.ndarray, Shape((None, 4, 2))]
-OF_FIT = Keys("covariance second delta_chi2 rms_px chi2 redundancy p_value rows outliers residuals_px weights")
-OF_PATENT = Keys("exposure second errors_px det_j same exposures")
-OF_ADJUSTED = Keys("poses image_rms_px board_rms_px tag_rms_px stretch shear sigma_px tag_sigma_px")
+OF_FIT = Named("covariance second delta_chi2 rms_px chi2 redundancy p_value rows outliers residuals_px weights")
+OF_PATENT = Named("exposure second errors_px det_j same exposures")
+OF_ADJUSTED = Named("poses image_rms_px board_rms_px tag_rms_px stretch shear sigma_px tag_sigma_px")
 
 
 class ExposureRow(Part):
@@ -209,13 +209,13 @@ class ExposureRow(Part):
 
 class SceneRow(Part):
     name: str = Field(description="of the scene")
-    verdict: Annotated[Verdict, Keys("decision reasons checks")] = Field(
+    verdict: Annotated[Verdict, Named("decision reasons checks")] = Field(
         description="`decision`, `reasons`, and `checks`: `name`, `value` (null: no other pose), `at_least`, "
         "`at_most`, `unit`, `passed`"
     )
     notes: list[str] = Field(description="what was left out, and other notes")
     exposures: list[ExposureRow] = Field(description="`name` of each readable image, number of `tags` in it")
-    merged: Annotated[Merged, Keys("rows share shifts")] | None = Field(
+    merged: Annotated[Merged, Named("rows share shifts")] | None = Field(
         description="of all exposures: `rows` of the tags seen, `share` of the "
         "corners' stated variance that differs between exposures, `shifts`: between two `exposures`, `tags` in common, "
         "median `shift_px` of their middles, and `sigma_px`"
@@ -241,7 +241,7 @@ class LocatedFile(ResultFile):
     layout: str = Field(description="the layout's name")
     tags: list[tuple[str, int]] = Field(description="dictionary and id of the layout's tags")
     scenes: list[SceneRow] = Field(description="one object each")
-    goals: Annotated[Goals, Keys("base_from_goal covariance")] | None = Field(
+    goals: Annotated[Goals, Named("base_from_goal covariance")] | None = Field(
         description="with `--hand-eye` or `--registration`: `base_from_goal` and its `covariance` of accepted scenes"
     )
 
@@ -266,7 +266,7 @@ class CalibratedLayoutFile(ResultFile):
         "board is along its rows than across, `stretch`, and its `shear`, relative; `sigma_px` and `tag_sigma_px` as "
         "in the layout file"
     )
-    layout: Annotated[TargetLayout, Keys("tags")] = Field(
+    layout: Annotated[TargetLayout, Named("tags")] = Field(
         description="`tags`: dictionary and id; `--out` has the corners"
     )
     counts: Rows = Field(description="number of images that show each tag")

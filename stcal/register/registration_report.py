@@ -11,7 +11,7 @@ from pydantic import Field as Key
 
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.io.json import Finite, Keys, Matrix, Matrix4, Points, ResultFile, Vector3
+from stcal.io.json import Finite, Matrix, Matrix4, Named, Points, ResultFile, Vector3
 from stcal.parallel import one_thread
 from stcal.register.liu2017 import Liu2017Options, orthogonal_samples
 from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
@@ -280,12 +280,12 @@ Rounded = Annotated[Points, BeforeValidator(lambda values: np.round(values, 9))]
 TransformMatrix = Annotated[
     Matrix4, BeforeValidator(lambda given: given.matrix() if isinstance(given, Rigid | Similarity | Affine) else given)
 ]
-OF_ROBOT = Keys(
+OF_ROBOT = Named(
     "b_from_base identified.rank identified.names identified.undetermined identified.weighting.sigma_mm off_mm better "
     "folds rows transform_mm kinematics_mm wild transform kinematics"
 )
 """Of base and kinematics, solved in addition to the transform: :class:`stcal.workflows.RegisteredRobot`."""
-OF_FIELD = Keys("seen p_value length_mm size_mm noise_mm rows taken_back plain corrected sigma_ratio grid")
+OF_FIELD = Named("seen p_value length_mm size_mm noise_mm rows taken_back plain corrected sigma_ratio grid")
 
 
 class RegistrationFile(ResultFile):
@@ -309,12 +309,12 @@ class RegistrationFile(ResultFile):
     sigma_factor: float | None = Key(description="by how much residuals exceed the σ given with the data")
     scaled: bool = Key(description="whether the covariance rests on the residuals")
     threshold_mm: float | None = Key(description="inliers are nearer than this; null by least squares")
-    inlier_errors: Annotated[ErrorFigures, Keys()] = Key(description=f"lengths of the inliers' residuals: {FIGURES}")
-    held_out: Annotated[HeldOutPoints, Keys()] | None = Key(
+    inlier_errors: Annotated[ErrorFigures, Named()] = Key(description=f"lengths of the inliers' residuals: {FIGURES}")
+    held_out: Annotated[HeldOutPoints, Named()] | None = Key(
         description=f"`folds`; `rows` and `error_mm` of each point tried; {FIGURES} `of_inliers` and `of_all`"
     )
     ambiguous: bool = Key(description="whether `alternative` is about as good")
-    alternative: Annotated[Alternative, Keys()] | None = Key(
+    alternative: Annotated[Alternative, Named()] | None = Key(
         description="another transform that other points agree on: `b_from_a`, `rows`, `apart_mm` (RMS), `turn_rad`"
     )
     notes: list[str] = Key(description="what to look at")
@@ -334,7 +334,7 @@ class RegistrationFile(ResultFile):
         "points and a quarter beyond), `error_mm` to expect of b − b_from_a a there, frame b, and its `sigma_mm` per "
         "axis"
     )
-    cubes: Annotated[Cubes, Keys()] | None = Key(
+    cubes: Annotated[Cubes, Named()] | None = Key(
         description="null with too few points: `middle` in a and `sides_mm` of cubes along the axes of a; in row i and "
         f"column j of `errors`: {FIGURES} of the fit in cube i at the points of cube j that are not in cube j − 1; "
         "points that the fit used are held out in turn"

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
-from stcal.io.json import ByFace, Keys, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
+from stcal.io.json import ByFace, Named, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
 from tests.outcome import fails_with
 
 
@@ -133,8 +133,8 @@ class Found:
 
 
 class WithKeys(ResultFile):
-    every: Annotated[Fit, Keys()]
-    named: Annotated[Found, Keys("names fit.share fit.worst")]
+    every: Annotated[Fit, Named()]
+    named: Annotated[Found, Named("names fit.share fit.worst")]
 
 
 def test_an_object_of_a_file_holds_named_attributes_of_a_result_or_all_its_fields():

@@ -150,10 +150,14 @@ def test_the_report_says_what_the_files_say(calibrated):
             assert f"{value:.4f}" in html.replace("−", "-")
 
 
-def test_the_verdict_is_the_first_line_and_the_answer_is_short(calibrated):
-    lines = calibrated.text.splitlines()
-    assert lines[0].startswith("May I use it? ")
-    assert len(lines) <= 20 or calibrated.out.parent.name.startswith("small")
+def test_the_verdict_is_the_first_line(calibrated):
+    assert calibrated.text.startswith("May I use it? ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("calibrated", ["sample"], indirect=True)
+def test_what_the_sample_prints_is_seen_at_a_glance(calibrated):
+    assert len(calibrated.text.splitlines()) <= 20
 
 
 def test_detections_are_where_the_truth_has_them(calibrated):

@@ -116,7 +116,7 @@ def scene(seed, *args, **options) -> PointPairScene:
 
 
 def parameter_error(found: Transform, truth: Transform) -> np.ndarray:
-    """The step (p,) from truth to found: that of :func:`~stcal.register.transforms.unit_covariance`."""
+    """The step (p,) from truth to found: that of :meth:`~stcal.register.transforms.Problem.unit_covariance`."""
     (linear, translation), (true_linear, true_translation) = parts(found), parts(truth)
     if not isinstance(found, Affine):
         scale = np.cbrt(np.linalg.det(linear) / np.linalg.det(true_linear))

@@ -34,7 +34,8 @@ def test_light_falls_off_and_glares():
     assert columns[100] == pytest.approx(64.5 * 255 / 256, rel=0.005)
     assert columns[199] / columns[0] == pytest.approx(4, rel=0.02)
     (spot,) = expose(photograph, [1.0], Light(glare=0.5, glare_at=(0.25, 1.0), glare_radius=0.1))
-    assert spot[195:206, 45:56].mean() - columns[100] == pytest.approx(127.5, rel=0.1)
+    near = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 20.0**2)).mean() ** 2  # of the Gaussian's peak, over 11 × 11 px
+    assert spot[195:206, 45:56].mean() - columns[100] == pytest.approx(127.5 * near, rel=0.01)
     assert spot[195:206, 145:156].mean() == pytest.approx(columns[100], rel=0.005)
 
 

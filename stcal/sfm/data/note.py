@@ -1,5 +1,7 @@
 """Remarks on a run: sentences that carry what programs decide by, so that nothing reads them but people."""
 
+from stcal.errors import StcalError
+
 NOT_AS_DRAWN = "not-as-drawn"
 """Faces are not where the design, or the names of groups, have them."""
 GROUP_LEFT_OUT = "group-left-out"
@@ -34,10 +36,9 @@ class Note(str):
         return str(self)
 
     @classmethod
-    def of_group(cls, group: str, error: Exception) -> "Note":
+    def of_group(cls, group: str, error: StcalError) -> "Note":
         """Returns the note on a group that an error leaves out."""
-        words, _, remedy = str(error).partition("; ")
-        return cls(words, GROUP_LEFT_OUT, group, remedy)
+        return cls(error.fault, GROUP_LEFT_OUT, group, error.remedy)
 
 
 def lost_groups(notes) -> list[str]:

@@ -231,7 +231,7 @@ class Setup:
     frame: FrameKind
     flatness_mm: float | None
     prior: CameraPrior | None  # of the intrinsics, None if they are fixed
-    common: float  # see :func:`stcal.sfm.adjust.joint.covariance_of`
+    common: float  # see :func:`stcal.sfm.adjust.joint.adjusted`
     sigma0: float = 1.0  # factor on all σ
     rims_mm2: np.ndarray | None = None  # (3c, 3c) by the heights of rims, which no view changes, None if not estimated
     stands_for: float = 1.0  # dots of the board for which each dot of the models stands

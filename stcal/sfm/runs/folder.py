@@ -34,7 +34,19 @@ from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
-from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, plots, require_pdf
+from stcal.report.document import (
+    Answer,
+    Document,
+    Notes,
+    Section,
+    Table,
+    links,
+    macro,
+    pdf_of,
+    plots,
+    require_pdf,
+    sentence,
+)
 from stcal.report.text import join
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, detections_csv
@@ -94,7 +106,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     except StcalError as error:
         if page:
             found = found_in_all(seen.labelled)
-            save(stage / "report.html", _page_on_failure(task.target.name, str(error), found, seen))
+            save(stage / "report.html", _page_on_failure(task.target.name, error, found, seen))
             error.append(f"; {found}")
         raise
 
@@ -264,7 +276,7 @@ def _corrected_px(models: Mapping[str, GroupModel], observations: Sequence[Image
     return list(corrected.values())
 
 
-def _page_on_failure(name: str, error: str, found: str, seen: DetectedImages) -> str:
+def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows = []
     for each in seen.labelled:
@@ -275,11 +287,10 @@ def _page_on_failure(name: str, error: str, found: str, seen: DetectedImages) ->
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
     shown = [macro("plot", place, image, image) for place, image in overlays[:FIRST_IMAGES]]
     sections = [
-        Section("What is wrong", [*error.split("; ")]),
+        *([Section("What to do", [sentence(error.remedy)])] if error.remedy else []),
         Section("What was found", [found, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in seen.detection.skipped])]),
         Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
     ]
-    answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
-    return Document(name, f"{len(rows)} images, no calibrated target", sections, [answer]).page()
+    return Document(name, f"{len(rows)} images, no calibrated target", sections, [Answer("no", error.fault)]).page()
