@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, rms
 from stcal.io.table import QUATERNION, csv_text
 from stcal.report.document import (
+    Answer,
     Block,
     Document,
     Section,
@@ -210,14 +211,18 @@ def compensation_report(result: Compensated) -> Document:
     counts = ", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status))
     joints = [name.replace("_", " ") for name in joint_columns(robot)]
     heads = ["line", *(["<target"] if any(result.targets.tools) else []), "<status", "<", *joints, "error mm"]
+    reached, *summary = compensated_summary(result)
+    usable = result.found.usable
+    answer = Answer("yes" if usable.all() else "part" if usable.any() else "no", reached)
     return Document(
         f"Compensation of {robot.name}",
         f"{len(result)} poses: {counts}",
         [
-            Section("Result", compensated_summary(result), terminal=True),
+            Section("Result", summary, terminal=True),
             Section("To know", [bullets(result.remarks[:MOST_NOTES])]),
             Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
         ],
+        [answer],
     )
 
 

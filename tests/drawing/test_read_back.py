@@ -20,7 +20,7 @@ from stcal.drawing.sheets import one_sheet
 from stcal.geometry.plane import apply_homography
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.detect.labelling import label_images, label_single  # noqa: F401
+from stcal.sfm.detect.labelling import label_single
 from stcal.synthetic.designs import second_design
 from tests.drawing.raster import camera_of, obliquely, page_image, pages_of, pixel_from_page, shapes_of
 from tests.support.circle_images import area_and_centroid
