@@ -8,10 +8,11 @@ import json
 import os
 import re
 import sys
+import threading
 import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from io import StringIO
 from pathlib import Path
@@ -23,7 +24,8 @@ from stcal.io import files
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-LINE_EVERY_S = 5.0
+LINE_EVERY_S = 2.0
+"""Longest silence of a command at work, s."""
 LEFT_FROM_S = 2.0
 """Shortest remaining time that a stage shows, s."""
 STANDARD_OUTPUT = Path("-")
@@ -33,15 +35,21 @@ _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 
 _quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
 _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
+_beating: ContextVar["_Beat | None"] = ContextVar("_beating", default=None)
 
 
 @contextmanager
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
     """Sets the verbosity within the context: warnings and errors only, or more than usual."""
-    tokens = _quiet.set(quiet), _verbose.set(verbose)
+    beat = _Beat()
+    tokens = _quiet.set(quiet), _verbose.set(verbose), _beating.set(beat)
+    if not quiet:
+        beat.start()
     try:
         yield
     finally:
+        beat.over.set()
+        _beating.reset(tokens[2])
         _quiet.reset(tokens[0])
         _verbose.reset(tokens[1])
 
@@ -51,12 +59,33 @@ def verbose() -> bool:
     return _verbose.get()
 
 
+class _Beat(threading.Thread):
+    """Says what a command is at, and for how long, before ``LINE_EVERY_S`` pass in silence."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.over, self.stream, self.said = threading.Event(), sys.stderr, True
+        self.stage, self.began = "working", time.perf_counter()
+
+    def at(self, stage: str) -> None:
+        """Notes what the command is at."""
+        if stage != self.stage:
+            self.stage, self.began = stage, time.perf_counter()
+
+    def run(self) -> None:
+        while not self.over.wait(LINE_EVERY_S / 2):
+            if not self.said:
+                with suppress(ValueError, OSError):  # nobody reads the stream any more
+                    print(f"{self.stage}: {time.perf_counter() - self.began:.0f} s", file=self.stream, flush=True)
+            self.said = not self.said
+
+
 class StageProgress:
     """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else plain lines, or
     quiet."""
 
     def __init__(self):
-        self.bar = None
+        self.bar, self.beat = None, _beating.get() or _Beat()
         self.tasks: dict[str, TaskID] = {}
         self.last = 0.0
         self.began: dict[str, float] = {}
@@ -70,6 +99,7 @@ class StageProgress:
 
     def __enter__(self) -> "StageProgress":
         if self.bar:
+            self.beat.over.set()  # the bar has a clock
             self.bar.start()
         return self
 
@@ -87,12 +117,14 @@ class StageProgress:
             return
         now = time.monotonic()
         began = self.began.setdefault(stage, now)
+        self.beat.at(stage if done < total else "working")
         if done == total or (done and (now - self.last > LINE_EVERY_S or _verbose.get())):
             self.last = now
             suffix = time_left(now - began, done, total)
             if _verbose.get() and done == total:
                 suffix = f" in {now - began:.1f} s"
             print(f"{stage}: {done} of {total}{suffix}", file=sys.stderr, flush=True)
+            self.beat.said = True
 
 
 def time_left(taken_s: float, done: int, total: int) -> str:
