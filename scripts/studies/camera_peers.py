@@ -10,18 +10,12 @@ wants them.
 
 `with the target` : `run --refine-camera` on the same photographs, from the camera of `calibrate-camera` without its σ:
 the target's circles stand where the board's dots do not reach. `mrcal, free` : without its regularization.
-
-With --real, photographs of which no truth is known: each view is foretold by a calibration without it, five parts.
-Judged alike are all cameras: board and poses of the other views are adjusted to each camera, and then the pose of the
-view that was held out; told is the RMS of what is left of it, px per coordinate; bold by the views' differences.
 """
 
-import argparse
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +25,8 @@ import pycolmap
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_file import board_of, load_flat_board
+from scripts.runner import options_of
+from stcal.boards.board_file import board_of
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
@@ -40,11 +35,10 @@ from stcal.io.cameras.camera_model import CameraModel, camera_from_colmap
 from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import run
-from stcal.sfm.camera.calibrate import FOLDS, calibrate_camera, foretold
+from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera, start_pose
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 SIZE = 2592, 1728
@@ -54,29 +48,6 @@ NOISE_PX = 0.02
 MODEL, MRCAL_MODEL = "OPENCV", "LENSMODEL_OPENCV4"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "stereo_target"
 SETS = ("clean", "clutter", "white_block")
-REAL = {
-    "dotgrid_handeye/images": """rows = 10
-columns = 10
-pitch_mm = 20.0
-radius_mm = 5.0
-polarity = "dark"
-sigma_mm = 0.1
-[corner]
-row = 9
-column = 0
-radius_mm = 10.0
-""",
-    "charuco_handeye/test_set_charuco/images": """type = "charuco"
-rows = 7
-columns = 5
-square_mm = 36.195
-marker_mm = 18.256
-dictionary = "DICT_6X6_250"
-""",
-}
-"""Folders of photographs, and their boards."""
-WRONG_TIMES = 5.0
-"""Dots that are so many times the median off by every camera are measured wrongly."""
 
 
 def boards() -> dict[str, tuple[BoardDesign, float, float]]:
@@ -257,72 +228,9 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
     return f"| {name} | {len(trials)} | " + " | ".join(cells) + " |"
 
 
-def photographed(folder: Path, board_toml: str) -> tuple[list[ImageObservations], BoardDesign, tuple[int, int]]:
-    """Complete views of a board of dots or corners, the board, and the images' size."""
-    with tempfile.TemporaryDirectory() as scratch:
-        file = Path(scratch) / "board.toml"
-        file.write_text(board_toml)
-        board = load_flat_board(file)
-    if isinstance(board, BoardDesign):
-        found, grid = calibrate_camera(folder, target_of(None), board, MODEL), board
-    else:
-        found, grid = calibrate_camera_by_corners(folder, board, MODEL), corner_grid(board)
-    camera, most = found.intrinsics.camera, max(map(len, found.views))
-    return [view for view in found.views if len(view) == most], grid, (camera.width, camera.height)
-
-
-def left(camera: Camera | None, others: Sequence, own: Sequence, board: BoardDesign) -> np.ndarray:
-    """Residuals (n, 2) of views that were held out, px; not a number without a camera."""
-    if camera is None:
-        return np.full((sum(map(len, own)), 2), np.nan)
-    result = adjust_intrinsics(others, board, camera, MODEL, held=True)
-    return np.concatenate([foretold(view, board, result)[0] for view in own])
-
-
-def real_row(name: str, board_toml: str) -> str:
-    """RMS of each way on views held out; the least, and what is as small, in bold."""
-    views, board, size = photographed(DATA.parent / name, board_toml)
-    found: dict[str, list[np.ndarray]] = {way: [] for way in WAYS}
-    for fold in range(FOLDS):
-        own = [view for i, view in enumerate(views) if i % FOLDS == fold]
-        others = [view for i, view in enumerate(views) if i % FOLDS != fold]
-        for way, calibrate in WAYS.items():
-            found[way].append(left(calibrate(others, board, size), others, own, board))
-    residuals = {way: np.concatenate(each) for way, each in found.items()}
-    length = np.array([np.linalg.norm(each, axis=1) for each in residuals.values() if np.isfinite(each).all()])
-    wrong = (length > WRONG_TIMES * np.median(length)).all(axis=0)
-    # views are complete, in the order of the folds, and alike in points
-    view = np.repeat(np.arange(len(views)), len(wrong) // len(views))[~wrong]
-    squares = {
-        way: np.bincount(view, (each[~wrong] ** 2).mean(axis=1)) * (len(views) / len(view))
-        for way, each in residuals.items()
-    }
-    best = min((each for each in squares.values() if np.isfinite(each).all()), key=np.mean)
-    cells = []
-    for each in squares.values():
-        bold = "**" if as_near(each, best) else ""
-        cells.append(f"{bold}{np.sqrt(each.mean()):.4f}{bold}" if np.isfinite(each).all() else "–")
-    count = f"{len(views)} views, {len(wrong)} points, {int(wrong.sum())} of them wrong"
-    return f"| {name.split('/')[0]}: {count} | {' | '.join(cells)} |"
-
-
-def real() -> None:
-    """Photographs without truth."""
-    print(f"| px RMS of views held out | {' | '.join(WAYS)} |")
-    print("|---|" + "---|" * len(WAYS))
-    for name, board_toml in REAL.items():
-        print(real_row(name, board_toml), flush=True)
-
-
 def main() -> None:
     """Simulate, calibrate, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=60)
-    parser.add_argument("--real", action="store_true", help="photographs without truth instead")
-    options = parser.parse_args()
-    if options.real:
-        real()
-        return
+    options = options_of(__doc__, trials=60)
     print(f"| px RMS over the image (where dots are) | trials | {' | '.join(COLUMNS)} |")
     print("|---|" + "---|" * (len(COLUMNS) + 1))
     peers = WAYS | {FREE: by_free_mrcal}
