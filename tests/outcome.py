@@ -9,7 +9,8 @@ import pytest
 from stcal.errors import StcalError
 
 INPUT, COMPUTATION, INTERRUPTED = 2, 3, 130
-_PROGRESS = re.compile(r"\w+: \d+ of \d+(, about \d+ (s|min) left)?")
+PROGRESS = re.compile(r"(\S+: )?[\w, ]+: (\d+ of \d+(, about \d+ (s|min) left)?|\d+ s)")
+"""A line on what a command is at."""
 
 
 class Outcome(tuple):
@@ -53,7 +54,7 @@ def refuses(error: str, function: Callable, *arguments, **options) -> None:
 
 
 def lines_of(stderr: str) -> list[str]:
-    return [line for line in stderr.splitlines() if not _PROGRESS.fullmatch(line)]
+    return [line for line in stderr.splitlines() if not PROGRESS.fullmatch(line)]
 
 
 def assert_error(outcome, code: int, *parts: str) -> str:

@@ -25,7 +25,7 @@ YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)
 
 
 DEEPEST = 60
-DEEP = re.compile(rf"""(?:[\w"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}""")
+DEEP = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}""")
 """A dotted name of more parts than any table needs."""
 
 

@@ -5,7 +5,6 @@ import csv
 import hashlib
 import json
 import os
-import re
 import shutil
 import signal
 import sys
@@ -21,6 +20,7 @@ from pathlib import Path
 from stcal.cli.main import MESSAGE_CHARACTERS
 from stcal.io.files import RUN_ENTRIES
 from tests.commands import PROGRAMS, Call
+from tests.outcome import PROGRESS
 from tests.shared import own_copy, without_rights
 
 LONGEST_S = 60.0
@@ -33,7 +33,6 @@ FAILED_CHECKS = 4
 """Of a run whose results are written, and not to be used."""
 EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
-_PROGRESS = re.compile(r"(\S+: )?[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
 _NO_POSE = "no pose accepted"
 """Said on standard output with exit code 3 by a command that has done its work."""
 
@@ -59,7 +58,7 @@ class TooLong(BaseException):
 
 
 def lines_of(err: str) -> list[str]:
-    return [line for line in err.split("\n") if line and not _PROGRESS.fullmatch(line)]
+    return [line for line in err.split("\n") if line and not PROGRESS.fullmatch(line)]
 
 
 def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path, Path]:
@@ -236,8 +235,8 @@ def _ending(outcome: Outcome, refused: bool) -> Iterator[tuple[str, str]]:
 
 def _printed(outcome: Outcome) -> Iterator[tuple[str, str]]:
     lines = lines_of(outcome.err)
-    if outcome.code == 0 and lines:
-        yield "noise", lines[0][:300]
+    if outcome.code == 0 and (noise := [line for line in lines if not line.startswith("warning: ")]):
+        yield "noise", noise[0][:300]
     done = outcome.code == 3 and not lines and _NO_POSE in outcome.out
     if outcome.code and not done and (len(lines) != 1 or not lines[0].startswith("error: ")):
         yield "not one line", f"{len(lines)}: " + " | ".join(line[:150] for line in lines[:4])
