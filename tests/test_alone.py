@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import stcal
-from stcal.alone import fault
+from stcal.errors import fault
 
 
 def test_a_package_by_itself_is_no_fault(tmp_path):

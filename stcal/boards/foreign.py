@@ -13,7 +13,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
-from stcal.io.poses.rotations import of_quaternions
+from stcal.io.rotations import of_quaternions
 from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
 from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM
 

@@ -96,7 +96,7 @@ def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
     ``fit`` : whether the fit is what is used, so that its quality is printed, or the lens itself.
     """
     from stcal.io.cameras.difference import SizedLens, load_lens
-    from stcal.io.cameras.photograph import SIGMA_FOCAL
+    from stcal.io.cameras.read import SIGMA_FOCAL
     from stcal.report.camera_figures import fitted_text
 
     sides = size.lower().split("x") if size else ["0", "0"]

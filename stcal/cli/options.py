@@ -35,8 +35,7 @@ class Opt:
     """An option: what its help text and its parameter do not state.
 
     ``name`` : its names, ``--held-out`` for ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes``
-    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value in the help text, and
-    variable that sets it.
+    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value, and variable that sets it.
     """
 
     name: str = ""
@@ -57,18 +56,12 @@ WRITES = Opt(writes=True)
 """An option with the name of a file that is written."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arg:
-    """An argument: a parameter without the name of an option; fields as of :class:`Opt`."""
+class Arg(Opt):
+    """An argument, a parameter without the name of an option: ``name`` is the word for its value."""
 
-    metavar: str | None = None
-    min: float | None = None
-    max: float | None = None
-    writes: bool = False
-
-    def info(self, _: str, text: str) -> Any:
+    def info(self, parameter: str, text: str) -> Any:
         """Returns Typer's form of the argument."""
-        return typer.Argument(metavar=self.metavar, help=text, min=self.min, max=self.max, writable=self.writes)
+        return typer.Argument(metavar=self.name or None, help=text, min=self.min, max=self.max, writable=self.writes)
 
 
 def declared(parameter: inspect.Parameter) -> inspect.Parameter:
@@ -194,7 +187,7 @@ def several_tables(
 
 def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
-    from stcal.io.poses.programs import require_form
+    from stcal.io.transforms import require_form
 
     exports = []
     for word in words:
@@ -226,25 +219,27 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
     """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
     command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
     others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
-    said = f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them"
-    _require(strict, said, report, bool(failed), verdict or f"failed: {', '.join(failed)}" * bool(failed))
+    said = [f"--strict: failed: {', '.join(failed[:2])}{others}"] * bool(failed)
+    require_usable(strict, said, report, verdict or f"failed: {', '.join(failed)}" * bool(failed), remedy="")
 
 
 def require_usable(
-    strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "", but: str = "do not use them"
+    strict: bool,
+    reasons: Sequence[str],
+    page: Path | None = None,
+    verdict: str = "",
+    but: str = "do not use them",
+    remedy: str = "; --no-strict ends with 0",
 ) -> None:
     """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given;
-    otherwise a quiet command writes ``verdict``, or the reasons. ``but`` : ends what is said of the results, which are
-    written."""
-    said = f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0"
-    _require(strict, said, page, bool(reasons), verdict or "; ".join(reasons))
-
-
-def _require(strict: bool, said: str, page: Path | None, failed: bool, verdict: str) -> None:
-    if strict and failed:
-        raise ChecksFailed("E-CHECKS-FAILED", said + (f"; see {page}" if page else ""))
-    if verdict:
-        warn_if_quiet(verdict)
+    otherwise a quiet command writes ``verdict``, or the reasons. ``but``, ``remedy`` : end the message, after that the
+    results are written."""
+    said = "; ".join(reasons)
+    if strict and reasons:
+        see = f"; see {page}" if page else ""
+        raise ChecksFailed("E-CHECKS-FAILED", f"{said}; results are written, {but}{remedy}{see}")
+    if verdict or said:
+        warn_if_quiet(verdict or said)
 
 
 def load_ahead(workers: int | None) -> None:
@@ -338,15 +333,9 @@ def _protected(command: Callable) -> Callable:
         camera_name: str = "",
         **given,
     ):
-        paths = [
-            (name, path)
-            for name, value in given.items()
-            for path in (value if isinstance(value, list | tuple) else [value])
-            if isinstance(path, Path)
-        ]
-        written, read = (
-            [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
-        )
+        values = {name: value if isinstance(value, list | tuple) else [value] for name, value in given.items()}
+        paths = [(name, path) for name, several in values.items() for path in several if isinstance(path, Path)]
+        written, read = ([(words[n], p) for n, p in paths if (n in outputs) is out] for out in (True, False))
         exports = (word.partition("=")[2] for word in given.get("export") or ())
         written += [("--export", Path(path)) for path in exports if path]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
@@ -422,8 +411,7 @@ def designs_told(
 
     assumed = []
     if target is not None:
-        design = target_of(target)
-        print_each("note", likeness_notes(design))
+        print_each("note", likeness_notes(design := target_of(target)))
         with_board = with_board and not design.has_scale
     elif with_target:
         faces = reference_target().faces

@@ -38,12 +38,12 @@ _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
 @contextmanager
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
     """Sets the verbosity within the context: warnings and errors only, or more than usual."""
-    tokens = _quiet.set(quiet), _verbose.set(verbose)
+    tokens = [(choice, choice.set(given)) for choice, given in ((_quiet, quiet), (_verbose, verbose))]
     try:
         yield
     finally:
-        _quiet.reset(tokens[0])
-        _verbose.reset(tokens[1])
+        for choice, token in tokens:
+            choice.reset(token)
 
 
 def verbose() -> bool:
@@ -105,13 +105,11 @@ def time_left(taken_s: float, done: int, total: int) -> str:
 
 def printable(text: str) -> str:
     """Returns the text with white space as a space, and other unprintable characters as question marks."""
-    return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
 
+    def shown(c: str) -> str:
+        return c if c.isprintable() or c == "\n" or unicodedata.category(c) == "Zs" else " " if c.isspace() else "?"
 
-def _instead(character: str) -> str:
-    if unicodedata.category(character) == "Zs":
-        return character
-    return " " if character.isspace() else "?"
+    return "".join(map(shown, text))
 
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
@@ -158,11 +156,17 @@ def write(path: Path, content, said: str = "written") -> None:
 
 
 def write_out(text: str) -> None:
-    """Writes JSON to standard output, which is reserved for it."""
+    """Writes JSON to standard output, which is reserved for it, with ``\\u....`` for characters that a terminal would
+    execute, or that its encoding lacks."""
     taker = _taker.get() or sys.stdout
     if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
         raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
-    taker.write(_escaped(text, taker.encoding or "ascii"))
+    is_utf8 = (taker.encoding or "ascii").lower().replace("-", "") == "utf8"
+
+    def escaped(c: re.Match) -> str:
+        return c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1]
+
+    taker.write(re.sub(r"[^ -~\n]", escaped, text))
     taker.flush()
 
 
@@ -170,12 +174,6 @@ def write_if(path: Path | None, content: Callable[[], object], said: str = "writ
     """Writes the result of ``content`` if a path is given; otherwise ``content`` is not called."""
     if path:
         write(path, content(), said)
-
-
-def _escaped(text: str, encoding: str) -> str:
-    """Returns JSON with ``\\u....`` for characters that a terminal would execute, or that the encoding lacks."""
-    is_utf8 = encoding.lower().replace("-", "") == "utf8"
-    return re.sub(r"[^ -~\n]", lambda c: c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
 
 
 def warn(line: object) -> None:

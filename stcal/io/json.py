@@ -16,9 +16,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandle
 from pydantic_core import PydanticCustomError, core_schema
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import OF_POINT, OF_POSE, Rows, frozen, require_covariance
 from stcal.geometry.rigid import Rigid
-from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
 from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, require_unchanged, text_of
 
 LONGEST = 80

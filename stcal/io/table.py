@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import ByValue
+from stcal.geometry.arrays import OF_POSE, TWIST, ByValue, Rows, first_fault
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
-from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}

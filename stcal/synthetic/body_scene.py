@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.cells import black_areas, clear_mm
+from stcal.boards.board_designs import black_areas, clear_mm
 from stcal.boards.target_file import save_target
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError

@@ -32,8 +32,7 @@ from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_hom
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
-from stcal.io.image_jobs import run_on_images
-from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit
+from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit, run_on_images
 from stcal.labels import DotLabel
 from stcal.locate.layout_calibration import CalibrationImages
 from stcal.parallel import Progress, one_thread

@@ -11,7 +11,7 @@ from stcal.boards.board_designs import (
     ChessboardDesign,
 )
 from stcal.boards.board_file import load_flat_board
-from stcal.boards.several import load_boards
+from stcal.boards.target_file import load_boards
 from stcal.errors import InputError
 
 APRILGRID = 'type = "aprilgrid"\nrows = 6\ncolumns = 7\ntag_mm = 80.0\nspacing = 0.3\n'

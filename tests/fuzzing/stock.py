@@ -12,8 +12,7 @@ from stcal.boards.target_file import target_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.forms import written
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, written
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml

@@ -9,8 +9,7 @@ import pytest
 from stcal.cli.cameras import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.forms import SUFFIXES, WRITERS, written
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import SUFFIXES, WRITERS, read_camera, written
 from tests.outcome import fails_with
 
 LENSES = {

@@ -12,8 +12,7 @@ import pytest
 from stcal.errors import InputError, InputNote
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.forms import name_to_write
-from stcal.io.cameras.read import camera_chosen, read_camera, read_lens
+from stcal.io.cameras.read import camera_chosen, name_to_write, read_camera, read_lens
 from tests.io.camera_files import (
     CAMERA_INFO,
     D4,

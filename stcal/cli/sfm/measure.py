@@ -148,7 +148,7 @@ def calibrate_camera(
     from stcal.design import BoardDesign
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.read import save_camera
-    from stcal.io.video import images_or_frames
+    from stcal.io.device import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.camera_report import calibration_file, calibration_report
     from stcal.workflows.board_views import calibrate_camera_by_corners

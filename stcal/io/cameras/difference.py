@@ -12,8 +12,7 @@ from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, 
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
-from stcal.io.cameras.read import read_lens, sized_camera
+from stcal.io.cameras.read import camera_of_photograph, is_photograph, read_lens, sized_camera
 
 CELLS = 24
 """Number of grid points along the shorter side of the image."""

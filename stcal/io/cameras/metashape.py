@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Rows, require_covariance
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv
 from stcal.io.cameras.foreign_lenses import ForeignLens, one_of, refused, require_finite
 from stcal.io.cameras.keys import pass_over, require_known
-from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 MORE_NAMES = ("p3", "p4")

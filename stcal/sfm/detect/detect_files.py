@@ -20,7 +20,6 @@ from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, keep_packed, kept, made_by, packed
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
     ImageFile,
@@ -31,6 +30,7 @@ from stcal.io.images import (
     grey_of,
     name_fault,
     require_common_size,
+    run_on_images,
     same_photograph,
     size_fault,
     thumbnail,

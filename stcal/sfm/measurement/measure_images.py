@@ -20,8 +20,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
-from stcal.io.image_jobs import run_on_images
-from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey
+from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey, run_on_images
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.data.group_model import ImageObservations, by_group

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.columns import fixed
+from stcal.io.rotations import fixed
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 """Arguments of ROS 2's ``static_transform_publisher``."""
