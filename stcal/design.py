@@ -28,10 +28,8 @@ class PrintedPattern(Protocol):
         ...
 
 
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-DOTS_SIGMA_MM = 0.005
-"""σ of the places of a board's dots where its file states none, mm per axis."""
+MIN_SINE = 0.02  # smallest sine of the angle between the X and Y circles as seen from the origin circle
+DOTS_SIGMA_MM = 0.005  # σ of the places of a board's dots where its file states none, mm per axis
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -95,7 +93,6 @@ class FaceDesign(Brief):
             freeze(self, "rim_mm", (len(self.ids),), f"face {self.id}: rims")
 
     def _require_possible(self) -> None:
-        """Refuses circles that occur twice or overlap, and frame circles that give no frame."""
         where, ids, xy, radius = f"face {self.id}", self.ids, self.xy_mm, self.radius_mm
         frame = self.origin, self.x, self.y
         _require_different(ids, f"{where}: circle id")
@@ -470,8 +467,7 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     return ScaleReference(**(known or none), faces=faces, distances=target.distances)
 
 
-DRAWN_SIGMA = 1e-7
-"""Relative σ of the drawn distance that defines the unit where no size is known."""
+DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit where no size is known
 
 
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:

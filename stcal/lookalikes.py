@@ -9,13 +9,10 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
-MAX_GAP = 0.5
-"""Largest distance of two circles' centres, in radii, at which the circles coincide."""
-MAX_RADIUS_RATIO = 1.3
-"""Largest ratio of two circles' radii at which the circles coincide."""
+MAX_GAP = 0.5  # largest distance of two circles' centres, in radii, at which the circles coincide
+MAX_RADIUS_RATIO = 1.3  # largest ratio of two circles' radii at which the circles coincide
 MIN_COMMON = 4
-BLOCK = 4000
-"""Number of motions tested together, which bounds the memory for patterns of many circles."""
+BLOCK = 4000  # number of motions tested together, which bounds the memory for patterns of many circles
 MOST_CIRCLES = 100
 """Largest number of circles of a pattern that is compared as a whole; larger ones take minutes."""
 

@@ -160,8 +160,6 @@ def hand_over(
 
 
 class _Processes:
-    """Pool of processes that starts with the first job and ends with the context."""
-
     def __init__(self, workers: int):
         self.workers = workers
         self._others = multiprocessing.active_children()

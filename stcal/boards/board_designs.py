@@ -135,10 +135,8 @@ class TagLayout(Distinct, Brief):
     unusual_size : bool
         True if unusually long or short sides are not a mistake of units.
 
-    Raises
-    ------
-    InputError
-        Tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that are not mm.
+    Raises InputError: tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that
+    are not mm.
     """
 
     tags: tuple[tuple[str, int], ...]
@@ -179,10 +177,7 @@ class TagLayout(Distinct, Brief):
         sigma_mm : float
             σ of a corner's coordinate, mm.
 
-        Raises
-        ------
-        InputError
-            A value is not finite, a size is not positive, or a tag is unknown or occurs twice.
+        Raises InputError: a value is not finite, a size is not positive, or a tag is unknown or occurs twice.
         """
         n = len(ids)
         middle = frozen(xy_mm, (n, 2), "tags' middles")
@@ -358,8 +353,7 @@ FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | Asy
 
 TAG_SIGMA_MM = 0.05
 """σ of a corner of a tag if its file states none: print on paper that is glued on."""
-PLACE_DIGITS = 6
-"""Decimals, mm, to which the places of points are the same row or column."""
+PLACE_DIGITS = 6  # decimals, mm, to which the places of points are the same row or column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -560,7 +554,6 @@ def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.
 
 
 def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
-    """Return the small squares at the tags' corners."""
     gap = board.spacing * board.tag_mm
     step, cells = board.tag_mm + gap, product(range(board.rows + 1), range(board.columns + 1))
     return [[np.array([column * step - gap, -row * step]) + gap * SQUARE] for row, column in cells]

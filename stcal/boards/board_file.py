@@ -176,7 +176,6 @@ def _form(word: str, design: type, number: Any, **more: Any) -> type[Sized]:
 
 
 def _grid(design: type[FlatBoard], data: Any, where: str) -> FlatBoard:
-    """Return a board of squares, of tags in rows or of circles, with sizes and tags that are possible."""
     keys = data.model_dump(exclude={"type", "unusual_size", "diameter_mm"})
     if issubclass(design, AsymmetricCirclesDesign):
         if (data.radius_mm is None) == (data.diameter_mm is None):
@@ -337,8 +336,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "hexagonal-circles": (HexagonalCirclesDesign, Count),
 }
 """Design of each kind of board by its word in files, and the type of its numbers of rows and columns."""
-TYPES = {design: word for word, (design, _) in KINDS.items()}
-"""The word of each kind of board in files."""
+TYPES = {design: word for word, (design, _) in KINDS.items()}  # the word of each kind of board in files
 _OF_CIRCLES = dict.fromkeys(("radius_mm", "diameter_mm"), (MaybeLength, None))
 READERS: Mapping[str, tuple[type[Strict], Callable[..., BoardDesign | FlatBoard]]] = {"circles": (_Dots, _dots)} | {
     word: (TagsFile, _tags)
@@ -400,10 +398,8 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
     BoardDesign or another board design
         Board frame, mm.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable, invalid for its kind, or of several boards; the message names file, place and reason.
+    Raises InputError: the file is unreadable, invalid for its kind, or of several boards; the message names file, place
+    and reason.
     """
     return design_of(path, board_content(path))
 
@@ -435,10 +431,7 @@ def load_board(path: str | Path) -> BoardDesign:
     BoardDesign
         Board frame, mm.
 
-    Raises
-    ------
-    InputError
-        As :func:`load_flat_board`; or its circles have no radius.
+    Raises InputError: as :func:`load_flat_board`; or its circles have no radius.
     """
     board = load_flat_board(path)
     if isinstance(board, BoardDesign):
@@ -457,7 +450,6 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
 
 
 def _lengths(board: FlatBoard) -> list[Length]:
-    """Return the lengths of a board by which the unit of its file is judged."""
     if isinstance(board, TagLayout):
         return [side("side of a tag", float(mm)) for mm in sides_mm(board.corners_mm)]
     if isinstance(board, AsymmetricCirclesDesign):

@@ -179,18 +179,13 @@ LEAST_SCATTER_PX = 0.05
 GATE = 5.0
 """Largest deviation of a corner from the prediction by its neighbours, in robust σ of the view or, if larger, of the
 neighbours themselves, as of a bent board."""
-SMOOTHING_PX = 0.8
-"""σ of the smoothing before gradients are taken."""
-ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2
-"""Area of pixels that smoothing makes alike, px²."""
-LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 30
-"""Limits of half the side of a window, px."""
-STEPS, SETTLED_PX = 20, 1e-3
-"""Most steps of a corner's measurement, and the step at which it ends, px."""
+SMOOTHING_PX = 0.8  # σ of the smoothing before gradients are taken
+ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2  # area of pixels that smoothing makes alike, px²
+LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 30  # limits of half the side of a window, px
+STEPS, SETTLED_PX = 20, 1e-3  # most steps of a corner's measurement, and the step at which it ends, px
 WIDEST_EDGE, MOST_FROM_SADDLE = 0.4, 0.25
 """Largest σ of an edge's blur, and distance of the edges' point from the saddle, in half sides of the window."""
-NOISE = 1e-6
-"""Keeps the equations of a blank window regular."""
+NOISE = 1e-6  # keeps the equations of a blank window regular
 LEAST_SIGMA_PX = 0.02
 """Smallest σ of a corner: below it printing, flatness and the lens limit its accuracy, not noise."""
 

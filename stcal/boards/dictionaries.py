@@ -12,8 +12,7 @@ import numpy as np
 
 from stcal.errors import InputError
 
-OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
-"""Families of AprilTag that OpenCV detects."""
+OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")  # families of AprilTag that OpenCV detects
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,6 @@ def dictionary_of(name: str):
 
 
 def _of_apriltag(name: str) -> str:
-    """Return the name of a family that OpenCV lacks, if it can be detected; errors as :func:`known_dictionary`."""
     instead = f"print tags of {', '.join(OF_OPENCV)}"
     unread = "OpenCV does not detect this family of AprilTag"
     if name in TOO_LARGE:

@@ -104,7 +104,6 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _metres(value: float) -> float:
-    """Refuses what no hardware has."""
     least, most = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
     if not least <= value <= most:
         raise ValueError(f"{least:g} … {most:g} m needed: Kalibr's lengths are metres, not mm")
@@ -113,8 +112,7 @@ def _metres(value: float) -> float:
 
 LEAST_GAP = 0.1
 """Smallest gap between tags over their side that grids have: with less white about them tags are not found."""
-SAME_WITHIN = 1e-6
-"""Largest relative difference between the sides of a square."""
+SAME_WITHIN = 1e-6  # largest relative difference between the sides of a square
 KALIBR_FAMILY = "DICT_APRILTAG_36h11"
 KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
 

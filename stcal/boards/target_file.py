@@ -52,8 +52,7 @@ from stcal.lengths import radius, stated_unusual
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
 """Form of the entry in which a face of a target file may state its rough pose."""
 MIN_DIRECTION = 1e-6
-MAX_SKEW_DEG = 5.0
-"""Largest deviation from a right angle between X and normal of a rough pose."""
+MAX_SKEW_DEG = 5.0  # largest deviation from a right angle between X and normal of a rough pose
 INWARDS = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 """Turns a frame whose Z points out of a body into that of a board or tag, whose Z points into it."""
 
@@ -75,8 +74,6 @@ class _CircleFile(Strict):
 
 
 class _RoughPoseFile(Strict):
-    """Rough pose of a face's drawing, in a frame that all faces share."""
-
     origin_mm: Vector
     x: Vector
     normal: Vector
@@ -94,8 +91,6 @@ class _CirclesFile(Strict):
 
 
 class _PrintedFile(Strict):
-    """A face with a board or tags; their keys are those of a board file, and of a tag in a layout."""
-
     id: Name
     rough_pose: _RoughPoseFile | None = None
     outline_mm: Outline | None = None
@@ -131,7 +126,6 @@ class _TargetFile(Sized):
     @model_validator(mode="before")
     @classmethod
     def _without_circles(cls, content: Any) -> Any:
-        """Adds a polarity where no face has circles that could have one."""
         faces = content.get("face") if isinstance(content, dict) else None
         if isinstance(faces, list) and faces and all(_kind_of_face(face) == "<printed>" for face in faces):
             return {"polarity": "bright"} | content
@@ -153,10 +147,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
     TargetDesign
         Faces in their own frames, mm.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read or is no design, or has a tag on two faces; the message names file, place and reason.
+    Raises InputError: the file cannot be read or is no design, or has a tag on two faces; the message names file, place
+    and reason.
     """
     data = load_toml(path, _TargetFile, "target file", INIT)
     where = f"target file {path}"
@@ -198,7 +190,6 @@ def target_of(given: str | Path | TargetDesign | None, printed: bool = True) -> 
 
 
 def _distance(entry: _ScaleFile, known: dict[str, Any], where: str) -> KnownDistance:
-    """Return the known distance of an entry between points of the target, ``known`` by their names."""
     for name in (entry.first, entry.second):
         if name not in known:
             raise InputError(
@@ -237,7 +228,6 @@ def _of_circles(face: _CirclesFile, where: str) -> FaceDesign:
 
 
 def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
-    """Refuse circles that extend beyond the outline of their plate."""
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
@@ -492,7 +482,6 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
 
 
 def _require_told_apart(found: BoardSet, where: str) -> None:
-    """Refuse boards that look alike in an image, and boards that look the same after a rotation."""
     for name, board in zip(found.names, found.boards, strict=True):
         if not board.unique() if isinstance(board, BoardDesign) else board.symmetries():
             raise InputError(
@@ -506,7 +495,6 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
 
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:
-    """Return why two boards look alike in images, and what to do; empty if they differ."""
     if (colour := getattr(first, "polarity", "")) and colour == getattr(second, "polarity", ""):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
     for whole, part in ((first, second), (second, first)):
@@ -523,7 +511,6 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
 
 
 def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
-    """Return rows and columns of inner corners of a board of squares, else None."""
     if isinstance(board, ChessboardDesign):
         return board.rows, board.columns
     return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None

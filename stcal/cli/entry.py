@@ -99,7 +99,6 @@ def _answer() -> None:
 
 
 def _end(number: int, _) -> None:
-    """Ends the process at a signal while the commands are loaded."""
     word, code = LOADING[signal.Signals(number)]
     os.write(sys.stderr.fileno(), f"{word}\n".encode())
     os._exit(code)

@@ -207,8 +207,7 @@ def run(
         raise typer.Exit(NOTHING_ACCEPTED)
 
 
-Method = Literal["robust", "least-squares", "liu2017"]
-"""Method of the fit."""
+Method = Literal["robust", "least-squares", "liu2017"]  # method of the fit
 
 
 def register(

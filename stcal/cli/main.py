@@ -23,14 +23,12 @@ from stcal.cli.terminal import printable, say
 from stcal.errors import NO_MEMORY, InputError, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
-AGAIN_S = 0.02
-"""Time after which a signal is sent again, s."""
+AGAIN_S = 0.02  # time after which a signal is sent again, s
 MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy": "scipy"}
 """Module of each library, by name."""
-RESUMED = {"run", "detect"}
-"""Commands that keep finished detections when they are interrupted."""
+RESUMED = {"run", "detect"}  # commands that keep finished detections when they are interrupted
 # The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
@@ -164,7 +162,6 @@ class _Terminated(BaseException):
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    """Prints the error as one line of printable characters, and ends with the exit code."""
     line = " ".join(printable(message).split())
     half = (MESSAGE_CHARACTERS - len("error:  … ")) // 2
     if len(line) > 2 * half:

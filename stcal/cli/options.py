@@ -52,8 +52,7 @@ class Opt:
         return typer.Option(*names, help=text, min=self.min, max=self.max, **more)
 
 
-WRITES = Opt(writes=True)
-"""An option with the name of a file that is written."""
+WRITES = Opt(writes=True)  # an option with the name of a file that is written
 
 
 class Arg(Opt):
@@ -110,8 +109,7 @@ Quiet = Annotated[bool, "Print only warnings and errors, and a verdict that is n
 Verbose = Annotated[bool, "Print more: steps, times, and what is found in images.", Opt("--verbose -v")]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
-WRITE_NOTHING = ("serve", "live", "dry_run")
-"""Options with which no output is written."""
+WRITE_NOTHING = ("serve", "live", "dry_run")  # options with which no output is written
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command may replace existing outputs."""
 MOST_SEED = 2**63 - 1

@@ -178,7 +178,6 @@ def axes(
 
 
 def _length(text: str, data: "Measurements") -> float | None:
-    """Returns the distance of virtual reflectors, mm; None for positions alone."""
     from stcal.robot.axes.sweeps import length_of
 
     if text in ("auto", "off"):
@@ -189,8 +188,7 @@ def _length(text: str, data: "Measurements") -> float | None:
         raise InputError("E-OPTION-VALUE", f"--orientations {text}: a length in mm, auto or off needed") from error
 
 
-Model = Literal["rigid", "elastic", "auto"]
-"""Model of the arm."""
+Model = Literal["rigid", "elastic", "auto"]  # model of the arm
 
 
 def identify(

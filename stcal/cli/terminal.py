@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 LINE_EVERY_S = 5.0
-LEFT_FROM_S = 2.0
-"""Shortest remaining time that a stage shows, s."""
-STANDARD_OUTPUT = Path("-")
-"""Name that means standard output instead of a JSON file."""
+LEFT_FROM_S = 2.0  # shortest remaining time that a stage shows, s
+STANDARD_OUTPUT = Path("-")  # name that means standard output instead of a JSON file
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
 

@@ -143,7 +143,6 @@ PLAIN: dict[Any, Rule] = {
 
 
 def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None) -> None:
-    """Refuse a value that is not of its type, by the rule and the hint of it."""
     if known is None or known[0][0](value):
         return
     words, hint = known[0][1], known[1]
@@ -155,7 +154,6 @@ def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None
 
 @lru_cache
 def _rules(kind: type) -> dict[str, tuple[Rule, Any]]:
-    """Return the rules and hints of a dataclass's fields."""
     hints = get_type_hints(kind)
     ends = {
         each.name: isinstance(each.default, float) and math.isinf(each.default) for each in fields(kind) if each.init
@@ -260,8 +258,7 @@ ROUNDING = 1e-5
 """Tolerance of a correlation per row of its matrix: files state six digits, so that 1.00000 may be off by 5e-6."""
 LARGEST = 1e24
 """Largest variance in any unit: a σ of 1e12 exceeds anything that is measured."""
-TINY = 1e-300
-"""Value that replaces a variance of zero, to avoid division by zero."""
+TINY = 1e-300  # value that replaces a variance of zero, to avoid division by zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,8 +276,7 @@ class Rows:
 
 TWIST = ("rx", "ry", "rz", "x", "y", "z")
 """Rows of the covariance of a pose: rotation vector (rad) and translation (mm), left perturbation."""
-NANOMETRE = 1e-12
-"""Square of a nanometre in mm²."""
+NANOMETRE = 1e-12  # square of a nanometre in mm²
 NANORADIAN = 1e-18
 """Square of a nanoradian in rad²: a point at a distance of a metre moves by a nanometre."""
 OF_POSE = Rows(TWIST, (*[NANORADIAN] * 3, *[NANOMETRE] * 3))

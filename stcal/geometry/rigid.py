@@ -76,8 +76,6 @@ else:
 
 
 class _Frames:
-    """What one transform a_from_b and a stack of them share; all arrays with leading axes (...)."""
-
     __slots__ = ()
     rotation: np.ndarray
     translation: np.ndarray

@@ -91,7 +91,6 @@ def _bytes(data: bytes) -> np.ndarray:
 
 
 def _digest(content: Mapping[str, np.ndarray]) -> bytes:
-    """Return the SHA-256 of names, types, shapes and values of arrays."""
     hasher = hashlib.sha256()
     for name, values in sorted(content.items()):
         hasher.update(f"{name}\0{values.dtype.str}\0{values.shape}\0".encode() + values.tobytes())

@@ -60,8 +60,7 @@ LEAST_COLOUR = 0.05
 """Smallest relative difference between neighbours of two colours that tells a mosaic."""
 GREEN_ALIKE = 0.3
 """Largest difference between both greens, as a share of that between green and the other colours."""
-TRIED_PX = 1024
-"""Side of the middle of the image that is judged, px."""
+TRIED_PX = 1024  # side of the middle of the image that is judged, px
 
 
 def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
@@ -107,8 +106,7 @@ UNREAD = {
 """What photographs of these suffixes are, and what to do where they are not read."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands of HEIC files, in the bytes 8 to 12."""
-DNG_VERSION = 50706
-"""Tag of a TIFF that is a raw photograph."""
+DNG_VERSION = 50706  # tag of a TIFF that is a raw photograph
 
 
 def readable() -> tuple[str, ...]:
@@ -147,7 +145,6 @@ def heic_grey(data: bytes, name: str) -> np.ndarray:
 
 
 def _properties(data: bytes) -> bytes:
-    """Return the part of a HEIC file that describes its images."""
     start = data.find(b"meta")
     return data[start : start + int.from_bytes(data[max(start - 4, 0) : start], "big")] if start >= 0 else b""
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from stcal.errors import InputError, InputNote
-from stcal.io.files import IMAGE_BYTES, read_bytes, save
+from stcal.io.files import IMAGE_BYTES, read_bytes, save, unwritable
 from stcal.io.images import SUFFIXES, decode, find_images, grey_8bit
 from stcal.parallel import scratch_folder
 
@@ -26,10 +26,8 @@ MANUAL_V4L2, MANUAL_OTHERS = 1.0, 0.25
 SATURATED = 250
 DARK = 5
 FULL_SCALE = 255
-SIMULATED_NOISE = 1.0
-"""Noise σ of a pixel of the simulated camera, grey values."""
-PATIENCE_S = 5.0
-"""Time without a picture after which a camera or a stream counts as lost, s."""
+SIMULATED_NOISE = 1.0  # noise σ of a pixel of the simulated camera, grey values
+PATIENCE_S = 5.0  # time without a picture after which a camera or a stream counts as lost, s
 FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 """Variable of the environment by which OpenCV sets how much FFmpeg says."""
 READINGS = 3
@@ -67,19 +65,14 @@ class OpenCVSource:
         place = int(device) if device.isdigit() else device
         self._capture = _device(place)
         if not self._capture.isOpened():
-            raise InputError(
-                "E-DEVICE-OPEN",
-                f"{self.name}: cannot be opened; check that it is plugged in and free (`ls /dev/video*`), or "
-                "--simulate with an image",
-            )
+            free = "check that it is plugged in and free (`ls /dev/video*`), or --simulate with an image"
+            raise InputError("E-DEVICE-OPEN", f"{self.name}: cannot be opened; {free}")
         back_end = self._capture.getBackendName()
-        manual = MANUAL_V4L2 if back_end == "V4L2" else MANUAL_OTHERS
-        self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, manual)
+        self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_V4L2 if back_end == "V4L2" else MANUAL_OTHERS)
         if gain is not None and not self._capture.set(cv2.CAP_PROP_GAIN, gain):
             self.close()
-            raise InputError(
-                "E-DEVICE-SETTING", f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out"
-            )
+            no_gain = f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out"
+            raise InputError("E-DEVICE-SETTING", no_gain)
 
     def expose(self, exposure: float, settle_s: float) -> tuple[np.ndarray, float]:
         """Return an image and its exposure, see :class:`Source`; frames during the settle time are dropped."""
@@ -127,9 +120,8 @@ class SimulatedSource:
         try:
             content = read_bytes(self._image, IMAGE_BYTES)
         except OSError as error:
-            raise InputError(
-                "E-IMAGE-UNREADABLE", f"{self._image}: {error.strerror or error}; an image needed to simulate a camera"
-            ) from error
+            unread = f"{self._image}: {error.strerror or error}; an image needed to simulate a camera"
+            raise InputError("E-IMAGE-UNREADABLE", unread) from error
         grey = exposure * self._gain * grey_8bit(decode(content, str(self._image))).astype(float)
         grey += self._rng.normal(0, SIMULATED_NOISE, grey.shape)
         return np.clip(np.round(grey), 0, FULL_SCALE).astype(np.uint8), exposure
@@ -170,24 +162,6 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
         yield chain([first], pictures)
     finally:
         pictures.close()  # which waits until nothing reads from the device any more
-        device.release()
-
-
-@contextmanager
-def frames_of(video: str | Path) -> Iterator[Iterator[np.ndarray]]:
-    """Open a video file, and return its frames, grey."""
-    device = _device(str(video))
-    try:
-        frames = _every(device)
-        first = next(frames, None) if device.isOpened() else None
-        if first is None:
-            raise InputError(
-                "E-VIDEO-UNREADABLE",
-                f"video {video}: cannot be read as one, a folder of images or a video file needed; another program may "
-                "convert it, such as `ffmpeg -i VIDEO clip.mp4`",
-            )
-        yield chain([first], frames)
-    finally:
         device.release()
 
 
@@ -260,8 +234,7 @@ def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, 
 
 
 AUTO = "auto"
-SMALL_PX = 240
-"""Longer side of the frames that are compared, px."""
+SMALL_PX = 240  # longer side of the frames that are compared, px
 MOVED = 0.04
 """Move of the parts that move most, as a share of the longer side, from which on a view is another: two degrees for
 a lens of medium focal length."""
@@ -270,8 +243,7 @@ MOVING = 90
 SHARP_BLUR_PX = 2.0
 """σ, px, of the blur that measures the sharpness of a frame: a frame that is already blurred as much hardly loses
 detail by it."""
-EDGE_SHARE = 0.05
-"""Share of the pixels that are taken for edges."""
+EDGE_SHARE = 0.05  # share of the pixels that are taken for edges
 ALL, NEXT, BEFORE = slice(None), slice(1, None), slice(None, -1)
 DIRECTIONS = (
     ((ALL, NEXT), (ALL, BEFORE)),
@@ -330,10 +302,9 @@ def chosen_frames(frames: Iterator[np.ndarray], every: str | int = AUTO) -> Iter
         scale = SMALL_PX / max(grey.shape)
         small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         frame = _Frame(number, grey, small, sharpness(grey))
-        new_part = start is None or (
+        if start is None or (
             number // every != start.number // every if isinstance(every, int) else _move(start, frame) >= MOVED
-        )
-        if new_part:
+        ):
             if best is not None:
                 yield best
                 last = best
@@ -359,19 +330,26 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
     """
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []
-    with frames_of(video) as frames:
+    device = _device(str(video))
+    try:
+        frames = _every(device)
+        first = next(frames, None) if device.isOpened() else None
+        if first is None:
+            unread = f"video {video}: cannot be read as one, a folder of images or a video file needed"
+            convert = "another program may convert it, such as `ffmpeg -i VIDEO clip.mp4`"
+            raise InputError("E-VIDEO-UNREADABLE", f"{unread}; {convert}")
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for old in folder.glob("frame_*.png"):
                 old.unlink()
         except OSError as error:
-            raise InputError(
-                "E-OUTPUT-UNWRITABLE", f"folder {folder}: {error.strerror or error}; give a writable folder"
-            ) from error
-        for frame in chosen_frames(frames, every):
+            raise unwritable(folder, error) from error
+        for frame in chosen_frames(chain([first], frames), every):
             path = folder / f"frame_{frame.number:06d}.png"
             save(path, png(frame.grey))
             written.append((path, frame.number, frame.sharpness))
+    finally:
+        device.release()
     usual = float(np.median([sharp for _, _, sharp in written]))
     sharp_ones = [each for each in written if each[2] >= LEAST_SHARPNESS * usual]
     spare = np.linspace(0, len(sharp_ones) - 1, min(len(sharp_ones), MOST_FRAMES)).round().astype(int).tolist()
@@ -379,11 +357,9 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
     for path in {path for path, _, _ in written} - {path for path, _, _ in chosen}:
         path.unlink()
     if len(chosen) < LEAST_FRAMES:
-        raise InputError(
-            "E-VIDEO-VIEWS",
-            f"video {video}: {len(chosen)} sharp frames with different views, {LEAST_FRAMES} needed; move the target "
-            "or the camera more, and slowly, or name a number of frames with --every",
-        )
+        few = f"video {video}: {len(chosen)} sharp frames with different views, {LEAST_FRAMES} needed"
+        remedy = "move the target or the camera more, and slowly, or name a number of frames with --every"
+        raise InputError("E-VIDEO-VIEWS", f"{few}; {remedy}")
     blurred = len(written) - len(sharp_ones)
     warnings.warn(
         f"{video.name}: {len(chosen)} frames chosen{f', {blurred} left out as blurred' if blurred else ''}: "

@@ -33,13 +33,10 @@ SUFFIXES = (*USUAL, *decoding.readable())
 UNPACKED = (".png", ".tif", ".tiff", ".bmp")
 """Forms in which programs of industrial cameras write pixels as the sensor gave them."""
 EXCLUDED = "taken out with --exclude"
-HOLDS_IMAGES = "it holds images"
-"""Part of the reason why a folder is left out."""
-TOP_GROUP = "."
-"""Name of the group that images lying directly in the folder form."""
+HOLDS_IMAGES = "it holds images"  # part of the reason why a folder is left out
+TOP_GROUP = "."  # name of the group that images lying directly in the folder form
 
-NOISE_BLUR_PX = 1.5
-"""σ of the blur that removes noise."""
+NOISE_BLUR_PX = 1.5  # σ of the blur that removes noise
 SAME_NOISE = 1.2
 """Largest RMS difference between two files of one photograph, in units of its RMS noise: a JPEG of low quality differs
 by 1.1, two exposures by 1.5."""
@@ -50,21 +47,18 @@ SAME_EDGES = 1.5
 """Factor on the allowed RMS difference over the whole image, edges included: compression changes edges a little, a
 motion of the camera changes them much."""
 
-MAJORITY = "the majority of the images"
-"""What states the size of images where the camera file does not."""
+MAJORITY = "the majority of the images"  # what states the size of images where the camera file does not
 TIFF_HEADS = (b"II*\0", b"MM\0*")
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
-MOST_JPEG_SIDE = 65_000
-"""Largest height of a thumbnail, px; the JPEG format is limited to 65 535."""
+MOST_JPEG_SIDE = 65_000  # largest height of a thumbnail, px; the JPEG format is limited to 65 535
 
 _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
 """Messages that decoders write to standard error without failing; stray bytes before the end of a JPEG do no harm."""
 
-_STANDARD_ERROR = threading.Lock()
-"""Lock that is held while standard error is redirected."""
+_STANDARD_ERROR = threading.Lock()  # lock that is held while standard error is redirected
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +123,6 @@ def _mosaics(path: Path, _: int) -> tuple[str, ...]:
 
 
 def _refuse_mosaics(files: Sequence[ImageFile]) -> None:
-    """Refuse images that are mosaics, by the first one in a form without losses: read as grey, it shifts centres."""
     first = next((file for file in files if file.path.suffix.lower() in UNPACKED), None)
     if first is None:
         return
@@ -168,16 +161,14 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         else:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
-        # A nested folder is the most helpful hint: the images lie deeper than they should.
-        unread = set(decoding.UNREAD.values())
-        most_telling = sorted(
+        unread = set(decoding.UNREAD.values())  # then a nested folder is the most helpful hint: images lie too deep
+        telling = sorted(
             skipped, key=lambda s: (s.reason not in unread, s.gate != "folder", HOLDS_IMAGES not in s.reason)
-        )[:1]
-        hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
+        )
+        hint = "".join(f" (left out {s.name}: {s.reason})" for s in telling[:1])
+        kinds = f"{', '.join(s[1:] for s in USUAL)}{hint}"
         raise InputError(
-            "E-IMAGES-NONE",
-            f"image folder {root}: no image, one of {', '.join(s[1:] for s in USUAL)}{hint}; "
-            f"put them into {root}/<group>/",
+            "E-IMAGES-NONE", f"image folder {root}: no image, one of {kinds}; put them into {root}/<group>/"
         )
     _refuse_mosaics(files)
     return files, skipped
@@ -197,17 +188,13 @@ def without_excluded(
     for word in exclude:
         matching = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
         if not matching:
-            raise InputError(
-                "E-OPTION-EXCLUDE",
-                f"--exclude {word}: no such image in {folder}; give its name as results have it, such as "
-                f"{files[0].name}",
-            )
+            none = f"--exclude {word}: no such image in {folder}"
+            raise InputError("E-OPTION-EXCLUDE", f"{none}; give its name as results have it, such as {files[0].name}")
         excluded |= matching
     remaining = [file for file in files if file.name not in excluded]
     if not remaining:
-        raise InputError(
-            "E-OPTION-EXCLUDE", f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in"
-        )
+        every = f"image folder {folder}: --exclude takes out all {len(files)} images"
+        raise InputError("E-OPTION-EXCLUDE", f"{every}; leave some in")
     return remaining, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in excluded)]
 
 
@@ -266,8 +253,10 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
         image = _decoded(data, name)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
-    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS and _tag(data, ExifTags.Base.PhotometricInterpretation) == 0:
-        image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
+    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS:
+        with contextlib.suppress(Exception), Image.open(BytesIO(data)) as file:  # damaged EXIF fails in many ways
+            if file.getexif().get(ExifTags.Base.PhotometricInterpretation) == 0:
+                image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
     if size is not None and size[0] != size[1] and image.shape == size:  # (height, width) is (width, height)
         turn = _turn(data)
         return image if turn is None else cv2.rotate(image, turn)
@@ -275,7 +264,6 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
 
 
 def _decoded(data: bytes, name: str) -> np.ndarray:
-    """Return the grey image of a JPEG, PNG, TIFF or BMP."""
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     with _STANDARD_ERROR, _decoder_messages() as messages:
         try:
@@ -285,19 +273,15 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
         if image is not None:
             image = _clearest(image, lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_COLOR))
     if image is None:
-        raise InputError(
-            "E-IMAGE-UNREADABLE",
-            f"{name}: not readable as an image; copy it again, or convert it to {', '.join(USUAL)}",
-        )
+        unread = f"{name}: not readable as an image; copy it again, or convert it to {', '.join(USUAL)}"
+        raise InputError("E-IMAGE-UNREADABLE", unread)
     if damage := _DAMAGE.search(messages):
-        raise InputError(
-            "E-IMAGE-DAMAGED", f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again"
-        )
+        seen = damage[0].decode(errors="replace").strip()
+        raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged ({seen}); copy it again")
     return image
 
 
-SPARSE = 5
-"""Only one row and column in this number is looked at."""
+SPARSE = 5  # only one row and column in this number is looked at
 FLAT, CLEARER = 0.1, 3.0
 """Range of grey values, as a share of all, below which the channels of a colour image are looked at, and how many times
 larger that of a channel must be to be taken for the image."""
@@ -332,27 +316,18 @@ def _turn(data: bytes) -> int | None:
         return None
 
 
-def _tag(data: bytes, tag: int) -> object:
-    try:
-        with Image.open(BytesIO(data)) as image:
-            return image.getexif().get(tag)
-    except Exception:  # damaged EXIF fails in many ways
-        return None
-
-
 def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
     """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable,
     an error if two sizes are equally frequent, so that the order of the files would decide."""
     with_size: dict[tuple[int, int], list[ImageFile]] = {}
+    unknown: list[ImageFile] = []
     for file in files:
         try:
             with Image.open(BytesIO(file.content) if file.content is not None else file.path) as image:
                 with_size.setdefault(image.size, []).append(file)
         except Exception:  # a file that is no image fails in many ways
-            with_size.setdefault((0, 0), []).append(file)
-    unknown = with_size.pop((0, 0), [])
-    order = {file.name: i for i, file in enumerate(files)}
-    ranked = sorted(with_size.values(), key=lambda own: (-len(own), order[own[0].name]))
+            unknown.append(file)
+    ranked = sorted(with_size.values(), key=len, reverse=True)
     _refuse_a_tie({size: own for size, own in with_size.items() if len(own) == len(ranked[0])})
     for own in (*ranked, unknown):
         for file in own:
@@ -362,7 +337,6 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
 
 
 def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
-    """Raise an error if several sizes have the same number of images, and some of these images are readable."""
     sizes = [size for size, own in equal.items() if any(map(_shape, own))] if len(equal) > 1 else []
     if len(sizes) < 2:
         return
@@ -372,7 +346,6 @@ def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
 
 
 def _shape(file: ImageFile) -> tuple[int, ...]:
-    """Return height and width, px; empty if the image is not readable."""
     try:
         return decode(file.read(), file.name).shape
     except (InputError, OSError):
@@ -575,11 +548,9 @@ def run_on_images(
     try:
         yield from run_parallel(function, jobs, workers)
     except BrokenExecutor as error:
-        raise DetectionError(
-            "E-WORKER-DIED",
-            f"images, {len(jobs)} of them: a process was ended from outside, for lack of memory perhaps; run the same "
-            f"command again, with fewer --workers{', finished detections are kept' * kept}",
-        ) from error
+        died = f"images, {len(jobs)} of them: a process was ended from outside, for lack of memory perhaps"
+        again = f"run the same command again, with fewer --workers{', finished detections are kept' * kept}"
+        raise DetectionError("E-WORKER-DIED", f"{died}; {again}") from error
 
 
 def _sent(files: ImageFile | list[ImageFile], with_content: bool) -> list[ImageFile] | ImageFile:

@@ -96,20 +96,16 @@ def join_tables(
             posed = bool(_OF_POSES.fullmatch(name))
             new = prefix + name if posed else name
             if new in joined and posed:
-                raise InputError(
-                    "E-TABLES-BOTH",
-                    f"{a}, {b}: both have {name}; positions or poses of one of them alone can be read here",
-                )
+                one = "positions or poses of one of them alone can be read here"
+                raise InputError("E-TABLES-BOTH", f"{a}, {b}: both have {name}; {one}")
             joined.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
     lines = [tables[0].lines[places[0][name]] for name in common]
     notes = []
     for path, row_of_key, rows_of_other in ((a, places[0], places[1]), (b, places[1], places[0])):
         unmatched = [name for name in row_of_key if name not in rows_of_other]
         if unmatched:
-            ellipsis = ", …" if len(unmatched) > SHOWN else ""
-            notes.append(
-                f"{len(unmatched)} rows of {path} have no partner: {key} {', '.join(unmatched[:SHOWN])}{ellipsis}"
-            )
+            names = ", ".join(unmatched[:SHOWN]) + ", …" * (len(unmatched) > SHOWN)
+            notes.append(f"{len(unmatched)} rows of {path} have no partner: {key} {names}")
     where = f"{Path(a).name} with {Path(b).name}"
     return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
@@ -132,10 +128,8 @@ def stack_tables(
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(
-            "E-TABLES-NAMES",
-            f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them",
-        )
+        called_so = f"{tables[0].where}: two files are called {twice}"
+        raise InputError("E-TABLES-NAMES", f"{called_so}; rename one, {column}s are called like them")
     common = [name for name in tables[0].columns if name != column and all(name in table for table in tables)]
     columns: dict[str, list[str] | np.ndarray] = {}
     for name in common:

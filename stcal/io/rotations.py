@@ -173,15 +173,11 @@ def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> Non
     """Refuse values (m, …) that are not finite; the message names the row."""
     bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if len(bad):
-        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(
-            "E-TABLE-NUMBER",
-            f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{suffix}; take it out",
-        )
+        reason = f"a value that is not finite, numbers needed{f' (and {len(bad) - 1} more)' * (len(bad) > 1)}"
+        raise InputError("E-TABLE-NUMBER", f"{where}: {places[bad[0]]}: {reason}; take it out")
 
 
-EXPLAINS = 0.2
-"""A mistake explains a misfit if its correction reduces the misfit below this share."""
+EXPLAINS = 0.2  # a mistake explains a misfit if its correction reduces the misfit below this share
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,25 +292,17 @@ def _all(table: Table, columns: list[str]) -> np.ndarray | None:
         return None
     if len(present) < len(columns):
         missing = next(column for column in columns if column not in table)
-        raise InputError(
-            "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: {', '.join(present)} without {missing}; all {len(columns)} needed",
-        )
+        without = f"{table.where}: {', '.join(present)} without {missing}; all {len(columns)} needed"
+        raise InputError("E-TABLE-COLUMN-MISSING", without)
     return np.column_stack([table.numbers(column) for column in columns])
 
 
-def _columns(table: Table, prefix: str, names: list[str]) -> tuple[str, ...]:
-    """Return the columns of these names, also with capital letters; none unless all are there."""
-    columns = tuple(column for name in names if (column := find_column(table, prefix, name)) is not None)
-    return columns if len(columns) == len(names) else ()
-
-
 def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | None:
-    """Return rotations of three angles, a rotation vector or q1 … q4, by the convention of their names or the user."""
     for triple, stated in TRIPLES.items():
         for unit in (*ANGLES, "") if len(triple) == 3 else ("",):
-            names = _columns(table, prefix, [f"{name}_{unit}" if unit else name for name in triple])
-            if not names:
+            wanted = [f"{name}_{unit}" if unit else name for name in triple]
+            names = tuple(column for name in wanted if (column := find_column(table, prefix, name)) is not None)
+            if len(names) < len(wanted):
                 continue
             what = "".join(triple) if len(triple[0]) == 1 else ", ".join(triple)
             if rotation is None and unit in stated:
@@ -323,10 +311,8 @@ def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | 
                 convention = said_convention(rotation, what, table.where, len(triple))
             says_unit = (rotation or "").endswith(tuple(f"-{name}" for name in ANGLES))  # a robot's name implies one
             if unit and says_unit and convention.unit not in ("", unit):
-                raise InputError(
-                    "E-OPTION-CONTRADICTS",
-                    f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one",
-                )
+                both = f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one"
+                raise InputError("E-OPTION-CONTRADICTS", both)
             convention = Convention(convention.order, unit or convention.unit)
             values = np.column_stack([table.numbers(column) for column in names])
             turned, words = rotations(values, convention, places_of(table), table.where, triple in NAMED_BY_AXES)

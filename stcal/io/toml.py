@@ -20,8 +20,7 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
-YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)
-"""A line as YAML has it."""
+YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)  # a line as YAML has it
 
 
 DEEPEST = 60
@@ -130,11 +129,9 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+_Loader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
 
 
 def load_yaml(text: str):
@@ -156,10 +153,5 @@ def opencv_matrix(name: str, values: np.ndarray) -> list[str]:
     """Return the lines of a matrix as ``cv2.FileStorage`` writes it, with numbers of full precision."""
     rows, columns = values.shape
     numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
-    return [
-        f"{name}: !!opencv-matrix",
-        f"   rows: {rows}",
-        f"   cols: {columns}",
-        "   dt: d",
-        f"   data: [ {numbers} ]",
-    ]
+    head = f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"
+    return [*head, f"   data: [ {numbers} ]"]

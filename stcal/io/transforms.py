@@ -83,10 +83,8 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     for static in statics:
         names = static.parent, static.child
         if spaced := [name for name in names if name.split() != [name]]:
-            raise InputError(
-                "E-FRAME-NAME",
-                f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name",
-            )
+            split = f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name"
+            raise InputError("E-FRAME-NAME", split)
         words = [*_pose_words(static.pose), *names]
         node = f"{static.child}_broadcaster".replace("/", "_")
         lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
@@ -123,8 +121,7 @@ def plain_numbers(values, digits: int) -> list[str]:
     return [fixed(v, digits) for v in values]
 
 
-METRE_MM = 1000.0
-"""Millimetres per metre, the unit of ROS, URDF and Universal Robots."""
+METRE_MM = 1000.0  # millimetres per metre, the unit of ROS, URDF and Universal Robots
 
 
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
@@ -175,20 +172,15 @@ def image_lines(text: str, where: str) -> list[ImageLine]:
             number, line = next(lines)
             continue
         if not _is_image(line):
-            raise InputError(
-                "E-MODEL-UNREADABLE",
-                f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
-            )
+            no_image = f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew"
+            raise InputError("E-MODEL-UNREADABLE", no_image)
         first, name = number, line.split(maxsplit=CELLS - 1)[-1].strip()
         number, line = next(lines)
         followed = number > 0 and not _is_image(line)
         images.append(ImageLine(first, name, followed))
         if followed and not _are_points(line):
-            raise InputError(
-                "E-MODEL-UNREADABLE",
-                f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
-                "model anew",
-            )
+            cells = f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each"
+            raise InputError("E-MODEL-UNREADABLE", f"{cells}; export the model anew")
         if followed:
             number, line = next(lines)
     return images

@@ -64,10 +64,7 @@ class BodyOptions:
     body_seed : int, optional
         Draws the errors of the body, so that another ``seed`` photographs the same one again; ``seed`` by default.
 
-    Raises
-    ------
-    InputError
-        A value is of another type, or out of range.
+    Raises InputError: a value is of another type, or out of range.
     """
 
     images: int = 24
@@ -169,10 +166,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     options : BodyOptions, optional
         The defaults if None.
 
-    Raises
-    ------
-    InputError
-        A face has no rough pose, or the camera is too near for the image to hold the body.
+    Raises InputError: a face has no rough pose, or the camera is too near for the image to hold the body.
     """
     options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
@@ -459,10 +453,7 @@ def write_body(
     progress : callable, optional
         Called with (done, total).
 
-    Raises
-    ------
-    InputError
-        The folder is not empty or cannot be written.
+    Raises InputError: the folder is not empty or cannot be written.
     """
     folder, count = Path(folder), len(scene.camera_from_target)
     with new_dataset(folder):

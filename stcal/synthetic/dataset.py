@@ -144,10 +144,7 @@ def render_all(
     workers : int, optional
         Number of processes that render; one per core by default.
 
-    Raises
-    ------
-    InputError
-        The lens does not fit the scene.
+    Raises InputError: the lens does not fit the scene.
     """
     options = options or RenderOptions()
     check_lens(scene, options.lens)
@@ -207,10 +204,7 @@ def write_dataset(
     workers, progress : int, callable, optional
         Number of processes, one per core by default; called with (done, total).
 
-    Raises
-    ------
-    InputError
-        The folder is not empty or cannot be written, or the image format or the lens does not fit.
+    Raises InputError: the folder is not empty or cannot be written, or the image format or the lens does not fit.
     """
     folder, options = Path(folder), render_options or RenderOptions()
     if image_format not in IMAGE_FORMATS:

@@ -145,7 +145,6 @@ def _edges(corners: np.ndarray, pieces: int = 12) -> np.ndarray:
 
 
 def _wall(scene: Scene, g: Group, rng) -> Rigid:
-    """Returns target_from_wall of a wall behind target and board, z towards the camera."""
     points = np.vstack([*(scene.face_outline(face.id) for face in scene.target.faces), scene.board_outline(g.name)])
     turn = Rigid.exp([*np.radians(rng.uniform(-10, 10, 3)), 0, 0, 0]).rotation
     rotation = g.axes.T @ turn
@@ -167,7 +166,6 @@ def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
 
 
 def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
-    """Draws random discs of all sizes, as bright as the circles or fainter, and random ellipses."""
     n_discs, n_ellipses = 120, 60
     n = n_discs + n_ellipses
     centre = np.column_stack([rng.uniform(-LAMP_REACH_MM, LAMP_REACH_MM, (n, 2)), np.full(n, 1.0)])
@@ -205,7 +203,6 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: fl
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
-    """Draws the box: its silhouette, which hides the background, then the faces towards the camera, far ones first."""
     outlines = {face.id: scene.face_outline(face.id) for face in scene.target.faces}
     pixel, _ = painter.pixels(np.concatenate([_edges(outline) for outline in outlines.values()]))
     points = pixel.reshape(-1, 2)
@@ -448,7 +445,6 @@ def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, r
 
 
 def _expose(picture: np.ndarray, options: RenderOptions, rng: np.random.Generator) -> np.ndarray:
-    """Returns the grey levels of the light ``picture`` on the sensor, which is overwritten."""
     height, width = picture.shape
     x = ((np.arange(width) - (width - 1) / 2) / (width / 2)).astype(np.float32)
     y = ((np.arange(height) - (height - 1) / 2) / (width / 2)).astype(np.float32)

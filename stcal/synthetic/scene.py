@@ -182,13 +182,9 @@ def make_scene(
     camera : Camera, optional
         The camera, in place of the one that the options describe.
 
-    Raises
-    ------
-    InputError
-        A group names an unknown face, a nominal pose is missing, or the camera states no image size or is given beside
-        ``fisheye_deg``.
-    DegenerateError
-        The faces do not bound a convex body, or a group cannot be photographed.
+    Raises InputError: a group names an unknown face, a nominal pose is missing, or the camera states no image size or
+    is given beside ``fisheye_deg``.
+    Raises DegenerateError: the faces do not bound a convex body, or a group cannot be photographed.
     """
     options = options or SceneOptions()
     if camera is not None:
@@ -242,7 +238,6 @@ def group_name(pair: tuple[str, str]) -> str:
 
 
 def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[CircleLabel, np.ndarray]]:
-    """Returns true poses and circles, in the frame of the reference face."""
     placed, frames = {}, {}
     for face in target.faces:
         turn, shift = rng.standard_normal((2, 3)) / np.sqrt(3)

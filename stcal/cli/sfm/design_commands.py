@@ -149,7 +149,6 @@ def _lens(
     distance_mm: float,
     camera: Path | None,
 ) -> "ThinLens | None":
-    """The thin lens of the options, or none; without ``focal_mm`` that of a sensor of the usual width."""
     from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import SENSOR_WIDTH_MM
 
@@ -179,7 +178,6 @@ def _scene(
     camera: Path | None,
     fisheye: float | None,
 ) -> "Scene":
-    """Returns a scene of the files' designs, or the second ones, before the camera of a file or the options."""
     from stcal.boards.board_designs import CornerBoard
     from stcal.boards.board_file import board_of
     from stcal.boards.target_file import target_of

@@ -300,7 +300,6 @@ def measure(
 
 
 def _design_beside(faces: Path) -> Path | None:
-    """Returns the target.toml that a run wrote beside its faces.json, if there is one, and says that it is used."""
     from stcal.io.files import RUN_MARKER, TARGET
 
     own = faces.parent / TARGET
@@ -311,7 +310,6 @@ def _design_beside(faces: Path) -> Path | None:
 
 
 def _serve(setting: tuple, source: int | str | None, host: str, port: int, limits: dict, as_json: bool) -> None:
-    """Answers images until Ctrl-C, or shows the pictures of a source as long as there are any."""
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
     from stcal.sfm.measurement.measure_images import Tracker

@@ -16,8 +16,7 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-Solve = Literal["joint", "chain", "paper"]
-"""Way in which the groups are solved."""
+Solve = Literal["joint", "chain", "paper"]  # way in which the groups are solved
 
 
 @app.command()

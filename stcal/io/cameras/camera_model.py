@@ -27,8 +27,7 @@ from stcal.io.files import save
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
 
-SQUARE_WITHIN = 1e-6
-"""Largest deviation from 1 of the correlation of a parameter with itself."""
+SQUARE_WITHIN = 1e-6  # largest deviation from 1 of the correlation of a parameter with itself
 
 EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
@@ -118,12 +117,10 @@ WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 PRIOR_FOCAL = 1e-3
 """Relative σ of the focal lengths if the camera file states none; as for the three constants below, a calibration of
 some weeks ago, or of another copy of the lens, is about as accurate."""
-PRIOR_CENTRE = 2e-3
-"""σ of the principal point if the camera file states none, in image widths."""
+PRIOR_CENTRE = 2e-3  # σ of the principal point if the camera file states none, in image widths
 PRIOR_RADIAL = 0.01
 """σ of k1 … k6 if the camera file states none; a tenth of the coefficient if that is larger."""
-PRIOR_TANGENTIAL = 1e-3
-"""σ of p1, p2, s1 … s4 if the camera file states none."""
+PRIOR_TANGENTIAL = 1e-3  # σ of p1, p2, s1 … s4 if the camera file states none
 
 
 def camera_prior(camera: Camera) -> CameraPrior:

@@ -14,13 +14,10 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
 from stcal.io.cameras.read import camera_of_photograph, is_photograph, read_lens, sized_camera
 
-CELLS = 24
-"""Number of grid points along the shorter side of the image."""
+CELLS = 24  # number of grid points along the shorter side of the image
 STEPS, STEP_RAD = 10, 1e-6
-LONGEST_RAD = 0.1
-"""Longest step of Newton's method for a ray."""
-MET_PX = 1e-6
-"""Largest distance between a pixel and the projection of its ray."""
+LONGEST_RAD = 0.1  # longest step of Newton's method for a ray
+MET_PX = 1e-6  # largest distance between a pixel and the projection of its ray
 LEAST_POINTS = 10
 
 
@@ -143,15 +140,12 @@ AZIMUTHS, RADII, FIT_STEPS = 72, 40, 1000
 """Numbers of azimuths of the rays, of radii along each, and of steps in the search for the edge of the image."""
 BEYOND = 0.01
 """Share of the image's size by which rays extend beyond the edge, so that they enclose the whole image."""
-FAR_PX = 1e6
-"""Residual, in px, where the fitted lens projects a ray to no pixel."""
+FAR_PX = 1e6  # residual, in px, where the fitted lens projects a ray to no pixel
 MOST_STEPS, SETTLED = 200, 1e-14
 GOOD_PX = 0.05
 """Largest residual, px, of a fit that needs no turn: a turned camera has other axes, which its user must know of."""
-TURN_HELPS = 0.5
-"""Share of the RMS residual to which a turn of the camera must bring it down."""
-HALF = 0.5
-"""Largest share by which a focal length may shrink in the fit."""
+TURN_HELPS = 0.5  # share of the RMS residual to which a turn of the camera must bring it down
+HALF = 0.5  # largest share by which a focal length may shrink in the fit
 SMALL = 1e-6
 """Step about the axis, in normalised coordinates, from which the initial focal lengths are computed."""
 
@@ -230,7 +224,6 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
 def _best(
     lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
 ) -> FittedLens:
-    """Return the fit of the model that is nearest; ``turn`` : whether the camera's axes are free."""
     best = None
     for model in CANDIDATES:
         camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)

@@ -39,10 +39,8 @@ NUMBERS = {
 """The names of COLMAP's models by their numbers in binary files and databases."""
 WRITE_AHEAD = b"\2\2"
 """Bytes 18 and 19 of a database in SQLite's mode of a write-ahead log (sqlite.org/fileformat.html, 1.3)."""
-SQUARE = 1e-9
-"""Largest ratio of skew to focal length that counts as no skew."""
-MARGIN = {2: 1, 3: 2}
-"""Number of intervals beyond the stated field of view, by the order of the spline."""
+SQUARE = 1e-9  # largest ratio of skew to focal length that counts as no skew
+MARGIN = {2: 1, 3: 2}  # number of intervals beyond the stated field of view, by the order of the spline
 
 
 @dataclass(frozen=True, slots=True, eq=False)

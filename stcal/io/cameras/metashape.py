@@ -23,8 +23,7 @@ MORE_NAMES = ("p3", "p4")
 """Parameters of Metashape up to version 1.8, and of PhotoScan, that later ones have not."""
 OTHER_KEYS = ("projection", "width", "height", "resolution")
 HARMLESS = ("date", "class", "type", "filmcamera", "sensorid")
-ROOTS = ("document", "chunk", "sensors", "sensor")
-"""Root elements of files with sensors."""
+ROOTS = ("document", "chunk", "sensors", "sensor")  # root elements of files with sensors
 KINDS = ("frame", "fisheye", "equidistant_fisheye")
 HELD_PX = 1e-3
 """σ of a parameter that was held fixed, as its effect at the corner of the image in px; without it a covariance would
@@ -138,12 +137,12 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> Camera
 
 
 def _model(colmap_model: str, names: list[str]) -> str:
+    adjusted = set(names)
     if FISHEYE in colmap_model:
-        return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
-    if "k3" in names or "k4" in names:
+        return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & adjusted else colmap_model
+    if {"k3", "k4"} & adjusted:
         return "FULL_OPENCV"
-    distorted = {"k1", "k2", "p1", "p2"} & set(names)
-    return "OPENCV" if distorted and colmap_model != "FULL_OPENCV" else colmap_model
+    return "OPENCV" if {"k1", "k2", "p1", "p2"} & adjusted and colmap_model != "FULL_OPENCV" else colmap_model
 
 
 def _theirs_by_ours() -> np.ndarray:
@@ -196,22 +195,16 @@ def cameras(camera: Camera, name: str) -> str:
     for tag, value in values.items():
         ElementTree.SubElement(element, tag).text = repr(float(value))
     if camera.covariance is not None:
-        names, matrix = _covariance(camera, camera.covariance)
+        rows = _theirs_by_ours()
+        if not camera.fisheye:
+            rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
+        by_model = rows @ intrinsic_basis(camera.colmap_model)
+        present = np.flatnonzero(by_model.any(axis=1))
+        matrix = by_model[present] @ camera.covariance @ by_model[present].T
         stated = ElementTree.SubElement(sensor, "covariance")
-        ElementTree.SubElement(stated, "params").text = " ".join(names)
+        ElementTree.SubElement(stated, "params").text = " ".join(NAMES[i] for i in present)
         ElementTree.SubElement(stated, "coeffs").text = " ".join(map(repr, matrix.ravel().tolist()))
     return _text(root)
-
-
-def _covariance(camera: Camera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
-    basis = intrinsic_basis(camera.colmap_model)
-    rows = _theirs_by_ours()
-    if not camera.fisheye:
-        rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
-    by_model = rows @ basis
-    present = np.flatnonzero(by_model.any(axis=1))
-    matrix = by_model[present] @ covariance @ by_model[present].T
-    return [NAMES[i] for i in present], matrix
 
 
 def without_sigma(camera: Camera) -> list[str]:

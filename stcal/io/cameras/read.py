@@ -41,8 +41,7 @@ from stcal.io.cameras.matlab import mat
 from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
-HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
-"""First bytes of JPEG, TIFF and PNG."""
+HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
 FILM_DIAGONAL_MM = 43.2666
 """Diagonal of 36 × 24 mm. CIPA DCG-001 states focal lengths "in 35 mm film" by the diagonal, some makers by the width;
 the two differ by 4 % in an image of 4 : 3."""
@@ -50,8 +49,7 @@ UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 """Lengths, in mm, of the values of ``FocalPlaneResolutionUnit``."""
 SIGMA_FOCAL, SIGMA_SQUARE = 0.05, 1e-3
 """Relative σ of the focal length, which EXIF states nominally and at infinity, and of the ratio of fx to fy."""
-SIGMA_CENTRE = 0.02
-"""σ of the principal point, in image widths."""
+SIGMA_CENTRE = 0.02  # σ of the principal point, in image widths
 SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 """σ of radial and tangential distortion, which EXIF does not state."""
 
@@ -160,10 +158,8 @@ MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPE
 """Numbers of coefficients of those models of mrcal that are OpenCV's."""
 MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
 """Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
-LEAST_CAMERA_BYTES = 48
-"""Bytes of a camera of ``cameras.bin`` with three parameters."""
-SIGMA_FORMS = ("colmap", "metashape-cameras")
-"""The forms that have a place for σ and correlations."""
+LEAST_CAMERA_BYTES = 48  # bytes of a camera of `cameras.bin` with three parameters
+SIGMA_FORMS = ("colmap", "metashape-cameras")  # the forms that have a place for σ and correlations
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,24 +206,19 @@ def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
 
 
 def _region(stated: object) -> np.ndarray | None:
-    """Return mrcal's polygon (n, 2), px, in which the intrinsics are valid; None if the file states none."""
     try:
-        region = None if stated is None else np.array(stated, float)
+        region = np.array([] if stated is None else stated, float)
     except (TypeError, ValueError):
         region = np.full(1, np.nan)  # refused below
-    if region is not None and not region.size:
-        return None
-    if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
+    if region.size and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
         raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
-    return region
+    return region if region.size else None
 
 
 def is_colmap_binary(content: bytes) -> bool:
     """Return True if a file begins with a number of cameras that it is long enough for; a text states a huge one."""
-    if len(content) < 8:
-        return False
-    (count,) = struct.unpack_from("<Q", content, 0)
-    return count <= (len(content) - 8) // LEAST_CAMERA_BYTES
+    count = int.from_bytes(content[:8], "little")
+    return len(content) >= 8 and count <= (len(content) - 8) // LEAST_CAMERA_BYTES
 
 
 def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.ForeignLens:
@@ -252,25 +243,16 @@ def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.For
 def name_to_write(name: str) -> str:
     """Return a name that every form can hold, of the name that chose a camera: ``Cam_B_35mm`` of ``Cam B (35mm)``,
     ``cam1`` of 1, ``cam0`` of none."""
-    word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
-    if not word:
-        return "cam0"
+    word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "cam0"
     return word if word[0].isalpha() else f"cam{word}"
 
 
 def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera in one of :data:`WRITERS`, with its name where the form has a place for it; refuse a
-    lens that the form cannot hold, and a name that is no word."""
-    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise InputError(
-            "E-CAMERA-NAME", f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0"
-        )
-    lost = []
-    if camera.covariance is not None and form not in SIGMA_FORMS:
-        lost.append("σ and correlations of the parameters")
-    if camera.covariance is not None and form == "metashape-cameras":
-        lost += metashape.without_sigma(camera)
-    return Written(WRITERS[form](camera, name), tuple(lost))
+    """Return the file of a camera in one of :data:`WRITERS`, with its name, a word, where the form has a place for it;
+    refuse a lens that the form cannot hold."""
+    lost = ["σ and correlations of the parameters"] * (form not in SIGMA_FORMS)
+    lost += metashape.without_sigma(camera) if form == "metashape-cameras" else []
+    return Written(WRITERS[form](camera, name), tuple(lost) if camera.covariance is not None else ())
 
 
 def _colmap_binary(camera: Camera, _: str) -> bytes:
@@ -282,16 +264,14 @@ def _colmap_binary(camera: Camera, _: str) -> bytes:
 
 def _fisheye_four(camera: Camera, form: str) -> list[float]:
     """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
-    others = [*camera.distortion[2:4], *camera.distortion[8:]]
-    if any(others):
+    if camera.distortion[2:4].any() or camera.distortion[8:].any():
         raise foreign.refused(camera, form, "p1, p2 and prisms")
-    return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
+    return camera.distortion[[0, 1, 4, 5]].tolist()
 
 
 def _coefficients(camera: Camera) -> list[float]:
     """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
-    count = 8 if camera.distortion[5:8].any() else 5
-    return [float(k) for k in camera.distortion[:count]]
+    return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
 
 
 def _matrix(camera: Camera) -> list[float]:
@@ -313,9 +293,8 @@ def _opencv(camera: Camera, _: str) -> str:
 def _ros(camera: Camera, name: str) -> str:
     values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
     kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
-    k = _matrix(camera)
+    k, eye = _matrix(camera), np.eye(3).ravel().tolist()
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
-    eye = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
     def node(rows: int, data: list[float]) -> str:
         return f"\n  rows: {rows}\n  cols: {len(data) // rows}\n  data: {data}\n"
@@ -331,12 +310,12 @@ def _kalibr(camera: Camera, name: str) -> str:
     if camera.fisheye:
         kind, values = "equidistant", _fisheye_four(camera, "kalibr")
     else:
-        kind, values = "radtan", [float(k) for k in camera.distortion[:4]]
+        kind, values = "radtan", camera.distortion[:4].tolist()
         if camera.distortion[4:].any():
             raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
-    lens = [*camera.focal.tolist(), *camera.centre.tolist()]
     return (
-        f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
+        f"{name}:\n  camera_model: pinhole\n  intrinsics: {camera.parameters()[:4].tolist()}\n"
+        f"  distortion_model: {kind}\n"
         f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
     )
 
@@ -347,10 +326,9 @@ def _mrcal(camera: Camera, _: str) -> str:
     values = _coefficients(camera) if camera.distortion.any() else []
     values = values[:4] if len(values) == 5 and not values[4] else values
     lens = next(name for name, count in MRCAL.items() if count == len(values))
-    numbers = [*camera.focal.tolist(), *camera.centre.tolist(), *values]
     return (
-        f"{{\n    'lensmodel': '{lens}',\n    'intrinsics': {numbers},\n    'extrinsics': [0, 0, 0, 0, 0, 0],\n"
-        f"    'imagersize': [{camera.width}, {camera.height}]\n}}\n"
+        f"{{\n    'lensmodel': '{lens}',\n    'intrinsics': {[*camera.parameters()[:4].tolist(), *values]},\n"
+        f"    'extrinsics': [0, 0, 0, 0, 0, 0],\n    'imagersize': [{camera.width}, {camera.height}]\n}}\n"
     )
 
 
@@ -368,8 +346,7 @@ WRITERS: Mapping[str, Callable[[Camera, str], str | bytes]] = {
 """Writers by form: each returns the file of a camera and its name."""
 
 
-SQLITE = b"SQLite format 3\0"
-"""First bytes of an SQLite database."""
+SQLITE = b"SQLite format 3\0"  # first bytes of an SQLite database
 COLMAP_LINE = re.compile(r"\A(?:[ \t]*(?:#[^\r\n]*)?[\r\n])*[ \t]*[^\s{<]+[ \t]+[A-Z][A-Z0-9_]+(?:[ \t]+\S+){3}")
 """First line of COLMAP's ``cameras.txt`` : a number, a model, and at least three numbers."""
 
@@ -543,8 +520,7 @@ TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraMode
 
 WRITTEN_PX = 1e-6
 """Largest difference of a projected point, px. Forms with few decimals, such as OpenCV's, round by 1e-8 px."""
-ACROSS = 9
-"""Number of points across the image, and down it, by which cameras are compared."""
+ACROSS = 9  # number of points across the image, and down it, by which cameras are compared
 
 
 @require_arguments
