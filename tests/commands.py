@@ -154,7 +154,6 @@ CALLS = (
     Call("camera convert", "@cameras/matlab.mat >camera.mat"),
     Call("camera convert", "@cameras/cameras.bin >camera.xml"),
     *(Call("camera show", f"@cameras/{name}") for name in ("camchain.yaml", "camera.cameramodel", "metashape.xml")),
-    Call("camera show", "@cameras/industrial.yaml --size 324x216"),
     Call("camera compare", "@cameras/sigma.txt @cameras/opencv.yaml --plot >camera.svg", 1.0),
     Call("robot init", "+robot.toml"),
     Call("robot convert", "@robot/made.toml >robot.urdf"),

@@ -235,9 +235,9 @@ class TagEntry(Strict):
         if self.x_mm is None or self.y_mm is None or self.size_mm is None:
             needed = f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
             raise InputError("E-TAG-PLACE", needed)
-        square, angle = self.size_mm * UNIT_SQUARE, np.radians(self.angle_deg)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
+        angle = np.radians(self.angle_deg)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return self.size_mm * UNIT_SQUARE @ turn + [self.x_mm, self.y_mm]
 
 
 class TagsFile(Sized):
@@ -386,17 +386,12 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
-    """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
+    """Return the board of a file of any kind (form: ``data_layout.md``), board frame, mm; without ``type`` one of dots.
 
     Parameters
     ----------
     path : str or Path
         The file: TOML, or Kalibr's YAML.
-
-    Returns
-    -------
-    BoardDesign or another board design
-        Board frame, mm.
 
     Raises InputError: the file is unreadable, invalid for its kind, or of several boards; the message names file, place
     and reason.
@@ -406,30 +401,21 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 
 def load_dots(path: str | Path) -> BoardDesign:
     """Read a board of dots; errors as :func:`load_flat_board`, and for a file of another kind of board."""
-    content = board_content(path)
-    kind = "circles" if content is None else content.get("type", content.get("target_type", "circles"))
-    if kind != "circles":
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"board file {path}: {kind}; a board of dots needed here: `calibrate-camera`, `handeye` and `locate` "
-            "take others",
-        )
-    return _dots(load_toml(path, _Dots, "board file", INIT), f"board file {path}")
+    board = load_flat_board(path)
+    if isinstance(board, BoardDesign):
+        return board
+    dots = "a board of dots needed here: `calibrate-camera`, `handeye` and `locate` take others"
+    raise InputError("E-BOARD-TYPE", f"board file {path}: {TYPES[type(board)]}; {dots}")
 
 
 def load_board(path: str | Path) -> BoardDesign:
-    """Read the file of a board beside a target: dots, asymmetric circles as places of a lattice, or points of a board
-    of squares or tags.
+    """Return the board beside a target, board frame, mm: dots, asymmetric circles as places of a lattice, or points of
+    a board of squares or tags.
 
     Parameters
     ----------
     path : str or Path
         ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
-
-    Returns
-    -------
-    BoardDesign
-        Board frame, mm.
 
     Raises InputError: as :func:`load_flat_board`; or its circles have no radius.
     """

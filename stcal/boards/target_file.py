@@ -133,7 +133,7 @@ class _TargetFile(Sized):
 
 
 def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
-    """Read ``target.toml`` with faces of circles, boards and tags.
+    """Return the target of ``target.toml``: faces of circles, boards and tags in their own frames, mm.
 
     Parameters
     ----------
@@ -141,11 +141,6 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
         The file (form: ``data_layout.md``).
     printed : bool
         False if faces with a board or tags are to be refused.
-
-    Returns
-    -------
-    TargetDesign
-        Faces in their own frames, mm.
 
     Raises InputError: the file cannot be read or is no design, or has a tag on two faces; the message names file, place
     and reason.

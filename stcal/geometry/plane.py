@@ -43,12 +43,6 @@ def shape_of_square(square: np.ndarray) -> np.ndarray:
     return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
 
 
-MAX_STEPS = 100
-EXACT = 1e-22
-"""Largest predicted decrease at the minimum of a pose, in squared normalised coordinates: a step of a hundred-billionth
-of the distance."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
     """The plane ``normal · xyz = offset``."""
@@ -183,6 +177,12 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
         h = -h
     rotation, _ = best_rotations(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
     return Rigid(rotation, h[:, 2])
+
+
+MAX_STEPS = 100
+EXACT = 1e-22
+"""Largest predicted decrease at the minimum of a pose, in squared normalised coordinates: a step of a hundred-billionth
+of the distance."""
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:

@@ -142,11 +142,9 @@ def body_camera(width: int) -> Camera:
     width : int
         Width of its images, px.
     """
-    height = round(width * 2 / 3)
-    focal = 1.1 * width
-    distortion = np.array([-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0])
-    centre = np.array([width / 2 + 0.006 * width, height / 2 - 0.004 * width])
-    return Camera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
+    height, distortion = round(width * 2 / 3), [-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0]
+    centre = width / 2 + 0.006 * width, height / 2 - 0.004 * width
+    return Camera(width, height, [1.1 * width] * 2, centre, distortion, False, "OPENCV")
 
 
 @require_arguments
@@ -310,10 +308,9 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarr
         plate = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     low, high = plate.min(0), plate.max(0)
     px_mm = DRAWING_PX / float((high - low).max())
-    width, height = np.ceil((high - low) * px_mm).astype(int)
+    width, height = np.ceil((high - low) * px_mm).astype(int).tolist()
     ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
-
-    size = int(height), int(width)
+    size = height, width
     grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
     solid = covered_share([[(plate - low) * px_mm]], size)
     if off_mm is None:

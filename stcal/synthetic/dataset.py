@@ -16,6 +16,7 @@ from stcal.boards.target_file import save_target
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.read import save_camera
+from stcal.io.files import unwritable
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
@@ -172,9 +173,7 @@ def new_dataset(folder: Path) -> Iterator[None]:
         if not existed and folder.is_dir():
             folder.rmdir()
         if isinstance(error, OSError):
-            raise InputError(
-                "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
-            ) from error
+            raise unwritable(folder, error) from error
         raise
 
 
@@ -208,9 +207,8 @@ def write_dataset(
     """
     folder, options = Path(folder), render_options or RenderOptions()
     if image_format not in IMAGE_FORMATS:
-        raise InputError(
-            "E-OPTION-FORM", f"data set: image format {image_format}, one of {', '.join(IMAGE_FORMATS)} needed"
-        )
+        known = ", ".join(IMAGE_FORMATS)
+        raise InputError("E-OPTION-FORM", f"data set: image format {image_format}, one of {known} needed")
     if image_format == "jpg" and options.bit_depth != 8:
         raise InputError("E-OPTION-FORM", f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
     if not 1 <= jpeg_quality <= 100:
@@ -250,6 +248,4 @@ def _write_image(make: Callable[..., np.ndarray], path: Path, arguments: tuple, 
     try:
         path.write_bytes(data)
     except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"image {path}: {error.strerror or error}; free space or choose another folder"
-        ) from error
+        raise unwritable(path, error) from error

@@ -50,10 +50,8 @@ class ThinLens:
     def __post_init__(self):
         require_fields(self, "lens")
         for name in ("f_number", "focal_mm", "focus_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(
-                    "E-SIMULATE-OPTIONS", f"lens: {name} {getattr(self, name):g}, a positive number needed"
-                )
+            if (value := getattr(self, name)) <= 0:
+                raise InputError("E-SIMULATE-OPTIONS", f"lens: {name} {value:g}, a positive number needed")
         if self.focus_mm <= self.focal_mm:
             raise InputError(
                 "E-SIMULATE-OPTIONS",
@@ -170,9 +168,8 @@ def expose(
     Saturated pixels of the photograph are taken to have the light of white. The noise of the exposures is independent.
     """
     if photograph.dtype != np.uint8 or photograph.ndim != 2:
-        raise InputError(
-            "E-IMAGE-TYPE", f"photograph: {photograph.dtype} of shape {photograph.shape}; 8-bit grey needed"
-        )
+        kind = f"{photograph.dtype} of shape {photograph.shape}"
+        raise InputError("E-IMAGE-TYPE", f"photograph: {kind}; 8-bit grey needed")
     if not all(time > 0 for time in times):
         raise InputError("E-EXPOSURES-VALUE", "exposure times: positive numbers needed")
     rng, exposures = np.random.default_rng(seed), []

@@ -202,8 +202,7 @@ def make_scene(
         return _seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
     target, board = target or reference_target(), board or reference_board()
     nominal = nominal or target.rough_poses()
-    missing = [face.id for face in target.faces if face.id not in nominal]
-    if missing:
+    if missing := [face.id for face in target.faces if face.id not in nominal]:
         raise InputError("E-TARGET-ROUGH-POSE", f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)

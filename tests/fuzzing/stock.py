@@ -126,7 +126,6 @@ def _cameras(folder: Path) -> None:
     storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     storage.write("distortion_coefficients", given.distortion[None, :5].copy())
     storage.release()
-    (forms / "industrial.yaml").write_text(f"intrinsics:\n  fx: {fx}\n  fy: {fy}\n  cx: {cx}\n  cy: {cy}\n")
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))

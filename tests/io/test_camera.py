@@ -126,19 +126,6 @@ def test_the_smallest_colmap_model_that_holds_it(tmp_path, distortion, expected)
     assert read(tmp_path, yaml_text(d=distortion)).colmap_model == expected
 
 
-def test_ros_industrial(tmp_path):
-    """Its form has no distortion, but the lens may have some: OPENCV, so that it can be adjusted."""
-    path = tmp_path / "cal_data.yaml"
-    path.write_text("data: []\nintrinsics:\n  fx: 1352.5  # px\n  fy: 1356\n  cx: 789.7\n  cy: 627.3\n")
-    camera = read_camera(path)
-    assert camera.focal.tolist() == [1352.5, 1356]
-    assert camera.centre.tolist() == [789.7, 627.3]
-    assert (camera.colmap_model, camera.width) == ("OPENCV", None)
-    path.write_text("intrinsics:\n  fx: 1352.5\n  cx: 789.7\n")
-    with fails_with("E-CAMERA-CONTENT … fy"):
-        read_camera(path)
-
-
 def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):
     model = read(tmp_path, yaml_text())
     assert (model.width, model.height) == (None, None)

@@ -61,12 +61,6 @@ def test_the_command_knows_every_form():
     assert get_args(Form) == tuple(WRITERS)
 
 
-@pytest.mark.parametrize("name", ["", "a: b", "0", "left\n", "é", "../cam"])
-def test_a_name_that_a_file_may_not_hold_is_refused(name):
-    with fails_with("E-CAMERA-NAME"):
-        written(camera_of("PINHOLE"), "kalibr", name)
-
-
 def test_a_comment_does_not_tell_the_form(tmp_path):
     text = "# as the lensmodel of mrcal\n1 PINHOLE 1280 961 812.25 809.5 640.125 478.0625\n"
     (tmp_path / "cameras.txt").write_text(text)
