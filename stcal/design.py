@@ -146,8 +146,7 @@ class FaceDesign(Brief):
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A measured distance between two points of the target, mm, with its σ: a scale bar; ``drawn`` : True if it is that
-    of the drawing, and defines the unit of a target of which no size is known."""
+    """A measured distance between two points of the target, mm, with σ; ``drawn`` : it defines the unit."""
 
     first: CircleLabel
     second: CircleLabel
@@ -431,8 +430,7 @@ def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleReference(BoardDesign):
-    """All that a run takes its scale from: the board, of no rows and columns if there is none, faces of known shape,
-    and known distances."""
+    """All that a run takes its scale from: the board, if any, faces of known shape, and known distances."""
 
     faces: tuple[FaceDesign, ...] = ()
     distances: tuple[KnownDistance, ...] = ()
@@ -471,8 +469,7 @@ DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit wh
 
 
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
-    """Returns the design with one drawn distance as the unit: the longest on a face that most images, by their labels,
-    see whole."""
+    """Returns the design with one drawn distance as the unit: the longest on the face that most images see whole."""
     views = [set(labels) for labels in images]
     best: tuple[int, float, KnownDistance] | None = None
     for face in target.faces:

@@ -15,8 +15,6 @@ MIN_COMMON = 4
 BLOCK = 4000  # number of motions tested together, which bounds the memory for patterns of many circles
 MOST_CIRCLES = 100
 """Largest number of circles of a pattern that is compared as a whole; larger ones take minutes."""
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -33,8 +33,6 @@ FOR_WORKERS: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1"
 AT_ONCE = 4  # number of jobs that are handed over for each process, so that the next ones are there when one is done
 _limited = threading.Lock()
 _one_starts = threading.Lock()
-
-
 LOCK = ".lock"  # file of a scratch folder; the system releases it when its process ends, in whatever way
 YOUNG_S = 1.0  # age below which such a file may not be locked yet
 

@@ -87,8 +87,6 @@ class CharucoDesign(Distinct):
 
 UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 """Corners of a tag of side 1 about its middle: top left, top right, bottom right, bottom left."""
-
-
 NESTED = 0.5
 """Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 
@@ -349,8 +347,6 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign
-
-
 TAG_SIGMA_MM = 0.05
 """σ of a corner of a tag if its file states none: print on paper that is glued on."""
 PLACE_DIGITS = 6  # decimals, mm, to which the places of points are the same row or column

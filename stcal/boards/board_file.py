@@ -48,7 +48,6 @@ OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_m
 LEAST_PPM, LEAST_PITCH_PPM = 1e-3, 0.1
 """Smallest expansion, ppm/K, and σ of a pitch, ppm, that anyone can state: less is in 1/K, or a fraction or mm."""
 LEAST_C, MOST_C = -100.0, 200.0
-
 Index = Annotated[int, Field(ge=0, strict=True)]
 RimHeight = Annotated[float, Field(ge=-20, le=20)]
 """Height in mm of a rim in front of a circle; negative for a disc that is raised from its plate."""

@@ -177,8 +177,7 @@ ROBUST_PASSES = 10
 LEAST_SCATTER_PX = 0.05
 """Smallest scatter of corners about a smooth field, px: printing and lenses cause it even in sharp views."""
 GATE = 5.0
-"""Largest deviation of a corner from the prediction by its neighbours, in robust σ of the view or, if larger, of the
-neighbours themselves, as of a bent board."""
+"""Largest deviation of a corner from its prediction, in robust σ of the view or, if larger, of the neighbours."""
 SMOOTHING_PX = 0.8  # σ of the smoothing before gradients are taken
 ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2  # area of pixels that smoothing makes alike, px²
 LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 30  # limits of half the side of a window, px

@@ -21,16 +21,14 @@ KEYS = ("tag_bundles", "standalone_tags")
 Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
-"""Number in a row of a chessboard. A grid with fewer inner corners is not recognised as a chessboard; fewer squares
-have all inner corners on one line."""
+"""Number in a row of a chessboard. Smaller grids are not recognised, or have all inner corners on one line."""
 FAMILY = "tag36h11"
 """The family where the file names none: settings.yaml of apriltag_ros does."""
 METRE_MM = 1000.0
 FLAT_MM, FLAT_RAD = 0.01, 1e-3
 """Largest deviation of tags from one plane: what a file rounds off."""
 CORNERS = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
-"""Corners of a tag of side 1 in its frame (X right, Y up), in the order of OpenCV, which draws tags of this family half
-a turn from AprilTag's own pictures."""
+"""Corners of a tag of side 1 (X right, Y up), in the order of OpenCV, which draws this family half a turn round."""
 UPRIGHT = np.roll(CORNERS, 2, axis=0)
 """The same of a tag that stands as OpenCV draws it, and of families that OpenCV lacks."""
 
@@ -115,7 +113,6 @@ LEAST_GAP = 0.1
 SAME_WITHIN = 1e-6  # largest relative difference between the sides of a square
 KALIBR_FAMILY = "DICT_APRILTAG_36h11"
 KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
-
 Metres = Annotated[Positive, AfterValidator(_metres)]
 
 

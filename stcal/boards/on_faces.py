@@ -21,15 +21,13 @@ MOST_READ, LOOKED_AT = 12, 5
 """Largest numbers of images in which tags of no face, and tags of other kinds, are looked for."""
 MOST_TILT_DEG = 70.0
 LEAST_COSINE = float(np.cos(np.radians(MOST_TILT_DEG)))
-"""Largest tilt, and its cosine, beyond which the corners of a tag are left out, as its edges meet at sharp angles:
-drawn tags had errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond."""
+"""Largest tilt of tags, and its cosine: beyond, corners had errors of 0.27 to 0.45 px RMS in place of 0.06."""
 
 
 def find_on_faces(
     image: np.ndarray, name: str, boards: Mapping[str, FlatBoard], camera: Camera
 ) -> tuple[dict[str, BoardView], list[str]]:
-    """Return the views of the boards and tags in a grey image by face, and notes on what was left out. Each dictionary
-    is searched once for all faces: a face of which no tag is read is not searched for corners."""
+    """Return the views of boards and tags in a grey image by face, and notes on what was left out."""
     of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
     of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
     tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
@@ -97,8 +95,7 @@ def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
 
 
 def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns how far the lens moves the measured corners (n, 4, 2) of tags: straight lines are laid along its curves.
-    A line along an edge of 100 px near the border of an image is off its ends by 0.1 px with usual lenses."""
+    """Returns how far the lens moves the measured corners (n, 4, 2) of tags, as lines are laid along its curves."""
     ideal = camera.normalised_from_pixel(corners_px)
     step = (np.roll(ideal, -1, axis=1) - ideal)[:, :, None]
     edge = camera.pixel_from_normalised(ideal[:, :, None] + np.linspace(*ALONG, POINTS)[:, None] * step)

@@ -204,8 +204,7 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
 def _refined(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return refined corners and covariances where all edges are visible, and the way of motion during the exposure;
-    ``white`` : (n,) white inside the edges."""
+    """Return corners and covariances, refined where all edges are seen, and motion; ``white`` : (n,) white inside."""
     if white.any():
         refined, covariance, smears = np.array(corners), np.zeros((len(corners), 8, 8)), [0.0, 0.0]
         for i, (colour, picture) in enumerate(((~white, grey), (white, 255 - grey))):

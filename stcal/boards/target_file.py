@@ -55,7 +55,6 @@ MIN_DIRECTION = 1e-6
 MAX_SKEW_DEG = 5.0  # largest deviation from a right angle between X and normal of a rough pose
 INWARDS = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 """Turns a frame whose Z points out of a body into that of a board or tag, whose Z points into it."""
-
 Vector = tuple[Finite, Finite, Finite]
 Outline = Annotated[list[tuple[Finite, Finite]], Field(min_length=3, max_length=1000)]
 Name = Annotated[

@@ -12,12 +12,8 @@ if TYPE_CHECKING:
     from stcal.io.cameras.difference import LoadedLens
 
 app = group("stcal camera", "Show, convert and compare camera files of this and other programs.")
-
-
 Form = Literal["colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"]
 """Format of a camera file."""
-
-
 NameOption = Annotated[
     str, "Choose this camera from a file of several, such as cam1 or 2; it is also the name that is written."
 ]

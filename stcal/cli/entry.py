@@ -44,8 +44,7 @@ def _run(name: str) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Opens the null device in place of closed standard streams (`>&-`), whose numbers the first files would take, so
-    that C libraries print into these."""
+    """Opens the null device in place of closed standard streams (`>&-`), into which C libraries would print."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

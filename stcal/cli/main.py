@@ -31,7 +31,6 @@ LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy":
 RESUMED = {"run", "detect"}  # commands that keep finished detections when they are interrupted
 # The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
-
 app = group("stcal", "Calibrate stereo targets from photographs of a single camera, and measure with them.")
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
@@ -62,8 +61,7 @@ def _version(
 
 
 def environment() -> dict[str, str]:
-    """Returns versions by name: stcal, Python, system, libraries or that one is missing, the native COLMAP on the
-    PATH."""
+    """Returns versions by name: stcal, Python, system, libraries, and the native COLMAP on the PATH."""
     from stcal.sfm.interop.native import find_colmap
 
     version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}

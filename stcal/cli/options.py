@@ -115,11 +115,8 @@ _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
-
 Scheduler = Annotated[str | None, "Send the images to the Dask scheduler at this address, tcp://host:8786."]
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
-
-
 Quaternions = Annotated[
     Literal["wxyz", "xyzw"], "Read quaternions by the names of their columns, or in their order as x, y, z, w (xyzw)."
 ]
@@ -135,8 +132,6 @@ MinDiameter = Annotated[
     float | None, "Ignore circles smaller than this, px; 4.5, 9 over 8 megapixels, if not given.", Opt(min=4, max=1e6)
 ]
 MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8, max=1e6)]
-
-
 FirstTable = Annotated[Path | None, "Read rows from this file (CSV), and join those of --b.", Opt("--a")]
 SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
@@ -281,8 +276,7 @@ def protect_outputs(application: typer.Typer) -> None:
 
 
 def _grouped(command: Callable) -> Callable:
-    """Returns the command with the options of each group, a dataclass, as parameters. An instance as a group's default
-    has their defaults."""
+    """Returns the command with the options of each group, a dataclass, as parameters, and an instance's defaults."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, type] = {
         name: each.annotation

@@ -28,7 +28,6 @@ LEFT_FROM_S = 2.0  # shortest remaining time that a stage shows, s
 STANDARD_OUTPUT = Path("-")  # name that means standard output instead of a JSON file
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
-
 _quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
 _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
 
@@ -50,8 +49,7 @@ def verbose() -> bool:
 
 
 class StageProgress:
-    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else plain lines, or
-    quiet."""
+    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else lines, or quiet."""
 
     def __init__(self):
         self.bar = None
@@ -130,8 +128,7 @@ def said_apart() -> Iterator[None]:
 
 @contextmanager
 def printed_last() -> Iterator[None]:
-    """Holds back what is printed within the context, in which files are written: a reader such as ``head`` may end the
-    command as soon as it has its lines."""
+    """Holds back what is printed while files are written: ``head`` ends a command as soon as it has its lines."""
     held = StringIO()
     try:
         with redirect_stdout(held):

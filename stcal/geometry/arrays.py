@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, DTypeLike
 from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
-
 LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
@@ -71,8 +70,7 @@ def _same(one: Any, two: Any) -> bool:
 
 
 class Brief(ByValue):
-    """Base of results, made with ``@dataclass(eq=False, repr=False)``, that show plain values, notes, and the size of
-    everything else in one line."""
+    """Base of results (``@dataclass(eq=False, repr=False)``) that show values, notes, and sizes in one line."""
 
     __slots__ = ()
 

@@ -34,8 +34,6 @@ COLMAP_LAYOUT = {
 COLMAP_MODELS = tuple(COLMAP_LAYOUT)  # camera models that stcal supports
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 FISHEYE = "FISHEYE"  # part of the names of COLMAP's equidistant models
-
-
 MAX_FOCAL_RATIO = 10.0  # largest ratio between fx and fy; anamorphic lenses have 2
 FARTHEST = 1e12  # largest value of any parameter, whose square does not overflow
 MAX_SIDE_PX = 1_000_000  # longest image side that a camera file may state, px
@@ -139,8 +137,7 @@ class Camera(ByValue):
         return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
 
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four, without
-        prisms."""
+        """Return OpenCV's camera matrix (3, 3) and its 4, 5, 8 or 12 coefficients; four of a fisheye without prisms."""
         matrix = np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]])
         if not self.fisheye:
             count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
@@ -269,8 +266,7 @@ class Camera(ByValue):
         return moved_x, moved_y
 
     def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the distortion folds the image
-        over."""
+        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the image is folded over."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
             return self._perspective(target.copy(), target)

@@ -13,15 +13,13 @@ from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 200
 SETTLED = 1e-12
-"""Largest predicted decrease of the last step, as a share of the cost. At a cost of 10⁴ such a step moves no parameter
-by more than 1e-4 σ, and the remaining error is far smaller."""
+"""Largest predicted decrease of the last step, as a share of the cost; such a step moves nothing by 1e-4 σ."""
 LEAST_GAIN = 1e-12
 """Decrease that rounding alone predicts for exact data, in units of σ²: a step of a millionth of σ."""
 ROUNDING = 1e-12  # share of the cost by which rounding may seem to raise the cost at the minimum
 MAX_DAMPING = 1e12
 UNKEPT, KEPT = 1e-8, 0.1
-"""A descent ends if the predicted decrease is at most ``UNKEPT``, in units of σ², and the actual decrease is less than
-the share ``KEPT`` of it: what remains is rounding."""
+"""A descent ends if a decrease of at most ``UNKEPT`` σ² is predicted, and less than ``KEPT`` of it comes."""
 TRUSTED = 0.5  # ratio of actual to predicted decrease above which the damping shrinks; below KEPT it grows
 DAMPED = 1e-4
 """Largest predicted decrease of an undamped step at which a damped descent counts as ended, in units of σ²: a step of a
@@ -29,8 +27,7 @@ hundredth of σ. Where the derivatives neglect the curvature of the residuals, o
 NEARLY_WHOLE = 1e-3
 """Largest damping at which a step's predicted decrease stands for that of the undamped step."""
 SLOW = 0.01
-"""A problem whose cost exceeds the best one by more than ``hopeless`` is given up when its predicted decrease is less
-than this share of the excess: with large residuals the last steps are many and short."""
+"""A problem whose excess over the best cost is beyond ``hopeless`` is given up if it falls by less than this share."""
 TINY = 1e-300
 
 
@@ -167,8 +164,7 @@ def minimise(
 
 MAX_POSE_STEPS = 60
 ACCEPTED = 1e-2
-"""Largest predicted decrease, in σ², that counts as settled after the last step: a tenth of σ. In a flat valley steps
-are many and short."""
+"""Largest predicted decrease, in σ², that counts as settled after the last step: flat valleys need many steps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

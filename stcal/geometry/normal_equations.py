@@ -10,7 +10,6 @@ from stcal.geometry.rigid import skew
 
 SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
-
 TINY = 1e-300
 SPARSE = 0.1  # share of entries that are not 0 below which a product of sparse matrices is faster
 LARGE = 100  # number of unknowns of a block from which on its inverse is computed from Cholesky's factors

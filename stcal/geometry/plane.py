@@ -106,8 +106,7 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
 
 
 def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the homographies (k, 3, 3) of k sets of pairs, (k, n, 2), each of the four or more that ``used`` (k, n)
-    marks; NaN where they do not determine it."""
+    """Return homographies (k, 3, 3) of k sets of pairs (k, n, 2) among ``used`` (k, n); NaN if undetermined."""
     count, on = used.sum(1), used[..., None]
 
     def normalised(p):
@@ -181,8 +180,7 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 
 MAX_STEPS = 100
 EXACT = 1e-22
-"""Largest predicted decrease at the minimum of a pose, in squared normalised coordinates: a step of a hundred-billionth
-of the distance."""
+"""Largest predicted decrease at a pose's minimum, in squared normalised coordinates."""
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
@@ -207,14 +205,12 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
 
 
 OUTLIER = 6.0
-"""Length of an outlier, in stated σ or the residuals' robust σ, whichever is larger; chance exceeds it for one point in
-6·10⁷ (Rayleigh)."""
+"""Length of an outlier, in the larger of stated and robust σ; chance exceeds it in one of 6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
 """Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
 SAME = 1.0  # distance, in σ, below which two minima count as one: the covariance covers both
 WIDER = 1.1
-"""Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
-loss."""
+"""Increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's loss."""
 MAX_SIGMA_RAD = 0.5  # largest σ of a usable rotation; beyond it linear error propagation is meaningless
 Descend = Callable[[Poses, float], Minima]
 """Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""

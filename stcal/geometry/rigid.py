@@ -19,8 +19,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import MYPY, Array, Brief, ByValue, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
-"""Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
-order of the columns."""
+"""Order of a quaternion's components; in tables by the names of columns (``wxyz``), or by their order (``xyzw``)."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
@@ -205,8 +204,7 @@ class Rigid(ByValue, _Frames):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity(ByValue):
-    """A similarity a_from_b, ``xyz_a = scale * rotation @ xyz_b + translation``, as from COLMAP's world, which has no
-    unit."""
+    """A similarity a_from_b, ``xyz_a = scale * rotation @ xyz_b + translation``, as from COLMAP's unitless world."""
 
     scale: float
     rigid: Rigid
@@ -396,8 +394,7 @@ class Affine(ByValue):
 
 
 def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields points (m, 3) with their axes in every other order and with every other sign: what stands in place of x, y
-    and z, such as ``y, x, −z``, and the points."""
+    """Yields points (m, 3) in every other order and sign of their axes: its name, like ``y, x, −z``, and the points."""
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         if (order, signs) != ((0, 1, 2), (1, 1, 1)):
             names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))

@@ -6,8 +6,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri
 
 HUBER = 3.0
-"""Limit of Huber's loss for the length of two coordinates over their robust σ. One inlier in ninety is longer, and
-loses hardly any weight."""
+"""Limit of Huber's loss for the length of two coordinates over their robust σ; one inlier in ninety is longer."""
 
 
 def length_limit(coordinates: int, beyond: float) -> float:
@@ -50,8 +49,7 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
 
 
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:
-    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F, by its lower
-    tail, which stays exact for small probabilities."""
+    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F."""
     return float(1 / fdtri(redundancy, freedom, beyond))
 
 
@@ -87,8 +85,7 @@ def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1
 
 
 def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m), of those ``among`` (n, m); NaN without
-    any."""
+    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m) ``among`` these (n, m); NaN of none."""
     ordered = np.sort(np.where(among, length, np.inf), axis=1)
     count = among.sum(1)
     middle = np.maximum(np.stack([(count - 1) // 2, count // 2], 1), 0)

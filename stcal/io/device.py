@@ -236,13 +236,11 @@ def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, 
 AUTO = "auto"
 SMALL_PX = 240  # longer side of the frames that are compared, px
 MOVED = 0.04
-"""Move of the parts that move most, as a share of the longer side, from which on a view is another: two degrees for
-a lens of medium focal length."""
+"""Move of the parts that move most, share of the longer side, from which a view is another: about two degrees."""
 MOVING = 90
 """Percentile of the moves of pixels: a body before a resting background has few pixels."""
 SHARP_BLUR_PX = 2.0
-"""σ, px, of the blur that measures the sharpness of a frame: a frame that is already blurred as much hardly loses
-detail by it."""
+"""σ, px, of the blur that measures a frame's sharpness: an already blurred one loses hardly any detail."""
 EDGE_SHARE = 0.05  # share of the pixels that are taken for edges
 ALL, NEXT, BEFORE = slice(None), slice(1, None), slice(None, -1)
 DIRECTIONS = (

@@ -84,8 +84,7 @@ RUN_ENTRIES = (
 )
 """Files and folders of a run or, ``detections.csv`` and ``overlays``, of a detection alone."""
 NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
-"""Suffixes of outputs that no command reads from a folder. Besides a run's entries, commands read images, YAML poses,
-and COLMAP's models and databases from folders."""
+"""Suffixes of outputs that no command reads from a folder, beside a run's entries."""
 
 
 def unwritable(path: Path, error: OSError) -> InputError:
@@ -215,8 +214,7 @@ def json_text(content) -> str:
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, outputs (option, path) that would replace an input, a file in an input folder, or each
-    other."""
+    """Refuse, before the work, outputs (option, path) that would replace an input, a file of it, or each other."""
     places: dict[Path, str] = {}
     for option, path in outputs:
         place, what = real_place(path), f"{option} {path}"

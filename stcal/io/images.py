@@ -35,36 +35,28 @@ UNPACKED = (".png", ".tif", ".tiff", ".bmp")
 EXCLUDED = "taken out with --exclude"
 HOLDS_IMAGES = "it holds images"  # part of the reason why a folder is left out
 TOP_GROUP = "."  # name of the group that images lying directly in the folder form
-
 NOISE_BLUR_PX = 1.5  # σ of the blur that removes noise
 SAME_NOISE = 1.2
-"""Largest RMS difference between two files of one photograph, in units of its RMS noise: a JPEG of low quality differs
-by 1.1, two exposures by 1.5."""
+"""Largest RMS difference of two files of one photograph, over its noise: JPEG differs by 1.1, exposures by 1.5."""
 SAME_GREY = 1.0
-"""Lower limit of the allowed RMS difference, grey values of 255: rounding and compression without noise cause as
-much."""
+"""Lower limit of the allowed RMS difference, of 255: rounding and compression cause as much without noise."""
 SAME_EDGES = 1.5
-"""Factor on the allowed RMS difference over the whole image, edges included: compression changes edges a little, a
-motion of the camera changes them much."""
-
+"""Factor on the allowed RMS difference with edges: compression changes them little, motion of the camera much."""
 MAJORITY = "the majority of the images"  # what states the size of images where the camera file does not
 TIFF_HEADS = (b"II*\0", b"MM\0*")
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
 MOST_JPEG_SIDE = 65_000  # largest height of a thumbnail, px; the JPEG format is limited to 65 535
-
 _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
 """Messages that decoders write to standard error without failing; stray bytes before the end of a JPEG do no harm."""
-
 _STANDARD_ERROR = threading.Lock()  # lock that is held while standard error is redirected
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """An image file; ``name`` : path below the image folder, with forward slashes; ``content`` : its bytes if they are
-    carried along to a machine that does not see the path."""
+    """An image file; ``name`` : path below the image folder, with /; ``content`` : bytes carried to another machine."""
 
     path: Path
     name: str
@@ -175,8 +167,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
 
 
 def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list[ImageFile], list[Skipped]]:
-    """Return the result of :func:`find_images` with the images ``exclude``, by their names in results or their paths,
-    moved to the skipped files."""
+    """Return :func:`find_images` with the images ``exclude``, by name or path, among the skipped files."""
     return without_excluded(*find_images(folder), exclude, folder)
 
 
@@ -283,8 +274,7 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
 
 SPARSE = 5  # only one row and column in this number is looked at
 FLAT, CLEARER = 0.1, 3.0
-"""Range of grey values, as a share of all, below which the channels of a colour image are looked at, and how many times
-larger that of a channel must be to be taken for the image."""
+"""Range of grey values below which channels are looked at, and how many times larger a channel's must be."""
 
 
 def _clearest(grey: np.ndarray, colours: Callable[[], Any]) -> np.ndarray:
@@ -317,8 +307,7 @@ def _turn(data: bytes) -> int | None:
 
 
 def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
-    """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable,
-    an error if two sizes are equally frequent, so that the order of the files would decide."""
+    """Return width and height, px, of most files, and a name among them; None if no file is readable."""
     with_size: dict[tuple[int, int], list[ImageFile]] = {}
     unknown: list[ImageFile] = []
     for file in files:

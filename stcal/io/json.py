@@ -219,7 +219,6 @@ Points = Annotated[np.ndarray, Shape((None, 3))]
 Vector = Annotated[np.ndarray, Shape((None,))]
 Vector3 = Annotated[np.ndarray, Shape((3,))]
 Pair = Annotated[np.ndarray, Shape((2,))]
-
 ByFace = Annotated[str, "face"]
 ByLabel = Annotated[str, "label"]
 ByGroup = Annotated[str, "group"]

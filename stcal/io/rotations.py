@@ -47,8 +47,7 @@ _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """A convention for rotations: :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; and the
-    unit of the angles, empty if it is open."""
+    """A convention for rotations: rotation vector, quaternion or order of axes; and the unit, empty if open."""
 
     order: str
     unit: str = ""
@@ -216,8 +215,6 @@ READINGS = (
         for each in ORDERS
     ),
 )
-
-
 TRIPLES = {
     ("rx", "ry", "rz"): {"rad": "ur-rotvec"},
     ("a", "b", "c"): {"deg": "kuka-abc"},
@@ -228,16 +225,14 @@ TRIPLES = {
     ("rpy_roll", "rpy_pitch", "rpy_yaw"): {"deg": "rpy", "rad": "rpy"},
     ("q1", "q2", "q3", "q4"): {},
 }
-"""Default conventions of columns with these names, by the unit that follows the names; with another unit, or
-none, the convention is open."""
+"""Conventions of columns by names and unit; with another unit, or none, the convention is open."""
 NAMED_BY_AXES = [names for names in TRIPLES if names[0] in ("rx", "theta_x", "roll", "rpy_roll")]
 _EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """Rotations (m, 3, 3) of a table's columns, and the convention in words; ``stated`` : True if the columns alone
-    define it, without an option."""
+    """Rotations (m, 3, 3) of columns, and the convention in words; ``stated`` : without an option."""
 
     rotation: np.ndarray
     words: str
@@ -260,8 +255,7 @@ def find_column(table: Table, prefix: str, name: str) -> str | None:
 
 
 def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:
-    """Return the rotations in the columns that begin with a prefix; None if there are none. ``rotation`` : name of the
-    convention, from ``--rotation``, for angles whose columns leave it open."""
+    """Return the rotations of columns with a prefix, None if none; ``rotation`` : the option for open angles."""
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
         table.has_rotation(prefix)

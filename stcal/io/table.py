@@ -160,8 +160,7 @@ class Table(ByValue):
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
-        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`, positive definite; None if there are
-        none."""
+        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are none."""
         names = [prefix + name for name in COVARIANCE]
         if not any(name in self for name in names):
             return None
@@ -173,8 +172,7 @@ class Table(ByValue):
         return full
 
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
-        """Refuse covariances (m, n, n) of the rows unless all are positive definite, by the first bad line and its
-        fault."""
+        """Refuse covariances (m, n, n) unless all are positive definite, by the first bad line."""
         if fault := first_fault(full, rows, definite=True):
             where = f"{self.where}: line {self.lines[fault.row]}"
             raise InputError("E-TABLE-COVARIANCE", f"{where}: covariance: {fault.reason}; correct it")

@@ -21,8 +21,6 @@ from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
 YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)  # a line as YAML has it
-
-
 DEEPEST = 60
 DEEP = re.compile(rf"""(?:[\w"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}""")
 """A dotted name of more parts than any table needs."""
@@ -135,8 +133,7 @@ _Loader.add_constructor(
 
 
 def load_yaml(text: str):
-    """Return the values of a text; of aliases, or a key twice, YAMLError. ``%YAML:1.0`` of ``cv2.FileStorage`` is
-    removed."""
+    """Return the values of a text; YAMLError for aliases and repeated keys; ``%YAML:1.0`` of OpenCV is removed."""
     return yaml.load(_without_directive(text), _Loader)
 
 

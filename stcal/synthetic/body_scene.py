@@ -32,8 +32,7 @@ BEND_MM = 0.02  # σ of a point of a printed face about its plane
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
-"""Largest angles between the normal of a face and the line of sight: where a photograph shows the face, and where it
-shows the face squarely."""
+"""Largest angles of a face's normal to the line of sight: shown by a photograph, and shown squarely."""
 ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
 """Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
 TRIALS, CHOICES = 2000, 24

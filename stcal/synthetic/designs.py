@@ -14,7 +14,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))  # groups of Zhang & Wei (2017), sec. 2.
-
 DRAWINGS = {
     "top": "A 15 16 6, B 50 18 6, C 85 14 6, D 17 60 6, E 62 55 6, F 34 38 3.5, G 84 50 3.5, H 40 84 3.5, I 76 82 3.5",
     "left": "p 15 26 6, q 46 15 6, r 82 40 6, s 24 82 6, t 60 78 6, u 32 52 3.5, v 56 44 3.5, w 85 80 3.5",
@@ -96,8 +95,6 @@ def tag_dodecahedron(
 
 MOST_WIDTH_MM = 10_000.0
 MIN_CELL_PX = 2.0  # width of a tag's cell below which its corners are several times less exact
-
-
 Body = Literal["cube", "dodecahedron"]
 
 

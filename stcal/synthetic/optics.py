@@ -142,8 +142,6 @@ def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
 
 
 DARKEST = 1e-3  # least grey value, as a share of white. The photograph holds no information below.
-
-
 FULL_WELL, READ_NOISE = 10_000.0, 8.0
 """Electrons of a sensor at full scale, whose shot noise is the root of their number, and read noise in electrons."""
 

@@ -18,7 +18,6 @@ from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
 __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]
-
 FACE_MARGIN_MM = 15.0
 """How far a plate is assumed to reach beyond the rims of its circles, mm, if the design states no outline."""
 BOARD_MARGIN_MM = 15.0

@@ -178,8 +178,6 @@ def calibrate_camera(
 
 
 SAY_EVERY_S = 1.0  # shortest time between two lines of --live, s
-
-
 TABLE = Path("poses.csv")
 
 

@@ -14,8 +14,6 @@ from stcal.errors import ChecksFailed, InputError, MappingError, StcalError
 from stcal.io.files import keep_apart
 
 app = typer.Typer()
-
-
 Solve = Literal["joint", "chain", "paper"]  # way in which the groups are solved
 
 

@@ -26,13 +26,9 @@ from stcal.io.files import save
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
-
 SQUARE_WITHIN = 1e-6  # largest deviation from 1 of the correlation of a parameter with itself
-
 EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
-
-
 OF_IMAGES = "the images"
 """Source of a camera that is found from the images themselves, of which some may show a part of the sensor."""
 
@@ -115,8 +111,7 @@ class CameraPrior(ByValue):
 
 WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 PRIOR_FOCAL = 1e-3
-"""Relative σ of the focal lengths if the camera file states none; as for the three constants below, a calibration of
-some weeks ago, or of another copy of the lens, is about as accurate."""
+"""Relative σ of the focal lengths if the camera file states none; these four are as of a calibration of weeks ago."""
 PRIOR_CENTRE = 2e-3  # σ of the principal point if the camera file states none, in image widths
 PRIOR_RADIAL = 0.01
 """σ of k1 … k6 if the camera file states none; a tenth of the coefficient if that is larger."""
@@ -166,8 +161,7 @@ def cameras_txt(camera: Camera) -> str:
 
 
 LEAST_FOCAL = {False: 0.1, True: 0.05}
-"""Smallest focal length over the longer side, by whether the lens is a fisheye: an image of 157° from edge to edge, and
-a circle of 280° on a third of the side. Lengths in mm are shorter."""
+"""Smallest focal length over the longer side, by whether the lens is a fisheye; lengths in mm are shorter."""
 LEAST_FOCAL_PX = 5.0
 """Smallest focal length, px: shares of a side, which files without a size have, are shorter."""
 AT_CORNER = 0.02
@@ -217,7 +211,6 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
 def camera_from_opencv(
     lens, given: np.ndarray, fisheye: bool, width: float, height: float, tangential: bool = False
 ) -> CameraModel:
-    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,) as of :func:`opencv_lens`; sides of 0 px
-    if the file states none."""
+    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,); 0 for sides that are not stated."""
     distortion, kind = opencv_lens(given, fisheye, tangential)
     return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None)

@@ -37,8 +37,7 @@ class CameraDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizedLens:
-    """A lens of an unsupported model over an image, by its own projection; ``near`` : the model that was fitted to it,
-    from which its rays are sought."""
+    """A lens of an unsupported model over an image; ``near`` : the fitted model, from which rays are sought."""
 
     lens: ForeignLens
     width: int
@@ -167,8 +166,7 @@ class FittedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedLens:
-    """The lens of a file: the camera, or another model's lens over its image; ``told`` : what a photograph's EXIF says
-    of it."""
+    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
 
     lens: Camera | SizedLens
     told: str = ""

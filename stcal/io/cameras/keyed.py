@@ -22,8 +22,7 @@ TAB = 4  # spaces in place of a tab, which YAML does not allow
 
 
 def values_of(text: str) -> dict:
-    """Return the keys and values of a text in JSON, XML or YAML; raise ValueError, YAMLError or ParseError if it is
-    none of these, or holds several documents that differ."""
+    """Return the keys and values of JSON, XML or YAML; ValueError, YAMLError or ParseError if it is none of them."""
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
     try:
@@ -76,8 +75,7 @@ def is_ini(text: str) -> bool:
 
 
 def ini_cameras(text: str) -> dict[str, dict]:
-    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``. A key
-    has a line of its own; the lines of its numbers follow."""
+    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``."""
     sections: dict[str, dict] = {}
     section, numbers = {}, []
     for line in (line.split("#")[0].strip() for line in text.splitlines()):
@@ -113,7 +111,6 @@ MOST_TANGENTIAL = 0.02
 """Largest tangential coefficient of real lenses: 0.02 is a sensor tilted by 2° behind the lens."""
 NEAR = 0.25
 """Share of the image's size within which the principal point is from the middle of the image."""
-
 Lens = CameraModel | ForeignLens
 
 

@@ -31,8 +31,7 @@ MARKS = (STRUCTURE, "MappingCoefficients")
 """Fields that tell a structure that ``toStruct`` makes of a camera, of a fisheye the second."""
 BOUGUET = ("fc", "cc", "kc")
 BOUGUET_SIGMAS = 3.0
-"""Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
-parameters")."""
+"""Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of …")."""
 TAKEN = {
     *("K", "IntrinsicMatrix", "FocalLength", "PrincipalPoint", "Skew", "ImageSize", "RadialDistortion"),
     *("TangentialDistortion", "MappingCoefficients"),

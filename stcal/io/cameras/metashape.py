@@ -26,8 +26,7 @@ HARMLESS = ("date", "class", "type", "filmcamera", "sensorid")
 ROOTS = ("document", "chunk", "sensors", "sensor")  # root elements of files with sensors
 KINDS = ("frame", "fisheye", "equidistant_fisheye")
 HELD_PX = 1e-3
-"""σ of a parameter that was held fixed, as its effect at the corner of the image in px; without it a covariance would
-be singular."""
+"""σ of a parameter that was held fixed, as its effect at the image's corner, px; 0 would be singular."""
 OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy", "k1", "k2", "k3", "k4")}
 """OpenCV's names of Metashape's parameters; ``b1`` and ``f`` together are fx."""
 
@@ -38,8 +37,7 @@ def is_metashape(text: str) -> bool:
 
 
 def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
-    """Return the camera of a ``<calibration>``; a foreign lens with ``b2``, ``p3``, ``p4``, or a frame camera with
-    ``k4``."""
+    """Return the camera of a ``<calibration>``; a foreign lens with b2, p3, p4, or of a frame camera with k4."""
     texts: dict[str, str] = {}
     for child in root:
         if child.tag in texts:
@@ -87,8 +85,7 @@ def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: floa
 
 
 def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
-    """Return the lens of a ``<calibration>``, or a sensor of exported cameras, or of a project's ``doc.xml``, as
-    adjusted, with its covariance."""
+    """Return the lens of a ``<calibration>``, or a sensor of exported cameras or ``doc.xml``, with covariance."""
     root, sensors = ElementTree.fromstring(text), {}
     if root.tag == "calibration":
         return from_calibration(root)

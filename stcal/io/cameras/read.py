@@ -43,8 +43,7 @@ from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_writ
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
 FILM_DIAGONAL_MM = 43.2666
-"""Diagonal of 36 × 24 mm. CIPA DCG-001 states focal lengths "in 35 mm film" by the diagonal, some makers by the width;
-the two differ by 4 % in an image of 4 : 3."""
+"""Diagonal of 36 × 24 mm, by which CIPA DCG-001 states focal lengths; widths would differ by 4 % at 4 : 3."""
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 """Lengths, in mm, of the values of ``FocalPlaneResolutionUnit``."""
 SIGMA_FOCAL, SIGMA_SQUARE = 0.05, 1e-3
@@ -241,15 +240,13 @@ def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.For
 
 
 def name_to_write(name: str) -> str:
-    """Return a name that every form can hold, of the name that chose a camera: ``Cam_B_35mm`` of ``Cam B (35mm)``,
-    ``cam1`` of 1, ``cam0`` of none."""
+    """Return a name that every form can hold: ``Cam_B_35mm`` of ``Cam B (35mm)``, ``cam1`` of 1, ``cam0`` of none."""
     word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "cam0"
     return word if word[0].isalpha() else f"cam{word}"
 
 
 def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera in one of :data:`WRITERS`, with its name, a word, where the form has a place for it;
-    refuse a lens that the form cannot hold."""
+    """Return the file of a camera in one of :data:`WRITERS`, named by a word; refuse a lens that it cannot hold."""
     lost = ["σ and correlations of the parameters"] * (form not in SIGMA_FORMS)
     lost += metashape.without_sigma(camera) if form == "metashape-cameras" else []
     return Written(WRITERS[form](camera, name), tuple(lost) if camera.covariance is not None else ())
@@ -344,12 +341,9 @@ WRITERS: Mapping[str, Callable[[Camera, str], str | bytes]] = {
     "matlab": mat,
 }
 """Writers by form: each returns the file of a camera and its name."""
-
-
 SQLITE = b"SQLite format 3\0"  # first bytes of an SQLite database
 COLMAP_LINE = re.compile(r"\A(?:[ \t]*(?:#[^\r\n]*)?[\r\n])*[ \t]*[^\s{<]+[ \t]+[A-Z][A-Z0-9_]+(?:[ \t]+\S+){3}")
 """First line of COLMAP's ``cameras.txt`` : a number, a model, and at least three numbers."""
-
 _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
 
@@ -516,8 +510,6 @@ TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraMode
     (lambda text: True, lambda text, name: from_keys(values_of(text), name)),
 )
 """For each text format the same; what no other test recognises has keys and values."""
-
-
 WRITTEN_PX = 1e-6
 """Largest difference of a projected point, px. Forms with few decimals, such as OpenCV's, round by 1e-8 px."""
 ACROSS = 9  # number of points across the image, and down it, by which cameras are compared
