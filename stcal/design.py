@@ -258,13 +258,11 @@ def _by_label(faces: Iterable[tuple[FaceDesign, np.ndarray]]) -> dict[CircleLabe
 
 @dataclass(frozen=True, slots=True)
 class StatedSize:
-    """Size of a body as stated in addition to its drawing; None for values that are not stated.
-
-    Only the uncertainty budget uses it. ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch, common to all
-    dots; ``expansion_ppm_per_k`` : coefficient of linear thermal expansion, with its σ; ``temperature_c`` : temperature
-    of the body in the photographs, with its σ; ``reference_temperature_c`` : temperature at which its size is stated,
-    or is to be reported (ISO 1: 20 °C).
-    """
+    """Size of a body as stated in addition to its drawing; None for values that are not stated. Only the uncertainty
+    budget uses it. ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch, common to all dots;
+    ``expansion_ppm_per_k`` : coefficient of linear thermal expansion, with its σ; ``temperature_c`` : temperature of
+    the body in the photographs, with its σ; ``reference_temperature_c`` : temperature at which its size is stated,
+    or is to be reported (ISO 1: 20 °C)."""
 
     pitch_sigma_ppm: float | None = None
     expansion_ppm_per_k: float | None = None

@@ -20,12 +20,10 @@ EQUAL = 4.6
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
     """A jump of the rows from ``row`` on, or a drift of all rows in proportion to their place in the order.
-
-    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift from
-    the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
-    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change by
-    chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors.
-    """
+    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift
+    from the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
+    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change
+    by chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors."""
 
     kind: Literal["jump", "drift"]
     row: int

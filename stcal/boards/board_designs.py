@@ -30,11 +30,9 @@ class Distinct:
 
 @dataclass(frozen=True, slots=True)
 class ChessboardDesign:
-    """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``.
-
-    X along a row, Y down the columns, Z into the board, origin at inner corner (0, 0); the square between inner
-    corners (0, 0) and (1, 1) is black. ``sigma_mm`` : σ of a corner about the grid, per axis.
-    """
+    """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``. X along a row, Y down the
+    columns, Z into the board, origin at inner corner (0, 0); the square between inner corners (0, 0) and (1, 1) is
+    black. ``sigma_mm`` : σ of a corner about the grid, per axis."""
 
     rows: int
     columns: int
@@ -57,14 +55,11 @@ class ChessboardDesign:
 
 @dataclass(frozen=True, slots=True)
 class CharucoDesign(Distinct):
-    """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares.
-
-    The tags have the size ``marker_mm`` and are from ``dictionary``.
-
-    X along a row, Y down the columns, Z into the board, origin at the outer corner of the first square. ``legacy`` :
-    True for the pattern of OpenCV before 4.6, in which boards with an even number of rows began with a white square.
-    ``sigma_mm`` : σ of a corner about the grid, per axis. ``first_id`` : id of the first tag; ids count up from there.
-    """
+    """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares. The tags
+    have the size ``marker_mm`` and are from ``dictionary``. X along a row, Y down the columns, Z into the board,
+    origin at the outer corner of the first square. ``legacy`` : True for the pattern of OpenCV before 4.6, in which
+    boards with an even number of rows began with a white square. ``sigma_mm`` : σ of a corner about the grid, per
+    axis. ``first_id`` : id of the first tag; ids count up from there."""
 
     rows: int
     columns: int
@@ -97,10 +92,8 @@ def sides_mm(corners_mm: np.ndarray) -> np.ndarray:
 
 
 def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusual_size: bool, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other.
-
-    ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
-    """
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other. ``corners_mm`` : (n, 4,
+    2), NaN for tags of no known place."""
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
     lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))
@@ -196,14 +189,12 @@ class TagLayout(Distinct, Brief):
 @dataclass(frozen=True, slots=True)
 class AprilGridDesign(Distinct):
     """An AprilGrid of ``rows`` × ``columns`` AprilTags of ``tag_mm`` (outer edge of the black border), as of Kalibr.
-
     The step from tag to tag is ``tag_mm`` · (1 + ``spacing``). Ids count up from ``first_id`` along the bottom row,
     then row by row upwards. X along a row, Y down the columns, Z into the board, origin at the bottom left corner of
     the first tag: Kalibr's frame, turned by half a turn about X, so that tag (row i from below, column j) has its
-    bottom left corner at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or the
-    usual 1; None if it is to be determined from images. ``upright`` : True if tags stand as OpenCV draws them; Kalibr
-    prints them rotated by half a turn. ``sigma_mm`` : σ of a corner about the grid, per axis.
-    """
+    bottom left corner at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or
+    the usual 1; None if it is to be determined from images. ``upright`` : True if tags stand as OpenCV draws them;
+    Kalibr prints them rotated by half a turn. ``sigma_mm`` : σ of a corner about the grid, per axis."""
 
     rows: int
     columns: int
@@ -260,14 +251,13 @@ class LatticePart(BoardDesign):
 
 @dataclass(frozen=True, slots=True)
 class AsymmetricCirclesDesign:
-    """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
-
-    Circle (i, j), row i and place j in it, both from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
-    ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into the
-    board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
-    circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a
-    circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its turn.
-    """
+    """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a
+    step. Circle (i, j), row i and place j in it, both from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
+    ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into
+    the board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
+    circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ
+    of a circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its
+    turn."""
 
     rows: int
     columns: int
@@ -325,11 +315,9 @@ HEXAGONAL = np.array([[1.0, 0.5], [0.0, np.sqrt(3) / 2]])
 
 @dataclass(frozen=True, slots=True)
 class HexagonalCirclesDesign(AsymmetricCirclesDesign):
-    """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
-
-    Circle (i, j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i ·
-    √3 / 2 · ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`.
-    """
+    """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step. Circle (i,
+    j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i · √3 / 2 ·
+    ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`."""
 
     hexagonal: ClassVar[bool] = True
 

@@ -87,10 +87,8 @@ def compare(
 
 
 def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
-    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says.
-
-    ``fit`` : whether the fit is what is used, so that its quality is printed, or the lens itself.
-    """
+    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says. ``fit`` : whether the fit is
+    what is used, so that its quality is printed, or the lens itself."""
     from stcal.io.cameras.difference import SizedLens, load_lens
     from stcal.io.cameras.read import SIGMA_FOCAL
     from stcal.report.camera_figures import fitted_text

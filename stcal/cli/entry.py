@@ -25,11 +25,9 @@ def main_sfm() -> None:
 
 
 def _run(name: str) -> None:
-    """Runs a program. ``--version`` alone is answered at once, before the commands are loaded.
-
-    Signals after the end of the program do not change its exit code: Python removes handlers while it ends, and a
-    signal would then end a command as if it had failed, although its results are in place.
-    """
+    """Runs a program. ``--version`` alone is answered at once, before the commands are loaded. Signals after the end
+    of the program do not change its exit code: Python removes handlers while it ends, and a signal would then end a
+    command as if it had failed, although its results are in place."""
     _replace_closed_streams()
     try:
         if sys.argv[1:] == ["--version"]:

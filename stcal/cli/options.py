@@ -32,11 +32,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Opt:
-    """An option: what its help text and its parameter do not state.
-
-    ``name`` : its names, ``--held-out`` for ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes``
-    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value, and variable that sets it.
-    """
+    """An option: what its help text and its parameter do not state. ``name`` : its names, ``--held-out`` for
+    ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is
+    written; ``metavar``, ``envvar`` : word for the value, and variable that sets it."""
 
     name: str = ""
     min: float | None = None
@@ -262,11 +260,9 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
 
 
 def protect_outputs(application: typer.Typer) -> None:
-    """Prevents the commands of an application from overwriting their inputs, or other files without a request.
-
-    Every path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``,
-    all of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output.
-    """
+    """Prevents the commands of an application from overwriting their inputs, or other files without a request. Every
+    path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``, all
+    of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output."""
     for command in application.registered_commands:
         if command.callback is not None:
             command.callback, command.cls = _protected(command.callback), Command

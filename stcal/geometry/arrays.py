@@ -23,12 +23,10 @@ MYPY = False
 if TYPE_CHECKING and not MYPY:
 
     class Array:
-        """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`.
-
-        To pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
+        """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`. To
+        pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
         ``np.ndarray``. At run time, and to mypy, it is ``np.ndarray``. Only for fields; an optional one is
-        ``np.ndarray | None``.
-        """
+        ``np.ndarray | None``."""
 
         def __get__(self, instance: object, owner: Any) -> np.ndarray: ...
         def __set__(self, instance: object, value: ArrayLike) -> None: ...
@@ -160,10 +158,8 @@ def _rules(kind: type) -> dict[str, tuple[Rule, Any]]:
 
 
 def require_fields(instance: object, what: str, **least: float) -> None:
-    """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``.
-
-    Numbers must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`.
-    """
+    """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``. Numbers
+    must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`."""
     for name, known in _rules(type(instance)).items():
         value = getattr(instance, name)
         _require(what, name, value, known)
@@ -291,11 +287,9 @@ class Fault:
 
 
 def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
-    """Return the fault of the first of m matrices (m, n, n) that is no covariance, None if all are.
-
-    A covariance is finite, symmetric and without negative eigenvalues of its correlations, up to rounding; without any
-    that are not positive if it will be inverted, ``definite``.
-    """
+    """Return the fault of the first of m matrices (m, n, n) that is no covariance, None if all are. A covariance is
+    finite, symmetric and without negative eigenvalues of its correlations, up to rounding; without any that are not
+    positive if it will be inverted, ``definite``."""
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)
     variance = np.diagonal(matrices, axis1=1, axis2=2) + nothing

@@ -113,15 +113,14 @@ def minimise(
     max_steps: int = MAX_STEPS,
     hopeless: float = np.inf,
 ) -> Minimum[S, L]:
-    """Return the state of least cost, of one problem, or of h problems at once if costs are (h,), found from a start.
-
-    ``linearise`` : returns the problem about a state; ``moved`` : a state after a step (k,), or (h, k); ``cost`` : that
-    of a state, where it is cheaper, so that accepted states alone are linearised; ``select`` : returns the new state or
-    :class:`Linear` where ``take`` (h,), else the old one; ``damping``, ``least_damping`` : at the start, and the lower
-    limit, which regularises what nothing determines; ``settled``, ``least_gain`` : a minimum is reached when the next
-    undamped step promises at most ``settled`` times the cost plus ``least_gain``, in σ²; ``hopeless`` : excess of a
-    problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`.
-    """
+    """Return the state of least cost, of one problem, or of h problems at once if costs are (h,), found from a
+    start. ``linearise`` : returns the problem about a state; ``moved`` : a state after a step (k,), or (h, k);
+    ``cost`` : that of a state, where it is cheaper, so that accepted states alone are linearised; ``select`` :
+    returns the new state or :class:`Linear` where ``take`` (h,), else the old one; ``damping``, ``least_damping`` :
+    at the start, and the lower limit, which regularises what nothing determines; ``settled``, ``least_gain`` : a
+    minimum is reached when the next undamped step promises at most ``settled`` times the cost plus ``least_gain``,
+    in σ²; ``hopeless`` : excess of a problem's cost over the best one up to which it is followed to its end; see
+    :data:`SLOW`."""
     current = linearise(state)
     damp = np.full(np.shape(current.cost), float(damping))
     done = np.zeros(damp.shape, bool)
@@ -176,10 +175,8 @@ class Normal(NormalEquations):
 
     @classmethod
     def of(cls, residual: np.ndarray, by_pose: np.ndarray, possible: np.ndarray, huber: float) -> "Normal":
-        """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2).
-
-        ``by_pose`` : (h, n, 2, 6) negative derivatives; the cost is infinite where a pose is not ``possible`` (h,).
-        """
+        """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2). ``by_pose`` :
+        (h, n, 2, 6) negative derivatives; the cost is infinite where a pose is not ``possible`` (h,)."""
         length = np.sqrt((residual**2).sum(2))
         cost = np.where(possible, huber_cost(length, huber).sum(1), np.inf)
         h = len(residual)

@@ -76,10 +76,8 @@ def inverse_and_size(normal: np.ndarray) -> tuple[np.ndarray, float]:
 def blocks_of(
     jacobian: np.ndarray, residual: np.ndarray, index: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k).
-
-    Of n observations: derivatives (n, c, k) and residuals (n, c), both over σ, and the block of each, (n,).
-    """
+    """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k). Of n
+    observations: derivatives (n, c, k) and residuals (n, c), both over σ, and the block of each, (n,)."""
     n, _, k = jacobian.shape
     if count == 1:
         flat = jacobian.reshape(residual.size, k)

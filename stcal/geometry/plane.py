@@ -15,22 +15,18 @@ from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
     """Return points (..., 3) whose ordinary projection is the centre of the ellipse that each circle projects to.
-
     With centre C, unit normal n and radius r it is that of ``C + (r²/C_z)(n_z·n − e_z)``, e_z the optical axis (from
-    the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C]; Hartley & Zisserman, sec. 2.2 and 8.3). All in the camera frame
-    and one unit; normals (..., 3) of either sign.
-    """
+    the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C]; Hartley & Zisserman, sec. 2.2 and 8.3). All in the camera
+    frame and one unit; normals (..., 3) of either sign."""
     c, n = np.asarray(xyz_camera, float), np.asarray(normal_camera, float)
     shift = n[..., 2:] * n - np.array([0.0, 0.0, 1.0])
     return c + (np.asarray(radius_mm, float) ** 2 / c[..., 2])[..., None] * shift
 
 
 def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
-
-    Centres (n, 3), radii (n,), and two orthonormal directions in the plane, (3, 2), give centres (n, 2) and symmetric
-    shapes (n, 2, 2), normalised: the rim is ``centre + shape @ unit circle``.
-    """
+    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`. Centres
+    (n, 3), radii (n,), and two orthonormal directions in the plane, (3, 2), give centres (n, 2) and symmetric shapes
+    (n, 2, 2), normalised: the rim is ``centre + shape @ unit circle``."""
     dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
     dual = -dual / dual[:, 2:, 2:]
     centre = -dual[:, :2, 2]
@@ -167,9 +163,7 @@ def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
     """Return the pose of a plane with a metric frame from its homography into normalised coordinates (Zhang 2000).
-
-    The plane's origin has a positive depth where the homography has that sign.
-    """
+    The plane's origin has a positive depth where the homography has that sign."""
     h = np.asarray(normalised_from_plane, float)
     h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
     if h[2, 2] < 0:
@@ -184,10 +178,8 @@ EXACT = 1e-22
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Return camera_from_plane of least reprojection error, from a start before which the points lie.
-
-    ``xy_plane`` : (n, 2) mm; ``xy_normalised`` : (n, 2) ideal coordinates.
-    """
+    """Return camera_from_plane of least reprojection error, from a start before which the points lie. ``xy_plane`` :
+    (n, 2) mm; ``xy_normalised`` : (n, 2) ideal coordinates."""
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
 
     def linearise(pose: Rigid) -> NormalEquations:
@@ -241,9 +233,7 @@ def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
 
 def distinct(poses: Poses, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
     """Return True if the second of two poses differs significantly from the first, of the normal matrix (6, 6).
-
-    ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose.
-    """
+    ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose."""
     step = poses[1].difference(poses[0])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
 
@@ -255,13 +245,11 @@ def two_minima(
     failure: str,
     planar: bool = True,
 ) -> PlaneMinima:
-    """Return one or two distinct minima of the residuals of single points.
-
-    ``descend_near`` : whitens residuals near one pose, alike for both minima, and returns the descent; ``start`` : one
-    pose, to which its mirror image is added, or two, the likelier one first; ``target_from_plane`` : origin in the
-    middle of the points, Z along the normal; ``planar`` : whether all points are in the plane, so that two starts that
-    end alike may have been on one side, and the mirror image of their minimum is tried.
-    """
+    """Return one or two distinct minima of the residuals of single points. ``descend_near`` : whitens residuals near
+    one pose, alike for both minima, and returns the descent; ``start`` : one pose, to which its mirror image is
+    added, or two, the likelier one first; ``target_from_plane`` : origin in the middle of the points, Z along the
+    normal; ``planar`` : whether all points are in the plane, so that two starts that end alike may have been on one
+    side, and the mirror image of their minimum is tried."""
     poses = start + mirrored(start, target_from_plane) if len(start) == 1 else start
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
@@ -335,11 +323,9 @@ class PlanePoses:
 
 
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:
-    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
-
-    The homography's derivative is taken at their mean. Z of the plane points away from the camera. DegenerateError: the
-    points determine no homography, or the plane is seen edge-on or from behind.
-    """
+    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2). The
+    homography's derivative is taken at their mean. Z of the plane points away from the camera. DegenerateError: the
+    points determine no homography, or the plane is seen edge-on or from behind."""
     xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
     middle = xy.mean(0)
     homography = fit_homography(xy - middle, xy_image)

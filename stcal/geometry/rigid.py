@@ -168,12 +168,10 @@ class Rigid(ByValue, _Frames):
         return np.concatenate([self.as_scipy().as_rotvec(), self.translation])
 
     def log_sigma(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the σ (6,) of :meth:`log`, rad and mm, from the covariance (6, 6) of a left perturbation.
-
-        A small turn ω moves the rotation vector φ by the inverse left Jacobian of SO(3), (φ/2) cot(φ/2) ω across φ, and
-        by half of ω × φ; σ about the axes are those of its components for small φ only (Barfoot, "State Estimation for
-        Robotics", 2017, sec. 7.1.5).
-        """
+        """Return the σ (6,) of :meth:`log`, rad and mm, from the covariance (6, 6) of a left perturbation. A small
+        turn ω moves the rotation vector φ by the inverse left Jacobian of SO(3), (φ/2) cot(φ/2) ω across φ, and by
+        half of ω × φ; σ about the axes are those of its components for small φ only (Barfoot, "State Estimation for
+        Robotics", 2017, sec. 7.1.5)."""
         turn = self.log()[:3]
         angle = float(np.linalg.norm(turn))
         across = 1 / 12 if angle < SMALL_RAD else (1 - angle / 2 / math.tan(angle / 2)) / angle**2
@@ -402,11 +400,8 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
-    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
-
-    ``xyz_a``, ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` :
-    (n,)
-    """
+    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign). ``xyz_a``,
+    ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` : (n,)"""
     return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
 
 

@@ -65,10 +65,8 @@ TRIED_PX = 1024  # side of the middle of the image that is judged, px
 
 def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
     """Return the patterns that a grey image may be a mosaic of: two, as red and blue look alike; none if it is none.
-
     Both greens, on one diagonal of each 2×2 pixels, are alike, and another colour differs all over the image, which
-    medians show: the scene favours no pixel of the four.
-    """
+    medians show: the scene favours no pixel of the four."""
     height, width = (min(side, TRIED_PX) // 2 * 2 for side in image.shape)
     if not height or not width:
         return ()

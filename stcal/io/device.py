@@ -138,10 +138,8 @@ def png(image: np.ndarray) -> bytes:
 @contextmanager
 def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
     """Open a camera by number, a stream by URL, a video file or a folder of images, and return its pictures, grey.
-
-    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is. Raises
-    InputError: it cannot be opened or gives no picture, or none for ``PATIENCE_S`` in between.
-    """
+    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is.
+    Raises InputError: it cannot be opened or gives no picture, or none for ``PATIENCE_S`` in between."""
     if isinstance(source, str) and Path(source).is_dir():
         paths = [file.path for file in find_images(source)[0]]
         yield (grey_8bit(decode(read_bytes(path, IMAGE_BYTES), str(path))) for path in paths)
@@ -278,11 +276,9 @@ def checked_every(every: str | int) -> str | int:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Return how much steeper the edges of a grey image are than after a blur, in the direction where they are least.
-
-    It is a ratio of squared differences of neighbours, less 1, at the blurred image's steepest edges, so that
-    brightness, contrast and empty parts do not count.
-    """
+    """Return how much steeper the edges of a grey image are than after a blur, in the direction where they are
+    least. It is a ratio of squared differences of neighbours, less 1, at the blurred image's steepest edges, so that
+    brightness, contrast and empty parts do not count."""
     picture = grey.astype(np.float32)
     blurred = cv2.GaussianBlur(picture, (0, 0), SHARP_BLUR_PX)
     ratios = []
@@ -321,11 +317,9 @@ def _move(first: _Frame, second: _Frame) -> float:
 
 
 def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO) -> list[Path]:
-    """Write the chosen frames of a video into a folder, as ``frame_<number>.png``; those of an earlier call go.
-
-    A warning lists them. Frames that are blurred more than others are left out. Raises InputError: the video cannot be
-    read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be written.
-    """
+    """Write the chosen frames of a video into a folder, as ``frame_<number>.png``; those of an earlier call go. A
+    warning lists them. Frames that are blurred more than others are left out. Raises InputError: the video cannot be
+    read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be written."""
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []
     device = _device(str(video))

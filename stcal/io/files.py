@@ -127,11 +127,9 @@ def require_new_folder(out: Path, images: Path) -> None:
 def require_written(
     path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike", most: float, unit: str
 ) -> None:
-    """Read a written file with the reader of later commands, and require that it gives the values that were reported.
-
-    ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest difference,
-    rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError.
-    """
+    """Read a written file with the reader of later commands, and require that it gives the values that were
+    reported. ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest
+    difference, rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError."""
     import numpy as np
 
     remedy = "do not use the file, and report this with its data"

@@ -64,11 +64,8 @@ class ImageFile:
     content: bytes | None = field(default=None, repr=False)
 
     def read(self) -> bytes:
-        """Return the content of the file.
-
-        Raises InputError: it is gone, and a result without it would be another one than was asked for. Raises OSError:
-        it cannot be read, or is too large for an image.
-        """
+        """Return the content of the file. Raises InputError: it is gone, and a result without it would be another
+        one than was asked for. Raises OSError: it cannot be read, or is too large for an image."""
         if self.content is not None:
             return self.content
         try:
@@ -224,12 +221,9 @@ def name_fault(name: str) -> str | None:
 
 
 def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor gave
-    them.
-
-    Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it is turned as
-    its EXIF says.
-    """
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor
+    gave them. Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it
+    is turned as its EXIF says."""
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
     if not ends_properly(data):
@@ -430,10 +424,8 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
     """Return True if two grey images are two files of one exposure, of equal noise but for losses by compression.
-
     The noise of two exposures from one place differs by √2 times itself. Brightness may differ by a factor and a
-    constant.
-    """
+    constant."""
     if image.shape != other.shape:
         return False
     first, second = (grey_8bit(grey).astype(np.float32) for grey in (image, other))
@@ -508,11 +500,9 @@ _elsewhere: ContextVar[tuple[Executor, int, bool] | None] = ContextVar("executor
 
 @contextlib.contextmanager
 def spread(executor: Executor, at_once: int, send_images: bool = False) -> Iterator[None]:
-    """Let an executor, which stays open, run the jobs on single images inside the ``with`` block; results are the same.
-
-    ``at_once`` : number of images that are handed over at a time; ``send_images`` : whether by content, and not by
-    their path on storage that all machines share.
-    """
+    """Let an executor, which stays open, run the jobs on single images inside the ``with`` block; results are the
+    same. ``at_once`` : number of images that are handed over at a time; ``send_images`` : whether by content, and
+    not by their path on storage that all machines share."""
     token = _elsewhere.set((executor, at_once, send_images))
     try:
         yield
@@ -523,12 +513,10 @@ def spread(executor: Executor, at_once: int, send_images: bool = False) -> Itera
 def run_on_images(
     function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None, kept: bool = False
 ) -> Iterator[tuple[int, R]]:
-    """Yield index and result of each job, run by :func:`stcal.parallel.run_parallel` or the executor of :func:`spread`.
-
-    The first argument of a job is an image file, or a list of them. ``kept`` : True if the caller keeps finished
-    results, so that a second try continues there. Raises DetectionError: a process was ended from outside. Raises
-    InputError: a worker does not see the folder of an image.
-    """
+    """Yield index and result of each job, run by :func:`stcal.parallel.run_parallel` or the executor of
+    :func:`spread`. The first argument of a job is an image file, or a list of them. ``kept`` : True if the caller
+    keeps finished results, so that a second try continues there. Raises DetectionError: a process was ended from
+    outside. Raises InputError: a worker does not see the folder of an image."""
     if current := _elsewhere.get():
         executor, at_once, send_images = current
         sent = ((function, _sent(files, send_images), *arguments) for files, *arguments in jobs)

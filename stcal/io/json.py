@@ -155,9 +155,8 @@ class CovarianceShape(Shape):
 @dataclass(frozen=True, slots=True)
 class Named:
     """An object of a file that holds attributes of a result: those named, in words, or all fields of a dataclass.
-
-    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result, Named()]``.
-    """
+    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result,
+    Named()]``."""
 
     names: str = ""
 

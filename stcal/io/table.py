@@ -178,10 +178,8 @@ class Table(ByValue):
             raise InputError("E-TABLE-COVARIANCE", f"{where}: covariance: {fault.reason}; correct it")
 
     def common_errors(self, covariance: np.ndarray | None, prefix: str = "") -> np.ndarray | None:
-        """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
-
-        ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them.
-        """
+        """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or
+        None. ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them."""
         stems = (name.removeprefix(prefix) for name in self.columns if name.startswith(prefix))
         count = len({stem.split("_")[0] for stem in stems if COMMON.fullmatch(stem)})
         if not count:
@@ -221,13 +219,11 @@ class Table(ByValue):
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
     """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or ``%`` with a space are
-    ignored.
-
-    Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns, numbers may
-    have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
-    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A :class:`Table` is
-    returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order, whatever their names.
-    """
+    ignored. Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns,
+    numbers may have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header.
+    Units in brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A
+    :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order,
+    whatever their names."""
     if isinstance(path, Table):
         return path
     where = f"{what} {path}"
@@ -417,11 +413,9 @@ def _with_units_of_a_row(
 
 
 def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> tuple[dict[str, list[str]], bool]:
-    """Return the columns with decimal points in place of decimal commas, and whether there were such.
-
-    Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
-    show that its comma is not of thousands; decimal points beside it are refused.
-    """
+    """Return the columns with decimal points in place of decimal commas, and whether there were such. Semicolons
+    stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must show that
+    its comma is not of thousands; decimal points beside it are refused."""
     numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
     with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}
     if not with_comma:

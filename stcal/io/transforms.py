@@ -125,10 +125,8 @@ METRE_MM = 1000.0  # millimetres per metre, the unit of ROS, URDF and Universal 
 
 
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
-    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
-
-    Roll is computed from what remains after pitch and yaw, which keeps full precision at a pitch of ±90°.
-    """
+    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order. Roll is computed from what
+    remains after pitch and yaw, which keeps full precision at a pitch of ±90°."""
     r = pose.rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     yaw = np.arctan2(r[1, 0], r[0, 0])

@@ -85,10 +85,8 @@ class BodyOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyScene:
-    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image.
-
-    ``off_mm`` : (n, 3) by face, how far its points are from the design, without a shift or turn of the whole.
-    """
+    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image. ``off_mm`` :
+    (n, 3) by face, how far its points are from the design, without a shift or turn of the whole."""
 
     target: TargetDesign
     target_from_face: dict[str, Rigid]
@@ -328,11 +326,9 @@ def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.nda
 
 
 def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
-    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly.
-
-    ``areas`` : lists of closed lines (k, 2), px: the outline, then holes in the other direction. Each piece of a line
-    within one pixel adds what is between it and the picture's right side.
-    """
+    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly. ``areas`` : lists of
+    closed lines (k, 2), px: the outline, then holes in the other direction. Each piece of a line within one pixel
+    adds what is between it and the picture's right side."""
     height, width = size
     added = np.zeros((height, width + 1))
     for area in areas:

@@ -45,10 +45,8 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
 
 
 def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple[FaceDesign, Rigid]:
-    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face.
-
-    The face frame has its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``.
-    """
+    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face. The face frame has
+    its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``."""
     ids = tuple(row[0] for row in circles)
     xy = np.array([row[1:3] for row in circles], float)
     zero, on_x, on_y = (np.append(xy[ids.index(circle)], 0.0) for circle in (origin, x, y))
@@ -99,10 +97,8 @@ Body = Literal["cube", "dodecahedron"]
 
 
 def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, faces: str = "") -> TargetDesign:
-    """Return a body of tags by its width between opposite faces, mm, which may be a text.
-
-    ``faces`` : ids of the faces that it is to have, such as ``1,2,3,4,5``; all of them if empty.
-    """
+    """Return a body of tags by its width between opposite faces, mm, which may be a text. ``faces`` : ids of the
+    faces that it is to have, such as ``1,2,3,4,5``; all of them if empty."""
     width, count = width_of(size), 6 if kind == "cube" else 12
     family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
     if kind == "cube":

@@ -79,11 +79,9 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
 def place_group(
     shape: GroupShape, camera: Camera, count: int, distance_mm: float, spread_rad: float, rng: np.random.Generator
 ) -> tuple[Rigid, list[Rigid]]:
-    """Returns target_from_board and ``count`` camera_from_target.
-
-    In every view both faces are tilted by up to 67° and the board by up to 50°, all of target and board is inside
-    the image, and neither covers the other. Among the views that satisfy this, those farthest apart are chosen.
-    """
+    """Returns target_from_board and ``count`` camera_from_target. In every view both faces are tilted by up to 67°
+    and the board by up to 50°, all of target and board is inside the image, and neither covers the other. Among the
+    views that satisfy this, those farthest apart are chosen."""
     best, shown = None, 0
     for _ in range(PLACES):
         target_from_board = _board_place(shape, rng)

@@ -57,10 +57,8 @@ def draw_background(
     lens: ThinLens | None = None,
     reflectance: float | None = None,
 ) -> np.ndarray:
-    """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery.
-
-    A thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
-    """
+    """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery. A
+    thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs."""
     g, look = scene.groups[group], look_of(scene.target.polarity)
     canvas = np.full((scene.camera.height, scene.camera.width), round(look.wall), np.uint8)
     painter = _Painter(scene.camera, g.camera_from_target[image], canvas)
@@ -312,10 +310,8 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:
-    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16.
-
-    The same arguments give the same image.
-    """
+    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16. The same arguments give
+    the same image."""
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)

@@ -349,10 +349,8 @@ PAST = (0.42, 0.24)
 
 
 def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
-    """Returns the scene with cameras of COLMAP's OPENCV_FISHEYE at the same places, turned at random.
-
-    ``field_deg`` : field of view over the image's diagonal, without distortion.
-    """
+    """Returns the scene with cameras of COLMAP's OPENCV_FISHEYE at the same places, turned at random. ``field_deg``
+    : field of view over the image's diagonal, without distortion."""
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2
     focal = np.hypot(original.width, original.height) / 2 / half

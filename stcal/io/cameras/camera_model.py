@@ -35,10 +35,9 @@ OF_IMAGES = "the images"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel(ByValue):
-    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states none.
-
-    ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's parameters.
-    """
+    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states
+    none. ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's
+    parameters."""
 
     focal: np.ndarray
     centre: np.ndarray

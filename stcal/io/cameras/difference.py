@@ -152,10 +152,8 @@ SMALL = 1e-6
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLens:
     """The camera that was fitted to a lens, and its RMS and largest residual where the lens was determined.
-
     ``share`` : of the azimuths in which that ends within 89° of the axis; ``camera_from_lens`` : the rotation of the
-    camera's axes, the identity unless it helps much.
-    """
+    camera's axes, the identity unless it helps much."""
 
     camera: Camera
     rms_px: float

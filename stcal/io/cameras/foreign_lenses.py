@@ -45,12 +45,9 @@ MARGIN = {2: 1, 3: 2}  # number of intervals beyond the stated field of view, by
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignLens:
-    """A lens that is known by its projection only, of a model that is ``called`` so.
-
-    ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``,
-    ``height`` : px, or None if the file states none; ``region`` : polygon (n, 2), px, within which it was determined,
-    or None.
-    """
+    """A lens that is known by its projection only, of a model that is ``called`` so. ``project`` : returns pixels
+    (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``, ``height`` : px, or None if the
+    file states none; ``region`` : polygon (n, 2), px, within which it was determined, or None."""
 
     called: str
     project: Callable[[np.ndarray], np.ndarray]
@@ -65,10 +62,8 @@ class ForeignLens:
 
 def of_colmap(model: str, width: float, height: float, params) -> CameraModel | ForeignLens:
     """Return the camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
-
     COLMAP 4, ``sensor/models.h``. A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens
-    distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE).
-    """
+    distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE)."""
     numbers = [float(value) for value in params]
     if model not in COLMAP_FOREIGN:
         return camera_from_colmap(model, width, height, numbers)
@@ -194,11 +189,8 @@ def of_parts(
     lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, xi: float = 0.0
 ) -> ForeignLens:
     """Return a lens of a projection, OpenCV's distortion (k,), and a matrix of fx, fy, cx, cy with skew as of
-    :func:`of_opencv`.
-
-    ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of OpenCV's omnidir,
-    Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none.
-    """
+    :func:`of_opencv`. ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of
+    OpenCV's omnidir, Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none."""
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height)
     if not abs(skew) < abs(camera.focal[0]):
         raise InputError("E-CAMERA-SKEW", f"skew {skew:g} px, less than fx needed; correct it")
@@ -219,11 +211,10 @@ def of_parts(
 
 def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size) -> ForeignLens:
     """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
-
-    C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B. Khomutenko
-    et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera Model", 3DV 2018.
-    F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13, 2001.
-    """
+    C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B.
+    Khomutenko et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera
+    Model", 3DV 2018. F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications
+    13, 2001."""
     first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
     coefficients = given if count else np.zeros(0)
@@ -311,12 +302,10 @@ def refused(camera: Camera, form: str, why: str) -> InputError:
 
 
 def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens:
-    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; a
-    supported model if both angles are zero.
-
-    A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery,
-    "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006).
-    """
+    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1,
+    r2; a supported model if both angles are zero. A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ²
+    − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68,
+    2006)."""
     if len(numbers) != 9:
         raise InputError("E-CAMERA-COEFFICIENTS", f"{len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")
     (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]

@@ -132,12 +132,10 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
 
 
 def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: bool = False) -> None:
-    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an :class:`InputNote`;
-    one that may change the projection is refused unless its value is 0 or empty.
-
-    ``harmless`` : further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in
-    ``*``; ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
-    """
+    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an
+    :class:`InputNote`; one that may change the projection is refused unless its value is 0 or empty. ``harmless`` :
+    further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in ``*``;
+    ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it."""
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
     pass_over(_with_numbers(unread))
