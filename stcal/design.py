@@ -98,13 +98,11 @@ class FaceDesign(Brief):
         _require_different(ids, f"{where}: circle id")
         for key, circle in zip(("origin", "x", "y"), frame, strict=True):
             if circle not in ids:
-                raise InputError(
-                    "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
-                )
+                raise InputError("E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among {', '.join(ids)}")
         if radius.min() <= 0:
             raise InputError(
                 "E-TARGET-RADIUS",
-                f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
+                f"{where}: circle {ids[int(radius.argmin())]}: radius {radius.min():g} mm; more needed",
             )
         gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
         np.fill_diagonal(gap, np.inf)
@@ -119,9 +117,7 @@ class FaceDesign(Brief):
         axis = (x - origin) / length_x
         sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
         if abs(sine) < MIN_SINE:
-            raise InputError(
-                "E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line"
-            )
+            raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} on one line; choose others")
         if sine < 0:
             raise InputError(
                 "E-TARGET-FRAME",
@@ -230,9 +226,7 @@ class TargetDesign(Brief):
             if face.id == face_id:
                 return face
         known = ", ".join(face.id for face in self.faces)
-        raise InputError(
-            "E-TARGET-NO-FACE", f"target {self.name}: no face {face_id}; the design has {known}, choose one of them"
-        )
+        raise InputError("E-TARGET-NO-FACE", f"target {self.name}: no face {face_id}; choose one of {known}")
 
     def rough_poses(self) -> dict[str, Rigid]:
         """Returns the rough poses by face id, of the faces that have one."""
@@ -326,15 +320,13 @@ class BoardDesign(ByValue):
             raise InputError("E-BOARD-SIZE", "board: {} rows and {} columns; 1 or more of each needed".format(*size))
         if not 0 < 2 * self.radius_mm < self.pitch_mm:
             raise InputError(
-                "E-BOARD-RADIUS",
-                f"board: radius {self.radius_mm:g} mm, under half the pitch {self.pitch_mm:g} mm needed",
+                "E-BOARD-RADIUS", f"board: radius {self.radius_mm:g}, under half the pitch {self.pitch_mm:g} mm needed"
             )
         if corner is None:
             return
         if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):
             raise InputError(
-                "E-BOARD-CORNER",
-                f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
+                "E-BOARD-CORNER", f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner needed"
             )
         least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
         if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:

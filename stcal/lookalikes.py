@@ -87,11 +87,9 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
         gap = abs(change * centred - target)
         coincides = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
         if coincides.all() and alike(scale * radius, other_radius).all():
-            radius_difference = float(abs(scale * radius - other_radius).max())
+            radii_mm = float(abs(scale * radius - other_radius).max())
             shift = other.mean() - change * own.mean()
-            return Likeness(
-                float(gap.max()), radius_difference, float(np.angle(change)), scale, (shift.real, shift.imag)
-            )
+            return Likeness(float(gap.max()), radii_mm, float(np.angle(change)), scale, (shift.real, shift.imag))
     return None
 
 

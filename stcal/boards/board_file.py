@@ -60,9 +60,7 @@ Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
 def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K", least: float = LEAST_PPM) -> float:
     if 0 < abs(value) < least:
         percent = "" if per else f", and in % {1e4 * value:g}"
-        raise ValueError(
-            f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or at least {least:g} needed"
-        )
+        raise ValueError(f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or {least:g} needed")
     return value
 
 
@@ -123,11 +121,10 @@ class _Dots(BoardSizeEntry):
 def _dots(data: _Dots, where: str) -> BoardDesign:
     same = data.model_dump(include={entry.name for entry in fields(BoardDesign)} - {"corner"})
     same["rings"] = _rings(data.rings, data.rows, data.columns, True, where)
-    corner = data.corner and (data.corner.row, data.corner.column)
+    stated = data.corner
+    corner, radius_mm = ((stated.row, stated.column), stated.radius_mm) if stated else (None, None)
     with named(where, "board"):
-        return BoardDesign(
-            **same, corner=corner, corner_radius_mm=data.corner and data.corner.radius_mm, stated=data.stated()
-        )
+        return BoardDesign(**same, corner=corner, corner_radius_mm=radius_mm, stated=data.stated())
 
 
 def _rings(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bool, where: str) -> tuple:
@@ -309,9 +306,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         if place is None:
             raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
         if tag.id >= (count := count_of(tag.dictionary)):
-            raise InputError(
-                "E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct id or dictionary"
-            )
+            raise InputError("E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct it")
         along = np.roll(place, -1, axis=0) - place
         following = np.roll(along, -1, axis=0)
         turn = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]

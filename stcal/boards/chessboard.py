@@ -43,9 +43,7 @@ PX_A_SQUARE = 25.0
 """Longer side of the first image that is searched, px per square of the board's longer side."""
 
 
-def find_chessboard(
-    image: np.ndarray, name: str, board: ChessboardDesign, with_sigma: bool = False
-) -> BoardView | None:
+def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign, with_sigma=False) -> BoardView | None:
     """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black. A
     board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are."""
     grey = grey_8bit(image)

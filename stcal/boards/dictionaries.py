@@ -138,9 +138,7 @@ def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, 
         except ValueError as error:
             raise InputError("E-TAG-DICTIONARY", f"{where}: tag {tag}: dictionary {name!r}: {error}") from None
         if tag != int(tag) or not 0 <= tag < count_of(full):
-            raise InputError(
-                "E-TAG-ID-RANGE", f"{where}: tag {tag}: {full} has 0 … {count_of(full) - 1}; correct id or dictionary"
-            )
+            raise InputError("E-TAG-ID-RANGE", f"{where}: tag {tag}: {full} has 0 … {count_of(full) - 1}; correct it")
         known.append((full, int(tag)))
     if twice := [tag for k, tag in enumerate(known) if tag in known[:k]]:
         repeated = f"{where}: tag {twice[0][1]} of {twice[0][0]} occurs twice; tags must differ"

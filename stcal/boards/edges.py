@@ -306,10 +306,8 @@ def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
-    levels = value[:, [3, 5]]
-    return _Area(
-        offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], passed, told, smeared
-    )
+    blur, levels, by_sampling = value[:, 2], value[:, [3, 5]], (inverse @ pull)[:, :2]
+    return _Area(offset, slope, settled, blur, levels, factor, by_noise, by_sampling, passed, told, smeared)
 
 
 def _smear(normal: np.ndarray, blur: np.ndarray, good: np.ndarray) -> np.ndarray:
@@ -466,9 +464,8 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
         off = pixels - (start + value[:, :2])[:, None]
         distance, place = (np.einsum("nki,nei->enk", off, axes) for axes in (normal, direction))
-        (one, slope1, wide1), (two, slope2, wide2) = (
-            integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1)
-        )
+        both = (integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1))
+        (one, slope1, wide1), (two, slope2, wide2) = both
         # Where edges are not square, the pixel sees both at once (first term of the tetrachoric series).
         both = (normal[:, 0] * normal[:, 1]).sum(1) * (value[:, 4] + PIXEL_VARIANCE)
         cross = one * two + (1 - one) * (1 - two) + 2 * both[:, None] * slope1 * slope2

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, ConfigDict, Field
 
-from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
+from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign, FlatBoard
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
 from stcal.io.rotations import of_quaternions
@@ -141,9 +141,7 @@ class _CircleGrid(Strict):
     asymmetricGrid: bool
 
 
-def kalibr_board_of(
-    content: dict[str, Any], where: str
-) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
+def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
     """Return the board of a file of Kalibr; its circle grids do not state the radius, which images determine."""
     kind = content["target_type"]
     if kind == "aprilgrid":
@@ -151,8 +149,7 @@ def kalibr_board_of(
         available = count_of(KALIBR_FAMILY)
         if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
             raise InputError(
-                "E-TAG-ID-RANGE",
-                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
+                "E-TAG-ID-RANGE", f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct them"
             )
         size = METRE_MM * data.tagSize
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
@@ -167,8 +164,7 @@ def kalibr_board_of(
         across, down = data.colSpacingMeters, data.rowSpacingMeters
         if abs(across - down) > SAME_WITHIN * across:
             raise InputError(
-                "E-BOARD-SPACING",
-                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same",
+                "E-BOARD-SPACING", f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed"
             )
         return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
     if kind == "circlegrid":

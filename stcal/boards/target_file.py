@@ -226,8 +226,7 @@ def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
         raise InputError(
-            "E-TARGET-OUTLINE",
-            f"{where}: outline_mm has the same corner twice; corners in order around the plate needed",
+            "E-TARGET-OUTLINE", f"{where}: outline_mm has the same corner twice; each once, in order, needed"
         )
     from_corner = face.xy_mm[:, None] - outline
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
@@ -245,7 +244,7 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     for key, direction in (("x", x), ("normal", z)):
         if (length := float(np.linalg.norm(direction))) < MIN_DIRECTION:
             raise InputError(
-                "E-TARGET-ROUGH-POSE", f"{where}: rough_pose: {key} {direction.tolist()}; a direction needed, not zero"
+                "E-TARGET-ROUGH-POSE", f"{where}: rough_pose: {key} {direction.tolist()}; a direction needed"
             )
         direction /= length
     angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))

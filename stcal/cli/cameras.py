@@ -15,7 +15,7 @@ app = group("stcal camera", "Show, convert and compare camera files of this and 
 Form = Literal["colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"]
 """Format of a camera file."""
 NameOption = Annotated[
-    str, "Choose this camera from a file of several, such as cam1 or 2; it is also the name that is written."
+    str, "Choose this camera from a file of several, such as cam1 or 2; it is also the name written."
 ]
 SizeOption = Annotated[str, "Take images to have this size, px, if the file states none.", Opt(metavar="WxH")]
 PlotFile = Annotated[Path | None, "Draw a picture into this file (.svg).", WRITES]

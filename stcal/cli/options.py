@@ -246,7 +246,7 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
 
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(
-            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed"
+            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g}: over --min-diameter {min_diameter:g} needed"
         )
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
@@ -292,7 +292,7 @@ def _grouped(command: Callable) -> Callable:
     @wraps(command)
     def together(**given):
         made = {
-            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)}) for name, kind in groups.items()
+            name: kind(**{each.name: given.pop(each.name) for each in fields(kind)}) for name, kind in groups.items()
         }
         return command(**given, **made)
 
@@ -329,15 +329,13 @@ def _protected(command: Callable) -> Callable:
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":
-                raise InputError(
-                    "E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give the name of a file"
-                )
+                raise InputError("E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give a file")
         written = [each for each in written if each[1] != STANDARD_OUTPUT]
         for option, path in written:
             if option == "--report" and path.suffix.lower() == ".pdf":
                 also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
                 raise InputError(
-                    "E-OUTPUT-SUFFIX", f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}"
+                    "E-OUTPUT-SUFFIX", f"--report {path}: a page of HTML; give {path.with_suffix('.html')}{also}"
                 )
         keep_apart(written, read)
         token = _replacing.set(overwrite)

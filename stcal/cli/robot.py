@@ -366,9 +366,7 @@ def compensate(
     write_if(json_file, lambda: compensation.CompensationFile.model_validate(result))
     write_if(report, document.page)
     if not result.found.usable.any():
-        raise DegenerateError(
-            "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"
-        )
+        raise DegenerateError("E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see above")
 
 
 def design(

@@ -151,9 +151,7 @@ def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None
 @lru_cache
 def _rules(kind: type) -> dict[str, tuple[Rule, Any]]:
     hints = get_type_hints(kind)
-    ends = {
-        each.name: isinstance(each.default, float) and math.isinf(each.default) for each in fields(kind) if each.init
-    }
+    ends = {e.name: isinstance(e.default, float) and math.isinf(e.default) for e in fields(kind) if e.init}
     return {name: (rule, hints[name]) for name, end in ends.items() if (rule := _rule(hints[name], end))}
 
 
@@ -226,9 +224,7 @@ def _as_array(values: ArrayLike, shape: Shape | None, what: str, dtype: DTypeLik
     try:
         array = np.array(values)
     except ValueError as error:
-        raise InputError(
-            "E-ARRAY-SHAPE", f"{what}: rows of different lengths; {shape or 'equal ones'} needed"
-        ) from error
+        raise InputError("E-ARRAY-SHAPE", f"{what}: rows of different lengths; {shape or 'equal'} needed") from error
     if array.dtype.kind not in "biuf" and dtype is not object and array.size:
         raise InputError("E-ARRAY-TYPE", f"{what}: {array.dtype} values; real numbers needed")
     if array.dtype.kind == "f" and np.dtype(dtype).kind in "iu" and (array != np.rint(array)).any():
@@ -317,7 +313,7 @@ def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
         raise InputError(
-            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'a single number'}, {size}×{size} needed"
+            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'one number'}, {size}×{size} needed"
         )
     fault = first_fault(matrix[None], rows, definite)
     if fault is not None:

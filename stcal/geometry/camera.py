@@ -84,9 +84,7 @@ class Camera(ByValue):
             object.__setattr__(self, "distortion", np.pad(self.distortion, (0, 4)))
         freeze(self, "distortion", (COEFFICIENTS,), "distortion")
         if self.fisheye and self.distortion[[6, 7, 9, 11]].any():
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera; 0 needed")
         if not self.colmap_model:
             object.__setattr__(self, "colmap_model", "THIN_PRISM_FISHEYE" if self.fisheye else "FULL_OPENCV")
         if self.colmap_model not in COLMAP_LAYOUT or (FISHEYE in self.colmap_model) != self.fisheye:
@@ -144,8 +142,7 @@ class Camera(ByValue):
             return matrix, self.distortion[:count].copy()
         if self.distortion[[2, 3, 8, 10]].any():
             raise InputError(
-                "E-CAMERA-MODEL",
-                "camera: tangential terms or prisms, which OpenCV's fisheye lacks; write it in COLMAP's form",
+                "E-CAMERA-MODEL", "camera: p1, p2 or prisms, which OpenCV's fisheye lacks; write it in COLMAP's form"
             )
         return matrix, self.distortion[[0, 1, 4, 5]]
 
@@ -271,9 +268,7 @@ class Camera(ByValue):
         if not self.distortion.any():
             return self._perspective(target.copy(), target)
         if not np.isfinite(target).all():
-            raise ConvergenceError(
-                "E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite coordinates needed"
-            )
+            raise ConvergenceError("E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite ones needed")
         x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
         steps = 0
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported below
@@ -355,9 +350,7 @@ def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> t
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of a fisheye; k1 to k4 needed")
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
     if given[8:].any():

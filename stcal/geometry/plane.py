@@ -95,9 +95,7 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
         raise DegenerateError("E-POINTS-FEW", f"homography: {len(b)} point pairs, 4 needed")
     (homography,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
     if not np.isfinite(homography).all():
-        raise DegenerateError(
-            "E-POINTS-COLLINEAR", "homography: the points do not determine it (three of four on a line)"
-        )
+        raise DegenerateError("E-POINTS-COLLINEAR", "homography: the points do not determine it (three on a line)")
     return homography
 
 

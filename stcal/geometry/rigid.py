@@ -127,9 +127,7 @@ class Rigid(ByValue, _Frames):
         freeze(self, "translation", (3,), "translation")
         deviation = _off_proper(*self.rotation.tolist())
         if deviation > 1e-6:
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rotation: not a proper rotation matrix; orthogonal with determinant +1 needed"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rotation: improper; orthogonal with determinant +1 needed")
         if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could fail the check above
             u, _, vt = np.linalg.svd(self.rotation)
             object.__setattr__(self, "rotation", frozen(u @ vt))
@@ -142,14 +140,11 @@ class Rigid(ByValue, _Frames):
             raise InputError("E-ARRAY-SHAPE", f"rigid transform: shape {m.shape}, 4×4 needed")
         if (m[3:] != [0, 0, 0, 1]).any():
             raise InputError(
-                "E-MATRIX-LAST-ROW",
-                f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is the matrix transposed?",
+                "E-MATRIX-LAST-ROW", f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is it transposed?"
             )
         u, s, vt = np.linalg.svd(m[:3, :3])
         if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rigid transform: the 3×3 part is not a rotation (left-handed or scaled)"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rigid transform: 3×3 part is no rotation (left-handed or scaled)")
         return cls(u @ vt, m[:3, 3])
 
     def as_scipy(self) -> Rotation:
@@ -263,9 +258,7 @@ class Poses(Brief, _Frames):
         freeze(self, "rotation", (len(self.translation), 3, 3), "rotations")
         r = self.rotation
         if len(r) and ((np.linalg.det(r) < 0).any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rotations: not proper rotation matrices; orthogonal with determinant +1 needed"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rotations: improper; orthogonal with determinant +1 needed")
 
     @classmethod
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
@@ -294,7 +287,7 @@ class Poses(Brief, _Frames):
         if len(off) and off.max() > UNIT_WITHIN:
             raise InputError(
                 "E-QUATERNION-LENGTH",
-                f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed",
+                f"quaternion {off.argmax() + 1}: length off by {off.max():.3g}, {UNIT_WITHIN} allowed",
             )
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
@@ -340,9 +333,8 @@ class Poses(Brief, _Frames):
     def __matmul__(self, other):
         """Return a_from_c for a :class:`Rigid` or m :class:`Poses` b_from_c; points (m, 3) for one or m points."""
         if isinstance(other, Rigid | Poses):
-            translation = np.einsum(
-                "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation
-            )
+            sums = "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi"
+            translation = np.einsum(sums, self.rotation, other.translation)
             return Poses._of(self.rotation @ other.rotation, translation + self.translation)
         points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
         return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
@@ -375,7 +367,7 @@ class Affine(ByValue):
         """Return b_from_a; a singular linear part is refused."""
         if np.linalg.cond(self.linear) > 1e12:
             raise DegenerateError(
-                "E-AFFINE-SINGULAR", "affine transform: its 3×3 part is singular; an invertible one needed"
+                "E-AFFINE-SINGULAR", "affine transform: 3×3 part is singular; an invertible one needed"
             )
         back = np.linalg.inv(self.linear)
         return Affine(back, -back @ self.translation)
@@ -458,7 +450,7 @@ def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
     for points in (da, db):
         if _collinear(points[w > 0]):
             raise DegenerateError(
-                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line are needed"
+                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line needed"
             )
     rotation, product = best_rotations((w[:, None] * da).T @ db)
     scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0

@@ -87,9 +87,7 @@ class OpenCVSource:
             received, frame = self._capture.read()
             read += 1
             if not received or frame is None:
-                raise InputError(
-                    "E-DEVICE-NO-IMAGE", f"{self.name}: no longer gives images; check its cable and other programs"
-                )
+                raise InputError("E-DEVICE-NO-IMAGE", f"{self.name}: no longer gives images; check its cable")
         return _grey(frame), float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
 
     def close(self) -> None:

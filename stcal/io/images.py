@@ -156,9 +156,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         )
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in telling[:1])
         kinds = f"{', '.join(s[1:] for s in USUAL)}{hint}"
-        raise InputError(
-            "E-IMAGES-NONE", f"image folder {root}: no image, one of {kinds}; put them into {root}/<group>/"
-        )
+        raise InputError("E-IMAGES-NONE", f"image folder {root}: no image, {kinds}; put them into {root}/<group>/")
     _refuse_mosaics(files)
     return files, skipped
 
@@ -340,7 +338,7 @@ def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], st
     found = common_size(files)
     if found is None:
         raise InputError(
-            "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
+            "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check them"
         )
     return found
 
@@ -374,7 +372,7 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
         ) from error
     except Exception as error:  # data that are no image fail in many ways
         raise InputError(
-            "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(USUAL)}"
+            "E-IMAGE-UNREADABLE", f"{name}: no readable image; convert it to {', '.join(USUAL)}"
         ) from error
 
 
@@ -383,8 +381,7 @@ def grey_of(image: np.ndarray, name: str) -> np.ndarray:
     image = np.asarray(image)
     if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
         raise InputError(
-            "E-ARRAY-SHAPE",
-            f"{name}: array of shape {image.shape}; (height, width) or (height, width, 3) needed, grey or RGB",
+            "E-ARRAY-SHAPE", f"{name}: shape {image.shape}; (height, width), or (height, width, 3) of RGB needed"
         )
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
@@ -412,7 +409,7 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
         raise InputError(
-            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed{remedy}"
+            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; 8 or 16 bits of grey needed{remedy}"
         )
     if size is not None and image.shape[::-1] != size:
         raise InputError(

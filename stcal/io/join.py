@@ -135,9 +135,8 @@ def stack_tables(
     for name in common:
         values_of_table = [table.kept(name) for table in tables]
         numeric = all(isinstance(part, np.ndarray) for part in values_of_table)
-        columns[name] = (
-            np.concatenate(values_of_table) if numeric else [v for table in tables for v in table.text(name)]
-        )
+        texts = (v for table in tables for v in table.text(name))
+        columns[name] = np.concatenate(values_of_table) if numeric else list(texts)
     columns |= {second: columns[first] for second, first in (called or {}).items()}
     columns[column] = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
     lines = [line for table in tables for line in table.lines]

@@ -202,7 +202,7 @@ class Reading:
 
 LAST = Reading("x, y, z, w in the order of their columns", "give --quaternions xyzw", (3, 0, 1, 2))
 FIRST = Reading(
-    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or name the columns so", (1, 2, 3, 0)
+    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or rename them", (1, 2, 3, 0)
 )
 ORDERS = (LAST, FIRST)
 INVERTED = Reading("conjugated (the first frame seen from the second)", "change the sign of qw", conjugated=True)

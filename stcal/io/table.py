@@ -186,8 +186,7 @@ class Table(ByValue):
             return None
         if covariance is None:
             raise InputError(
-                "E-TABLE-COVARIANCE",
-                f"{self.where}: columns common1_… without columns cov_…, which must include them; give both",
+                "E-TABLE-COVARIANCE", f"{self.where}: columns common1_… without cov_…, which include them; give both"
             )
         names = [prefix + name for name in common_columns(count)]
         self._need_all(names, "columns common1_rx …")
@@ -206,14 +205,12 @@ class Table(ByValue):
     def _need_all(self, names: Iterable[str], which: str) -> None:
         for name in names:
             if name not in self:
-                raise InputError(
-                    "E-TABLE-COLUMN-MISSING", f"{self.where}: {name} is missing; all {which} or none needed"
-                )
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{self.where}: no {name}; all {which} or none needed")
 
     def _need(self, column: str) -> None:
         if column not in self.columns:
             raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: column {column} is missing; the header is {self.header()}"
+                "E-TABLE-COLUMN-MISSING", f"{self.where}: no column {column}; the header is {self.header()}"
             )
 
 
@@ -248,22 +245,17 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     try:
         names = [name.strip() for name in cells_of(used[0][1], between)]
     except csv.Error as error:
-        raise InputError(
-            "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
-        ) from error
+        raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header needed") from error
     names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
         raise InputError(
-            "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
+            "E-TABLE-HEADER", f"{where}: line {used[0][0]} is numbers, a header with units needed, like x_mm"
         )
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
-            raise InputError(
-                "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
-            )
+            raise InputError("E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; once needed")
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
         raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]} is no header of the rows below it; remove it")
     if len(used) == 1:
@@ -287,9 +279,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         raise InputError("E-TABLE-CELLS", f"{where}: line {first}: {open_cell}")
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
-            raise InputError(
-                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
-            )
+            raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, the header has {len(names)}")
     columns = {name: [row[k] for row in cells] for k, name in enumerate(names)}
     if between == ",":
         return Table(where, dict(columns), numbers, quaternions)

@@ -63,9 +63,7 @@ class PoseEntry(Strict):
         wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
         length = float(np.linalg.norm(wxyz))
         if abs(length - 1) > UNIT_WITHIN:
-            raise InputError(
-                "E-QUATERNION-LENGTH", f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz"
-            )
+            raise InputError("E-QUATERNION-LENGTH", f"{where}: quaternion of length {length:.4g}, 1 needed; correct it")
         return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
 
 

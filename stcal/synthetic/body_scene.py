@@ -166,10 +166,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
         if face.id not in rough:
-            raise InputError(
-                "E-SIMULATE-BODY",
-                f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
-            )
+            raise InputError("E-SIMULATE-BODY", f"face {face.id}: no rough_pose; each face needs one in target.toml")
     rng = np.random.default_rng(options.seed)
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
     moved = {}

@@ -161,9 +161,7 @@ IMAGE_FORMATS = ("jpg", "png")
 def new_dataset(folder: Path) -> Iterator[None]:
     """Refuses a folder that is not empty or not writable; if the block fails, the folder is left as it was."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
-        )
+        raise InputError("E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give another")
     existed = folder.exists()
     try:
         yield

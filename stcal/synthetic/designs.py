@@ -107,9 +107,7 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
         whole = tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
     if unknown := [name for name in kept if name not in ids]:
-        raise InputError(
-            "E-OPTION-VALUE", f"--faces {faces}: the {kind} has no face {unknown[0]}; use some of {', '.join(ids)}"
-        )
+        raise InputError("E-OPTION-VALUE", f"--faces {faces}: no face {unknown[0]}; use some of {', '.join(ids)}")
     if kept and len(set(kept)) < 2:
         raise InputError("E-OPTION-VALUE", f"--faces {faces}: one face; two or more needed, such as 1,2,3")
     return replace(whole, faces=tuple(face for face in whole.faces if not kept or face.id in kept))
@@ -122,9 +120,7 @@ def width_of(size: str | float) -> float:
     except ValueError:
         width = 0.0
     if not 0 < width <= MOST_WIDTH_MM:
-        raise InputError(
-            "E-OPTION-VALUE", f"--size {size}: one width between opposite faces, mm, such as 60, needed with --tags"
-        )
+        raise InputError("E-OPTION-VALUE", f"--size {size}: a width between opposite faces, mm, needed with --tags")
     return width
 
 
@@ -140,9 +136,7 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
         f"{tag_px:.0f} px at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
     )
     nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
-    tilted = (
-        f"\nwarning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm or nearer"
-    )
+    tilted = f"\nwarning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm"
     return text + tilted * (nearest < distance_mm)
 
 

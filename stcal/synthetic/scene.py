@@ -93,9 +93,7 @@ class SceneOptions:
         if self.fisheye_deg is not None and not 60 <= self.fisheye_deg <= 170:
             raise InputError("E-OPTION-RANGE", f"scene: fisheye_deg {self.fisheye_deg:g}, 60 to 170 possible")
         if len(self.distortion) > 8:
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} coefficients, at most 8 possible")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,9 +186,7 @@ def make_scene(
     options = options or SceneOptions()
     if camera is not None:
         if options.fisheye_deg is not None:
-            raise InputError(
-                "E-OPTION-CONFLICT", "scene: camera and fisheye_deg given, which are two cameras; give one of them"
-            )
+            raise InputError("E-OPTION-CONFLICT", "scene: camera and fisheye_deg are two cameras; give one of them")
         model = camera_model(camera)
         if not (model.width and model.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file")
@@ -241,9 +237,8 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
         turn, shift = rng.standard_normal((2, 3)) / np.sqrt(3)
         moved = Rigid.exp([*(np.radians(options.face_turn_deg) * turn), *(options.face_shift_mm * shift)])
         # The face turns about its own origin, so that only the shift moves the origin.
-        pose = Rigid(
-            moved.rotation @ nominal[face.id].rotation, nominal[face.id].translation + options.face_shift_mm * shift
-        )
+        rough = nominal[face.id]
+        pose = Rigid(moved.rotation @ rough.rotation, rough.translation + options.face_shift_mm * shift)
         xy = face.xy_mm + options.circle_sigma_mm * rng.standard_normal(face.xy_mm.shape)
         xyz = pose @ np.column_stack([xy, np.zeros(len(xy))])
         placed[face.id] = xyz
@@ -354,9 +349,7 @@ def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2
     focal = np.hypot(original.width, original.height) / 2 / half
-    camera = Camera(
-        original.width, original.height, np.array([focal, focal]), original.centre, np.array(DISTORTION), True
-    )
+    camera = Camera(original.width, original.height, [focal, focal], original.centre, DISTORTION, True)
     groups = {}
     for name, group in scene.groups.items():
         angles = rng.uniform(-1, 1, (len(group.camera_from_target), 2)) * half * PAST

@@ -104,12 +104,9 @@ def simulate(
         others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
             raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
+                "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
             )
-        shape = BodyOptions(
-            images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0, body_seed=body_seed
-        )
+        shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1, body_seed=body_seed)
         file = None if camera is None else read_camera(camera)
         if file is not None and not (file.width and file.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
@@ -155,9 +152,7 @@ def _lens(
     if f_number is None:
         for name, value in {"--focus-mm": focus_mm, "--focal-mm": focal_mm}.items():
             if value is not None:
-                raise InputError(
-                    "E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number, or leave {name} out"
-                )
+                raise InputError("E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number")
         return None
     if focal_mm is None and camera is not None:
         raise InputError(
@@ -199,9 +194,7 @@ def _scene(
     if camera is None:
         return scene.make_scene(replace(options, fisheye_deg=fisheye), *designs, poses)
     if fisheye is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them"
-        )
+        raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
     return scene.make_scene(options, *designs, poses, read_camera(camera))
 
 

@@ -64,9 +64,7 @@ def plan(
 
     design = target_of(target)
     if noise is not None and run is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
-        )
+        raise InputError("E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both state σ; give one of them")
     if noise is not None:
         centre_noise = CentreNoise(0.0, floor_px=noise, corner_px=noise)
         source = "--noise, whatever the size of a circle"
@@ -225,9 +223,7 @@ def measure(
     ellipses = shared.ellipse_options(min_diameter, max_diameter)
     target = _design_beside(faces) if target is None else target
     if serve or live:
-        mode, source = (
-            ("--live", "from a camera, as it takes them") if live else ("--serve", "over HTTP, one answer each")
-        )
+        mode, source = ("--live", "from a camera, as taken") if live else ("--serve", "over HTTP, one answer each")
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--out": out != TABLE}
         alone |= {
             "IMAGES": images if serve else None,
@@ -237,9 +233,7 @@ def measure(
         alone |= {"--send-images": send_images, "--strict": strict, "--workers": workers}
         if conflict := next((name for name, value in alone.items() if value), None):
             lines = ", or give --json -, a line each" if live and conflict in ("--json", "--out") else ""
-            raise InputError(
-                "E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave {conflict} out{lines}"
-            )
+            raise InputError("E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave it out{lines}")
     elif images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     else:

@@ -198,7 +198,7 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
         layout = COLMAP_LAYOUT[colmap_model]
         if len(params) != len(layout):
             raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters for {colmap_model}, {len(layout)} needed"
+                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters of {colmap_model}, {len(layout)} needed"
             )
         flat = np.zeros(len(PARAMETER_NAMES))
         for place, value in zip(layout, params, strict=True):

@@ -240,15 +240,12 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
     around = np.concatenate([np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False), np.arctan2(*corners.T[::-1])])
     rays, pixels, ends = [], [], 0
     for azimuth in around:
-        rays_of_azimuth = np.column_stack(
-            [np.cos(azimuth) * np.tan(angle), np.sin(azimuth) * np.tan(angle), np.ones(FIT_STEPS)]
-        )
+        x, y = np.cos(azimuth) * np.tan(angle), np.sin(azimuth) * np.tan(angle)
+        rays_of_azimuth = np.column_stack([x, y, np.ones(FIT_STEPS)])
         pixels_of_azimuth = lens.project(rays_of_azimuth)
         radius = np.linalg.norm(pixels_of_azimuth - centre, axis=1)
-        inside = ((pixels_of_azimuth >= -0.5 - far) & (pixels_of_azimuth <= np.array([width, height]) - 0.5 + far)).all(
-            axis=1
-        )
-        inside &= lens.determined(pixels_of_azimuth)
+        off = np.abs(pixels_of_azimuth - (np.array([width, height]) - 1) / 2)
+        inside = (off <= np.array([width, height]) / 2 + far).all(axis=1) & lens.determined(pixels_of_azimuth)
         grows = np.diff(radius, prepend=0) > 0  # beyond this radius the distortion folds over
         good = np.logical_and.accumulate(inside & grows)
         count = int(good.sum())
@@ -258,9 +255,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
             rays.append(rays_of_azimuth[np.unique(np.minimum(at, count - 1))])
             pixels.append(pixels_of_azimuth[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
-        raise InputError(
-            "E-CAMERA-NO-FIELD", f"{lens.called} projects almost no point into {width}×{height} px; check it"
-        )
+        raise InputError("E-CAMERA-NO-FIELD", f"{lens.called} projects hardly any point into {width}×{height} px")
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 
 

@@ -151,9 +151,7 @@ def one_of(names: list[str], choice: str) -> str:
     if choice not in names and (choice or len(names) > 1):
         asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
-        raise InputError(
-            "E-CAMERA-SEVERAL", f"{asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name"
-        )
+        raise InputError("E-CAMERA-SEVERAL", f"{asked}; choose of {shown} with --camera-name, or `stcal camera` --name")
     others = [name for name in names if name != (choice or names[0])]
     pass_over(others, "the other cameras, " if len(others) > 1 else "the other camera, ")
     return choice or names[0]
@@ -218,11 +216,8 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
     first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
     coefficients = given if count else np.zeros(0)
-    if (
-        numbers.shape != (first + 4,)
-        or coefficients.shape != (count,)
-        or not np.isfinite([*numbers, *coefficients]).all()
-    ):
+    of_model = numbers.shape == (first + 4,) and coefficients.shape == (count,)
+    if not of_model or not np.isfinite([*numbers, *coefficients]).all():
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
             f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
@@ -270,14 +265,12 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2)."""
     match = SPLINED.fullmatch(name)
     if match is None:
-        raise InputError(
-            "E-CAMERA-MODEL", f"{name[:80]} does not have mrcal's form of a splined model; write it again with mrcal"
-        )
+        raise InputError("E-CAMERA-MODEL", f"{name[:80]} is no splined model of mrcal's form; write it again")
     order, columns, rows, wide = (int(word) for word in match.groups())
     if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
-            f"{len(numbers)} intrinsics of {columns}×{rows} points; {4 + 2 * columns * rows} needed",
+            f"{len(numbers)} intrinsics; {4 + 2 * columns * rows} of {columns}×{rows} points needed",
         )
     focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
@@ -287,9 +280,8 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     def project(rays: np.ndarray) -> np.ndarray:
         u = 2 * rays[:, :2] / (np.linalg.norm(rays, axis=1) + rays[:, 2])[:, None]
         at = (u * per_u + middle).T[::-1]
-        moved = [
-            map_coordinates(c, at, order=order, prefilter=False, mode="nearest") for c in np.moveaxis(control, 2, 0)
-        ]
+        settings = {"order": order, "prefilter": False, "mode": "nearest"}
+        moved = [map_coordinates(c, at, **settings) for c in np.moveaxis(control, 2, 0)]
         return centre + focal * (u + np.column_stack(moved))
 
     called = f"mrcal's splines of {columns}×{rows} points"

@@ -78,8 +78,7 @@ def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
     structures = dict(_structures({key: value for key, value in values.items() if not key.startswith("__")}, ""))
     if not structures:
         raise InputError(
-            "E-CAMERA-CONTENT",
-            "no structure of a camera; save toStruct(cameraParams), since only MATLAB can read its objects",
+            "E-CAMERA-CONTENT", "no structure of a camera; save toStruct(cameraParams), not MATLAB's object"
         )
     return from_structure(structures[one_of(list(structures), choice)])
 

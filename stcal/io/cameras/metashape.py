@@ -47,9 +47,8 @@ def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
     if kind not in KINDS:
         raise InputError("E-CAMERA-MODEL", f"projection {kind}; frame and fisheye are read")
     names = (*NAMES, *MORE_NAMES)
-    require_known(
-        {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, HARMLESS
-    )
+    unread = {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}
+    require_known(unread, HARMLESS)
     v = {name: float(texts.get(name, 0) or 0) for name in names}
     size = root.find("resolution")
     stated = texts if size is None else size.attrib

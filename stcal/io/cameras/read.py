@@ -405,9 +405,7 @@ def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple
     """Return the camera of a file; ``size`` is taken where the file states none."""
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):
-        raise InputError(
-            "E-CAMERA-SIZE", f"camera file {path}: states no image size; give it (--size), width and height in px"
-        )
+        raise InputError("E-CAMERA-SIZE", f"camera file {path}: states no image size; give it (--size), px")
     if isinstance(model, ForeignLens):
         raise unsupported(model, path)
     return model.calibrated(width, height)
@@ -491,9 +489,7 @@ def _read(path: Path, name: str) -> CameraModel | ForeignLens:
         raise InputError("E-CAMERA-UNREADABLE", reason) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"no camera of {READ} ({reason}); check its form, or convert it"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", f"no camera of {READ} ({reason}); check it, or convert it") from error
 
 
 BINARY_FORMATS = (
