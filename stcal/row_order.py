@@ -133,14 +133,6 @@ def _best(errors: np.ndarray, basis: np.ndarray, motions: np.ndarray, good: np.n
     motion = step / np.where(scale > 0, scale, 1.0)
     variance = max(square - gain, 1e-300) / freedom
     near = places[:-1][(gain - gains[:-1]) / variance / 2 < EQUAL]
-    return Change(
-        kind="jump" if jump else "drift",
-        row=int(rows[place]) if jump else 0,
-        first=int(rows[near[0]]) if jump else 0,
-        last=int(rows[near[-1]]) if jump else 0,
-        motion=motion,
-        moves=moves,
-        share=gain / square,
-        log_p=float(chances[best] + np.log(len(places))),
-        good=good,
-    )
+    row, first, last = rows[[place, near[0], near[-1]]].tolist() if jump else (0, 0, 0)
+    told = motion, moves, gain / square, float(chances[best] + np.log(len(places))), good
+    return Change("jump" if jump else "drift", row, first, last, *told)

@@ -464,8 +464,8 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
         off = pixels - (start + value[:, :2])[:, None]
         distance, place = (np.einsum("nki,nei->enk", off, axes) for axes in (normal, direction))
-        both = (integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1))
-        (one, slope1, wide1), (two, slope2, wide2) = both
+        steps = (integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1))
+        (one, slope1, wide1), (two, slope2, wide2) = steps
         # Where edges are not square, the pixel sees both at once (first term of the tetrachoric series).
         both = (normal[:, 0] * normal[:, 1]).sum(1) * (value[:, 4] + PIXEL_VARIANCE)
         cross = one * two + (1 - one) * (1 - two) + 2 * both[:, None] * slope1 * slope2
@@ -475,15 +475,10 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
             value[:, 5:] = solved(levels, weight, level)[0]
         rise = (shade @ value[:, 8:, None])[..., 0]
         first, second = rise * by_first, rise * by_second
-        design = np.concatenate(
-            [
-                -first[..., None] * normal[:, None, 0] - second[..., None] * normal[:, None, 1],
-                np.stack([-first * place[0], -second * place[1]], axis=-1),
-                (rise * ((2 * two - 1) * wide1 + (2 * one - 1) * wide2))[..., None],
-                levels,
-            ],
-            axis=2,
-        )
+        by_shift = -first[..., None] * normal[:, None, 0] - second[..., None] * normal[:, None, 1]
+        by_turns = np.stack([-first * place[0], -second * place[1]], axis=-1)
+        by_blur = rise * ((2 * two - 1) * wide1 + (2 * one - 1) * wide2)
+        design = np.concatenate([by_shift, by_turns, by_blur[..., None], levels], axis=2)
         residual = level - (levels @ value[:, 5:, None])[..., 0]
         change, inverse = solved(design, weight, residual)
         if k < CROSSING_STEPS:

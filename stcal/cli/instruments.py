@@ -54,19 +54,14 @@ def capture(
     folder = scene_folder(out, scene)
     exposures = exposure_times(shortest, longest, count)
     source = OpenCVSource(device, gain) if simulate is None else SimulatedSource(simulate, gain)
+
+    def told(row) -> None:
+        shares = f"{100 * row.saturated_share:.1f} % saturated, {100 * row.dark_share:.1f} % dark"
+        say(f"  {row.image}: exposure {row.exposure_set:g} set for {row.exposure:g}, {shares}")
+
     try:
         say(f"{source.name}: {count} exposures")
-        capture(
-            source,
-            exposures.tolist(),
-            folder,
-            gain,
-            settle,
-            lambda row: say(
-                f"  {row.image}: exposure {row.exposure_set:g} set for {row.exposure:g}, "
-                f"{100 * row.saturated_share:.1f} % saturated, {100 * row.dark_share:.1f} % dark"
-            ),
-        )
+        capture(source, exposures.tolist(), folder, gain, settle, told)
     finally:
         source.close()
     say(f"scene: {folder}")
@@ -271,20 +266,10 @@ def register(
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
-    result = registered(
-        pairs.xyz_a,
-        pairs.xyz_b,
-        model=model,
-        method=method,
-        threshold_mm=threshold,
-        seed=seed,
-        liu2017_options=liu2017,
-        weights=pairs.weights,
-        covariances=pairs.covariances,
-        folds=folds,
-        allow_ambiguous=allow_ambiguous,
-        lines=pairs.lines,
-    )
+    both = {"threshold_mm": threshold, "liu2017_options": liu2017, "folds": folds}
+    asked = {"model": model, "method": method, "seed": seed, "allow_ambiguous": allow_ambiguous, **both}
+    stated = {"weights": pairs.weights, "covariances": pairs.covariances, "lines": pairs.lines}
+    result = registered(pairs.xyz_a, pairs.xyz_b, **asked, **stated)
     registration = findings(pairs, result)
     content, sections, failed = RegistrationFile.model_validate(registration), [], None
     if report and liu2017:
@@ -296,15 +281,7 @@ def register(
         from stcal.workflows.register_robot import comparison_section, register_with_robot
 
         try:
-            beside = register_with_robot(
-                pairs,
-                registration,
-                load_robot(robot_file),
-                source,
-                threshold_mm=threshold,
-                liu2017_options=liu2017,
-                folds=folds,
-            )
+            beside = register_with_robot(pairs, registration, load_robot(robot_file), source, **both)
             content = content.model_copy(update={"robot": OF_ROBOT.checked(beside)})
             sections.append(comparison_section(beside))
             if identified:

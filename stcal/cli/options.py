@@ -314,13 +314,7 @@ def _protected(command: Callable) -> Callable:
     outputs = {name for name, info in infos.items() if info.writable}
 
     @wraps(command)
-    def checked(
-        overwrite: bool = False,
-        quiet: bool = False,
-        verbose: bool = False,
-        camera_name: str = "",
-        **given,
-    ):
+    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, camera_name: str = "", **given):
         values = {name: value if isinstance(value, list | tuple) else [value] for name, value in given.items()}
         paths = [(name, path) for name, several in values.items() for path in several if isinstance(path, Path)]
         written, read = ([(words[n], p) for n, p in paths if (n in outputs) is out] for out in (True, False))

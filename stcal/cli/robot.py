@@ -121,9 +121,7 @@ def _is_xml(path: Path) -> bool:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
 
 
-def init(
-    file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
-) -> None:
+def init(file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml")) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.robot_model import mh80
 

@@ -194,11 +194,7 @@ def _holds_text(values: object) -> bool:
 
 
 def frozen(
-    values: ArrayLike,
-    shape: Shape | None = None,
-    what: str = "array",
-    dtype: DTypeLike = float,
-    finite: bool = True,
+    values: ArrayLike, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float, finite: bool = True
 ) -> np.ndarray:
     """Return a read-only copy of values of a shape, in which ``None`` admits any length; ``what`` : their name in
     messages; ``finite`` : whether NaN is refused, which else stands for what is not known."""

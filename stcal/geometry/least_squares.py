@@ -211,12 +211,7 @@ class Minima:
         return Minima(self.poses + other.poses, *both)
 
 
-def descend(
-    evaluate: Callable[[Poses], Normal],
-    poses: Poses,
-    settled: float,
-    hopeless: float = np.inf,
-) -> Minima:
+def descend(evaluate: Callable[[Poses], Normal], poses: Poses, settled: float, hopeless: float = np.inf) -> Minima:
     """Return the minima reached from h poses at once; a step that lowers χ² by less than ``settled``, or by less than
     this share, is the last, and so is any one of a pose whose χ² exceeds the best one by ``hopeless``."""
     result = minimise(

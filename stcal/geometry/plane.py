@@ -237,11 +237,7 @@ def distinct(poses: Poses, normal: np.ndarray, robust_sigma: float = 1.0) -> boo
 
 
 def two_minima(
-    descend_near: Callable[[Poses], Descend],
-    start: Poses,
-    target_from_plane: Rigid,
-    failure: str,
-    planar: bool = True,
+    descend_near: Callable[[Poses], Descend], start: Poses, target_from_plane: Rigid, failure: str, planar: bool = True
 ) -> PlaneMinima:
     """Return one or two distinct minima of the residuals of single points. ``descend_near`` : whitens residuals near
     one pose, alike for both minima, and returns the descent; ``start`` : one pose, to which its mirror image is

@@ -53,14 +53,9 @@ def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
     (a, b, c), (d, e, f), (g, h, i) = x, y, z
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         return math.inf
-    return max(
-        abs(a * a + b * b + c * c - 1),
-        abs(d * d + e * e + f * f - 1),
-        abs(g * g + h * h + i * i - 1),
-        abs(a * d + b * e + c * f),
-        abs(a * g + b * h + c * i),
-        abs(d * g + e * h + f * i),
-    )
+    own = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    across = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+    return max(*(abs(square - 1) for square in own), *map(abs, across))
 
 
 if TYPE_CHECKING and not MYPY:

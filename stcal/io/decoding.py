@@ -81,10 +81,7 @@ def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
     def apart(one: np.ndarray, two: np.ndarray) -> float:
         return float(np.median((one - two)[bright] / total[bright])) * 4
 
-    for greens, others, patterns in (
-        ((b, c), (a, d), ("RGGB", "BGGR")),
-        ((a, d), (b, c), ("GRBG", "GBRG")),
-    ):
+    for greens, others, patterns in (((b, c), (a, d), ("RGGB", "BGGR")), ((a, d), (b, c), ("GRBG", "GBRG"))):
         colour = max(min(abs(apart(other, green)) for green in greens) for other in others)
         if colour > LEAST_COLOUR and abs(apart(*greens)) < GREEN_ALIKE * colour:
             return patterns
@@ -96,8 +93,7 @@ RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", "
 EXPORT = "export it as JPEG of its full size, not edited"
 UNREAD = {
     **dict.fromkeys(
-        HEIC,
-        "a HEIC photograph, which is read after `pip install 'stereo-target-calibration[heic]'`; or " + EXPORT,
+        HEIC, "a HEIC photograph, which is read after `pip install 'stereo-target-calibration[heic]'`; or " + EXPORT
     ),
     **dict.fromkeys(RAW, "a raw photograph; develop it to TIFF or PNG without correction of the lens, crop or turn"),
 }

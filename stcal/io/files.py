@@ -69,19 +69,8 @@ DATABASE, MODELS, TARGET_MODEL = "colmap/database.db", "colmap/models", "colmap/
 REFINED_CAMERA = "colmap/refined_cameras.txt"
 """Camera file with the intrinsics that a run refined, and their σ."""
 REPORT_PDF, COMPARISON = "report.pdf", "compare.json"  # what `report --pdf` and `compare` add
-RUN_ENTRIES = (
-    "faces.json",
-    "report.json",
-    "report.html",
-    REPORT_PDF,
-    COMPARISON,
-    "labels.csv",
-    "detections.csv",
-    "overlays",
-    "colmap",
-    "inputs",
-    INTERNAL,
-)
+_RESULTS, _OTHERS = ("faces.json", "report.json", "report.html"), ("labels.csv", "detections.csv", "overlays")
+RUN_ENTRIES = (*_RESULTS, REPORT_PDF, COMPARISON, *_OTHERS, "colmap", "inputs", INTERNAL)
 """Files and folders of a run or, ``detections.csv`` and ``overlays``, of a detection alone."""
 NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
 """Suffixes of outputs that no command reads from a folder, beside a run's entries."""

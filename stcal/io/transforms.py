@@ -41,17 +41,12 @@ def xyzw(pose: Rigid) -> list[float]:
 
 def messages(statics: Iterable[Static]) -> str:
     """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
-    documents = [
-        {
-            "header": {"frame_id": each.parent},
-            "child_frame_id": each.child,
-            "transform": {
-                "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-                "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
-            },
-        }
-        for each in statics
-    ]
+    documents = []
+    for each in statics:
+        parts = ("translation", "xyz", metres(each.pose)), ("rotation", "xyzw", xyzw(each.pose))
+        transform = {part: dict(zip(axes, values, strict=True)) for part, axes, values in parts}
+        head = {"header": {"frame_id": each.parent}, "child_frame_id": each.child}
+        documents.append({**head, "transform": transform})
     return "---\n".join(yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in documents)
 
 

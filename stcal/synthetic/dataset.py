@@ -89,23 +89,20 @@ class TruthFile(ResultFile):
         options = options or RenderOptions()
         lens = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
         optics: dict[str, Any] = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
+        groups = {}
+        for name, group in scene.groups.items():
+            shown = [_circles(scene, name, i) for i in range(len(group.camera_from_target))]
+            images = {
+                image_name(name, i, image_format): TrueImage(camera_from_target=pose.matrix(), circles=shown[i])
+                for i, pose in enumerate(group.camera_from_target)
+            }
+            groups[name] = TrueGroup(board_circles_target=group.board_circles_target, images=images)
         truth = cls(
             unit="mm",
             reference_face=scene.reference_face,
             target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
             circles={str(label): xyz for label, xyz in scene.circles_target.items()},
-            groups={
-                name: TrueGroup(
-                    board_circles_target=group.board_circles_target,
-                    images={
-                        image_name(name, i, image_format): TrueImage(
-                            camera_from_target=pose.matrix(), circles=_circles(scene, name, i)
-                        )
-                        for i, pose in enumerate(group.camera_from_target)
-                    },
-                )
-                for name, group in scene.groups.items()
-            },
+            groups=groups,
         )
         return truth.model_copy(update={"optics": TrueOptics(**optics)}) if optics else truth
 
@@ -118,16 +115,12 @@ def image_name(group: str, image: int, image_format: str = "jpg") -> str:
 def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
     shown = image_circles(scene, group, image)
     number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
-    return {
-        number.get(label, label): TrueCircle(
-            centre_px=np.array([round(float(x), 5) for x in centre]),
-            tilt_deg=round(float(np.degrees(tilt)), 2),
-            must_find=bool(must),
-        )
-        for label, centre, tilt, must in zip(
-            shown.labels, shown.centre_px, shown.tilt_rad, shown.must_find, strict=True
-        )
-    }
+    made = {}
+    for i, label in enumerate(shown.labels):
+        centre, tilt_deg = np.round(shown.centre_px[i], 5), round(float(np.degrees(shown.tilt_rad[i])), 2)
+        circle = TrueCircle(centre_px=centre, tilt_deg=tilt_deg, must_find=bool(shown.must_find[i]))
+        made[number.get(label, label)] = circle
+    return made
 
 
 @require_arguments

@@ -15,17 +15,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
-from stcal.cli.terminal import (
-    STANDARD_OUTPUT,
-    StageProgress,
-    print_each,
-    printed_last,
-    say,
-    verbose,
-    write,
-    write_if,
-    write_out,
-)
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, printed_last, say, verbose, write, write_if
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -302,6 +292,7 @@ def _design_beside(faces: Path) -> Path | None:
 
 
 def _serve(setting: tuple, source: int | str | None, host: str, port: int, limits: dict, as_json: bool) -> None:
+    from stcal.cli.terminal import write_out
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
     from stcal.sfm.measurement.measure_images import Tracker

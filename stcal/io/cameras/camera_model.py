@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote, named
-from stcal.geometry.arrays import ByValue, require_fields
+from stcal.geometry.arrays import ByValue, Rows, require_covariance, require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
     FISHEYE,
+    MAX_SIDE_PX,
     PARAMETER_NAMES,
     Camera,
     intrinsic_basis,
@@ -157,6 +158,30 @@ def cameras_txt(camera: Camera) -> str:
         lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
     lines.append(f"1 {camera.colmap_model} {camera.width} {camera.height} {params}")
     return "\n".join(lines) + "\n"
+
+
+def stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
+    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
+    lines, count = text.splitlines(), len(names)
+    sigmas, rows = ([line.split()[2:] for line in lines if line.startswith(key)] for key in (SIGMA, CORRELATION))
+    if not sigmas and not rows:
+        return None
+    try:
+        if list(map(len, sigmas)) != [count] or list(map(len, rows)) != [count] * count:
+            raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
+        sigma, correlation = np.array(sigmas[0], float), np.array(rows, float)
+        for name, of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
+            # the covariance hides such errors
+            if not 0 < of_name <= MAX_SIDE_PX or not abs(with_itself - 1) <= SQUARE_WITHIN:
+                measured = f"σ of {name} is {of_name:g}, its correlation with itself {with_itself:g}"
+                needed = f"a positive number up to {MAX_SIDE_PX}, and 1 needed"
+                raise InputError("E-CAMERA-COVARIANCE", f"{measured}; {needed}")
+        covariance = correlation * np.outer(sigma, sigma)
+        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
+    except (InputError, ValueError) as error:
+        none = f"SIGMA and CORRELATION state no covariance of its parameters: {error}"
+        raise InputError("E-CAMERA-COVARIANCE", f"{none}; write it again, or remove these comments") from error
+    return covariance
 
 
 LEAST_FOCAL = {False: 0.1, True: 0.05}

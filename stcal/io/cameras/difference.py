@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -295,15 +296,6 @@ def _fitted(
         return np.nan_to_num((weight[:, :, None] * derivatives).reshape(-1, len(x)), posinf=0, neginf=0)
 
     lowest = np.array([-HALF if name in ("fx", "fy") else -np.inf for name in names] + [-np.inf] * 3 * turn)
-    solution = least_squares(
-        off,
-        np.zeros(len(lowest)),
-        slope,  # pyright: ignore[reportArgumentType]
-        bounds=(lowest, np.inf),
-        x_scale="jac",
-        max_nfev=MOST_STEPS,
-        xtol=SETTLED,
-        ftol=SETTLED,
-        gtol=SETTLED,
-    )
+    ends: dict[str, Any] = {"max_nfev": MOST_STEPS, **dict.fromkeys(("xtol", "ftol", "gtol"), SETTLED)}
+    solution = least_squares(off, np.zeros(len(lowest)), jac=slope, bounds=(lowest, np.inf), x_scale="jac", **ends)
     return Camera.of(camera_at(solution.x), model), turned(solution.x)

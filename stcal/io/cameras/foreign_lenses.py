@@ -267,11 +267,10 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     if match is None:
         raise InputError("E-CAMERA-MODEL", f"{name[:80]} is no splined model of mrcal's form; write it again")
     order, columns, rows, wide = (int(word) for word in match.groups())
-    if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(numbers)} intrinsics; {4 + 2 * columns * rows} of {columns}×{rows} points needed",
-        )
+    needed = 4 + 2 * columns * rows
+    if columns <= MARGIN[order] + 1 or len(numbers) != needed or not 0 < wide < 360:
+        size = f"{len(numbers)} intrinsics of {columns}×{rows} points; {needed} needed"
+        raise InputError("E-CAMERA-COEFFICIENTS", size)
     focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
     per_u = (columns - 1 - MARGIN[order]) / (4 * np.tan(np.radians(wide) / 4))

@@ -21,19 +21,11 @@ import yaml
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Rows, require_arguments, require_covariance
-from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
 from stcal.io.cameras import foreign_lenses as foreign
 from stcal.io.cameras import matlab, metashape
-from stcal.io.cameras.camera_model import (
-    CORRELATION,
-    SIGMA,
-    SQUARE_WITHIN,
-    CameraModel,
-    camera_from_opencv,
-    cameras_txt,
-    model_of,
-)
+from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv, cameras_txt, model_of, stated_covariance
 from stcal.io.cameras.foreign_lenses import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
 from stcal.io.cameras.keys import pass_over, reading, require_known
@@ -411,37 +403,6 @@ def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple
     return model.calibrated(width, height)
 
 
-def _stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
-    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
-    stated = {
-        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
-    }
-    if not any(stated.values()):
-        return None
-    count = len(names)
-    try:
-        if list(map(len, stated[SIGMA])) != [count] or list(map(len, stated[CORRELATION])) != [count] * count:
-            raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
-        sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
-        for name, sigma_of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
-            # the covariance hides such errors
-            if not 0 < sigma_of_name <= MAX_SIDE_PX or not abs(with_itself - 1) <= SQUARE_WITHIN:
-                raise InputError(
-                    "E-CAMERA-COVARIANCE",
-                    f"σ of {name} is {sigma_of_name:g}, its correlation with itself {with_itself:g}; a positive number "
-                    f"up to {MAX_SIDE_PX}, and 1 needed",
-                )
-        covariance = correlation * np.outer(sigma, sigma)
-        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
-    except (InputError, ValueError) as error:
-        raise InputError(
-            "E-CAMERA-COVARIANCE",
-            f"SIGMA and CORRELATION state no covariance of its parameters: {error}; write it again, or remove these "
-            "comments",
-        ) from error
-    return covariance
-
-
 def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = {row[0]: row[1:] for row in rows}
@@ -455,7 +416,7 @@ def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
     lens = of_colmap(model, width, height, params)
     if isinstance(lens, ForeignLens):
         return lens
-    return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model)))
+    return replace(lens, covariance=stated_covariance(text, parameter_names(lens.colmap_model)))
 
 
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
