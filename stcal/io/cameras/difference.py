@@ -296,6 +296,6 @@ def _fitted(
         return np.nan_to_num((weight[:, :, None] * derivatives).reshape(-1, len(x)), posinf=0, neginf=0)
 
     lowest = np.array([-HALF if name in ("fx", "fy") else -np.inf for name in names] + [-np.inf] * 3 * turn)
-    ends: dict[str, Any] = {"max_nfev": MOST_STEPS, **dict.fromkeys(("xtol", "ftol", "gtol"), SETTLED)}
-    solution = least_squares(off, np.zeros(len(lowest)), jac=slope, bounds=(lowest, np.inf), x_scale="jac", **ends)
+    how: dict[str, Any] = {"jac": slope, "max_nfev": MOST_STEPS, **dict.fromkeys(("xtol", "ftol", "gtol"), SETTLED)}
+    solution = least_squares(off, np.zeros(len(lowest)), bounds=(lowest, np.inf), x_scale="jac", **how)
     return Camera.of(camera_at(solution.x), model), turned(solution.x)
