@@ -119,20 +119,27 @@ def require_written(
     """Read a written file with the reader of later commands, and require that it gives the values that were
     reported. ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest
     difference, rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError."""
-    import numpy as np
-
-    remedy = "do not use the file, and report this with its data"
-    try:
-        again = np.asarray(read(), float)
-    except (StcalError, OSError, LookupError, ValueError, SyntaxError) as error:
-        again_not = f"{path}: written, and cannot be read again: {error}; {remedy}"
-        raise ConvergenceError("E-WRITTEN-DIFFERS", again_not) from error
-    reported, difference = np.asarray(reported, float), float("inf")
-    if again.shape == reported.shape and (np.isnan(again) == np.isnan(reported)).all():
-        difference = float(np.nanmax(np.abs(again - reported), initial=0.0))
+    difference = _difference(path, read, reported)
     if not difference <= most:
         differs = f"the file gives values that differ from those reported by up to {difference:.2g} {unit}"
-        raise ConvergenceError("E-WRITTEN-DIFFERS", f"{path}: {differs}, {most:g} allowed; {remedy}")
+        raise ConvergenceError("E-WRITTEN-DIFFERS", f"{path}: {differs}, {most:g} allowed; {DO_NOT_USE}")
+
+
+DO_NOT_USE = "do not use the file, and report this with its data"
+
+
+def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
+    """Return the largest difference between a file and the reported values; infinite for another shape."""
+    import numpy as np
+
+    try:
+        again, values = np.asarray(read(), float), np.asarray(reported, float)
+    except (StcalError, OSError, LookupError, ValueError, SyntaxError) as error:
+        unread = f"{path}: written, and cannot be read again: {error}; {DO_NOT_USE}"
+        raise ConvergenceError("E-WRITTEN-DIFFERS", unread) from error
+    if again.shape != values.shape or (np.isnan(again) != np.isnan(values)).any():
+        return float("inf")
+    return float(np.nanmax(np.abs(again - values), initial=0.0))
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
