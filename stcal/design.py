@@ -100,10 +100,8 @@ class FaceDesign(Brief):
             if circle not in ids:
                 raise InputError("E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among {', '.join(ids)}")
         if radius.min() <= 0:
-            raise InputError(
-                "E-TARGET-RADIUS",
-                f"{where}: circle {ids[int(radius.argmin())]}: radius {radius.min():g} mm; more needed",
-            )
+            fault = f"{where}: circle {ids[int(radius.argmin())]}: radius {radius.min():g} mm"
+            raise InputError("E-TARGET-RADIUS", f"{fault}; more needed")
         gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
         np.fill_diagonal(gap, np.inf)
         if gap.min() <= 0:
@@ -330,10 +328,8 @@ class BoardDesign(ByValue):
             )
         least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
         if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"board: corner radius {self.corner_radius_mm} mm; at least {least:g} mm and under {most:g} mm needed",
-            )
+            fault = f"board: corner radius {self.corner_radius_mm} mm"
+            raise InputError("E-BOARD-CORNER", f"{fault}; at least {least:g} mm and under {most:g} mm needed")
 
     def scaled(self, factor: float) -> "BoardDesign":
         """Returns the board printed larger by a factor."""
@@ -445,11 +441,8 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     if board is not None and not faces and not target.distances:
         return board
     if board is not None and type(board) is not BoardDesign:
-        raise InputError(
-            "E-BOARD-TYPE",
-            "--board: a lattice of circles or corners, beside a target whose own size is known; a rectangular board "
-            "of dots needed, or none",
-        )
+        fault = "--board: a lattice of circles or corners, beside a target whose own size is known"
+        raise InputError("E-BOARD-TYPE", f"{fault}; a rectangular board of dots needed, or none")
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
     return ScaleReference(**(known or none), faces=faces, distances=target.distances)

@@ -132,18 +132,13 @@ def _rings(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bo
     told = {(row, column) for row, column in rings}
     for row, column in told:
         if row >= rows or column >= columns:
-            raise InputError(
-                "E-BOARD-RINGS",
-                f"{where}: rings has [{row}, {column}] of {rows} rows of {columns} dots, counted from 0; correct it",
-            )
+            fault = f"{where}: rings has [{row}, {column}] of {rows} rows of {columns} dots, counted from 0"
+            raise InputError("E-BOARD-RINGS", f"{fault}; correct it")
     half = {(rows - 1 - row, columns - 1 - column) for row, column in told}
     quarter = {(column, rows - 1 - row) for row, column in told} if quarters and rows == columns else set()
     if told and told in (half, quarter):
-        raise InputError(
-            "E-BOARD-RINGS",
-            f"{where}: {len(told)} rings that look the same after a turn of the board; choose rings that distinguish "
-            "its ends, or leave rings out",
-        )
+        fault = f"{where}: {len(told)} rings that look the same after a turn of the board"
+        raise InputError("E-BOARD-RINGS", f"{fault}; choose rings that distinguish its ends, or leave rings out")
     return tuple(sorted(told))
 
 
@@ -181,25 +176,16 @@ def _grid(design: type[FlatBoard], data: Any, where: str) -> FlatBoard:
     board = design(**keys)
     require_millimetres(_lengths(board), data.unusual_size, where)
     if isinstance(board, AsymmetricCirclesDesign) and board.radii_mm()[0] >= (most := board.nearest_mm() / 2):
-        raise InputError(
-            "E-BOARD-RADIUS",
-            f"{where}: radius {board.radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is "
-            f"{SPACING[design]}",
-        )
+        fault = f"{where}: radius {board.radius_mm:g} mm, under {most:g} mm needed for circles apart"
+        raise InputError("E-BOARD-RADIUS", f"{fault}; spacing_mm is {SPACING[design]}")
     if isinstance(board, CharucoDesign) and board.marker_mm > MOST_MARKER * board.square_mm:
-        raise InputError(
-            "E-BOARD-MARKER-SIZE",
-            f"{where}: marker_mm {board.marker_mm:g}, under {MOST_MARKER:g} of square_mm {board.square_mm:g} needed; "
-            "are they swapped?",
-        )
+        fault = f"{where}: marker_mm {board.marker_mm:g}, under {MOST_MARKER:g} of square_mm {board.square_mm:g} needed"
+        raise InputError("E-BOARD-MARKER-SIZE", f"{fault}; are they swapped?")
     if isinstance(board, CharucoDesign | AprilGridDesign):
         ids = board.tag_ids()
         if ids.stop > (count := count_of(board.dictionary)):
-            raise InputError(
-                "E-TAG-ID-RANGE",
-                f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
-                "columns, first_id or dictionary",
-            )
+            fault = f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}"
+            raise InputError("E-TAG-ID-RANGE", f"{fault}; correct rows, columns, first_id or dictionary")
     return board
 
 

@@ -155,11 +155,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
         elif printed:
             faces.append(_of_print(face, data.unusual_size, of_face))
         else:
-            raise InputError(
-                "E-TARGET-PRINTED",
-                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect`, "
-                "`measure` and `simulate` do",
-            )
+            fault = f"{of_face}: a board or tags, which this command does not take yet"
+            raise InputError("E-TARGET-PRINTED", f"{fault}; `stcal-sfm run`, `detect`, `measure` and `simulate` do")
     with named(where, f"target {data.name}"):
         target = TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size)
     known = {str(label): label for face in faces for label in face.labels()}
@@ -186,11 +183,8 @@ def target_of(given: str | Path | TargetDesign | None, printed: bool = True) -> 
 def _distance(entry: _ScaleFile, known: dict[str, Any], where: str) -> KnownDistance:
     for name in (entry.first, entry.second):
         if name not in known:
-            raise InputError(
-                "E-TARGET-SCALE",
-                f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target; points are "
-                f"{', '.join(list(known)[:4])}, …",
-            )
+            fault = f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target"
+            raise InputError("E-TARGET-SCALE", f"{fault}; points are {', '.join(list(known)[:4])}, …")
     if entry.first == entry.second:
         raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")
     return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm, entry.drawn)
@@ -232,10 +226,8 @@ def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
     gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - face.radius_mm
     for i in np.flatnonzero(~inside(outline, face.xy_mm) | (gap < 0))[:1]:
-        raise InputError(
-            "E-TARGET-OUTLINE",
-            f"{where}: circle {face.ids[i]} reaches beyond outline_mm; corners in order around all circles needed",
-        )
+        fault = f"{where}: circle {face.ids[i]} reaches beyond outline_mm"
+        raise InputError("E-TARGET-OUTLINE", f"{fault}; corners in order around all circles needed")
 
 
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:

@@ -125,10 +125,8 @@ class Camera(ByValue):
         """
         k = frozen(matrix, (3, 3), "camera matrix")
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
-            raise InputError(
-                "E-CAMERA-MATRIX",
-                f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed; skew is not supported",
-            )
+            fault = f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed"
+            raise InputError("E-CAMERA-MATRIX", f"{fault}; skew is not supported")
         given = frozen(np.ravel(distortion), None, "distortion")
         with named("camera"):
             flat, model = opencv_lens(given, fisheye)

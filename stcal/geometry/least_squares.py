@@ -92,11 +92,8 @@ class Minimum(Generic[S, L]):
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
         """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ²."""
         if not (self.converged | (self.promised <= accepted)).all():
-            raise ConvergenceError(
-                "E-NO-MINIMUM",
-                f"{what}: no minimum after {self.steps} steps, the last was to gain {np.max(self.promised):.2g} σ²; "
-                f"{remedy}",
-            )
+            fault = f"{what}: no minimum after {self.steps} steps, the last was to gain {np.max(self.promised):.2g} σ²"
+            raise ConvergenceError("E-NO-MINIMUM", f"{fault}; {remedy}")
         return self
 
 

@@ -412,11 +412,8 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
             "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; 8 or 16 bits of grey needed{remedy}"
         )
     if size is not None and image.shape[::-1] != size:
-        raise InputError(
-            "E-IMAGE-SIZE",
-            f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px; "
-            "give images as the camera took them",
-        )
+        fault = f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px"
+        raise InputError("E-IMAGE-SIZE", f"{fault}; give images as the camera took them")
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
@@ -536,9 +533,6 @@ def _sent(files: ImageFile | list[ImageFile], with_content: bool) -> list[ImageF
 def _on_worker(function: Callable, files: ImageFile | list[ImageFile], *arguments):
     for file in [files] if isinstance(files, ImageFile) else files:
         if file.content is None and not file.path.parent.is_dir():
-            raise InputError(
-                "E-WORKER-PATH",
-                f"{file.path.parent}: does not exist on worker {socket.gethostname()}; give a path that all workers "
-                "see, or --send-images",
-            )
+            fault = f"{file.path.parent}: does not exist on worker {socket.gethostname()}"
+            raise InputError("E-WORKER-PATH", f"{fault}; give a path that all workers see, or --send-images")
     return function(files, *arguments)

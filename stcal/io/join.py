@@ -83,11 +83,8 @@ def join_tables(
     common = [name for name in places[0] if name in places[1]]
     if not common:
         first = [next(iter(row_of_key)) for row_of_key in places]
-        raise InputError(
-            "E-TABLES-UNMATCHED",
-            f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other; correct them, or give "
-            "another --key",
-        )
+        fault = f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other"
+        raise InputError("E-TABLES-UNMATCHED", f"{fault}; correct them, or give another --key")
     joined: dict[str, list[str] | np.ndarray] = {}
     for table, row_of_key, prefix in zip(tables, places, prefixes, strict=True):
         rows = [row_of_key[name] for name in common]

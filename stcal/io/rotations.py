@@ -91,10 +91,8 @@ def said_convention(rotation: str | None, what: str, where: str, count: int = 3)
         raise InputError("E-ROTATION-AMBIGUOUS", f"{where}: {what} may be {form}; give --rotation, like {likely}")
     convention = convention_of(rotation)
     if convention.count != count:
-        raise InputError(
-            "E-OPTION-CONTRADICTS",
-            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {convention.count}; correct the option",
-        )
+        fault = f"{where}: {what} are {count} numbers, --rotation {rotation} is of {convention.count}"
+        raise InputError("E-OPTION-CONTRADICTS", f"{fault}; correct the option")
     return convention
 
 

@@ -414,10 +414,8 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
     points = [cell for cells in columns.values() for cell in cells if "." in cell and re.fullmatch(_NUMBER, cell)]
     if points or (between != ";" and all(_THOUSANDS.fullmatch(cell) for cell in commas)):
         beside = f" beside {points[0]}" if points else ""
-        raise InputError(
-            "E-TABLE-DECIMAL",
-            f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands; write points",
-        )
+        fault = f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands"
+        raise InputError("E-TABLE-DECIMAL", f"{fault}; write points")
     return columns | {n: [cell.replace(",", ".") for cell in cells] for n, cells in with_comma.items()}, True
 
 

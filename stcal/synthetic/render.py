@@ -290,10 +290,8 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
     if lens is None:
         return
     if scene.camera.fisheye:
-        raise InputError(
-            "E-SIMULATE-OPTIONS",
-            "rendering: thin lens of an equidistant camera; a perspective camera needed, or leave the f-number out",
-        )
+        fault = "rendering: thin lens of an equidistant camera"
+        raise InputError("E-SIMULATE-OPTIONS", f"{fault}; a perspective camera needed, or leave the f-number out")
     widest, at_mm = 0.0, lens.focus_mm
     for name, group in scene.groups.items():
         for image in range(len(group.camera_from_target)):

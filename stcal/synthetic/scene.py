@@ -262,11 +262,8 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
     if is_reference and set(REFERENCE_GROUPS) <= set(visible_pairs):
         return list(REFERENCE_GROUPS)
     if not visible_pairs:
-        raise DegenerateError(
-            "E-SCENE-FACES",
-            f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both; "
-            "check the rough poses, or add a face",
-        )
+        fault = f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both"
+        raise DegenerateError("E-SCENE-FACES", f"{fault}; check the rough poses, or add a face")
     return visible_pairs
 
 

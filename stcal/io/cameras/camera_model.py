@@ -199,11 +199,8 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraMo
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
         size = f" of an image of {width:g}×{height:g} px" if width and height else ""
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; "
-            "pixels needed; check that they are not mm, or shares of a side",
-        )
+        fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
+        raise InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         raise InputError(
             "E-CAMERA-CENTRE",

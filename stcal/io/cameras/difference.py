@@ -84,10 +84,8 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     Raises DegenerateError: too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
-        raise InputError(
-            "E-CAMERA-SIZES-DIFFER",
-            f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px; files of one image size needed",
-        )
+        fault = f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px"
+        raise InputError("E-CAMERA-SIZES-DIFFER", f"{fault}; files of one image size needed")
     pixels = image_grid(one)
     flat = pixels.reshape(-1, 2)
     first, second = (each.rays(flat) if isinstance(each, SizedLens) else rays(each, flat) for each in (one, two))

@@ -218,11 +218,8 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
     coefficients = given if count else np.zeros(0)
     of_model = numbers.shape == (first + 4,) and coefficients.shape == (count,)
     if not of_model or not np.isfinite([*numbers, *coefficients]).all():
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
-            f"finite numbers; {numbers.size} and {coefficients.size} found",
-        )
+        fault = f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, finite numbers"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}; {numbers.size} and {coefficients.size} found")
     shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
     if (focal <= 0).any():
         raise InputError("E-CAMERA-FOCAL", f"focal length {focal.tolist()}; positive numbers needed")

@@ -154,10 +154,8 @@ def _camera(lens: list[float], given: np.ndarray, kind: str, size: tuple, skew: 
     last = 4 if kind == "equidistant" else 5
     given = given[:last] if last < len(given) < 8 and not given[last:].any() else given  # zeros beyond the model's
     if kind == "equidistant" and len(given) not in (0, 4):
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant; k1 to k4 needed",
-        )
+        fault = f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}; k1 to k4 needed")
     if listed:
         _require_order(lens, width, height)
     if kind == "unified" or (kind == "equidistant" and not abs(skew) <= SQUARE * abs(lens[0])):
@@ -186,11 +184,8 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray) -> str:
             kinds[name] = LENSES[word]
         elif word not in UNDISTORTED and not (word in INVERSE and not given.any()):
             why = "its coefficients are those of another formula; " if word in INVERSE else ""
-            raise InputError(
-                "E-CAMERA-MODEL",
-                f"{name} {' '.join(str(value).split())[:60]!r} is not supported; {why}calibrate anew with plumb_bob or "
-                "equidistant",
-            )
+            fault = f"{name} {' '.join(str(value).split())[:60]!r} is not supported"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; {why}calibrate anew with plumb_bob or equidistant")
     both = set(kinds.values()) - ({"perspective"} if "unified" in kinds.values() else set())
     if len(both) > 1:
         words = ", ".join(f"{name} says {kind}" for name, kind in kinds.items())

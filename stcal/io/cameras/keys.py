@@ -226,9 +226,6 @@ class Keys:
         if both.size != 2:
             raise InputError("E-CAMERA-SIZE", f"size of {both.size} numbers; width and height needed")
         if width and height and (width, height) != tuple(both):
-            raise InputError(
-                "E-CAMERA-SIZE",
-                f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px; correct "
-                "one of them",
-            )
+            fault = f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px"
+            raise InputError("E-CAMERA-SIZE", f"{fault}; correct one of them")
         return float(both[0]), float(both[1]), True

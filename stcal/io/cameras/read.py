@@ -83,11 +83,8 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     if focal is None:
         focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
         what = f"{focal_mm:g} mm, but no size of its pixels" if focal_mm else "no focal length"
-        raise InputError(
-            "E-CAMERA-EXIF",
-            f"camera file {path}: a photograph whose EXIF states {what}; give a camera file, or "
-            "`stcal-sfm calibrate-camera`",
-        )
+        fault = f"camera file {path}: a photograph whose EXIF states {what}"
+        raise InputError("E-CAMERA-EXIF", f"{fault}; give a camera file, or `stcal-sfm calibrate-camera`")
     zoom = _positive(exif.get(ExifTags.Base.DigitalZoomRatio)) or 1.0
     if zoom != 1:
         raise InputError(
