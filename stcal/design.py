@@ -323,9 +323,8 @@ class BoardDesign(ByValue):
         if corner is None:
             return
         if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):
-            raise InputError(
-                "E-BOARD-CORNER", f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner needed"
-            )
+            fault = f"board: corner dot at row {corner[0]}, column {corner[1]}"
+            raise InputError("E-BOARD-CORNER", f"{fault}; a corner needed")
         least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
         if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:
             fault = f"board: corner radius {self.corner_radius_mm} mm"

@@ -148,9 +148,8 @@ def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
         data = validated(content, _KalibrAprilGrid, where)
         available = count_of(KALIBR_FAMILY)
         if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
-            raise InputError(
-                "E-TAG-ID-RANGE", f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct them"
-            )
+            fault = f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}"
+            raise InputError("E-TAG-ID-RANGE", f"{fault}; correct them")
         size = METRE_MM * data.tagSize
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
             raise InputError(
@@ -163,9 +162,8 @@ def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
         data = validated(content, _Checkerboard, where)
         across, down = data.colSpacingMeters, data.rowSpacingMeters
         if abs(across - down) > SAME_WITHIN * across:
-            raise InputError(
-                "E-BOARD-SPACING", f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed"
-            )
+            fault = f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}"
+            raise InputError("E-BOARD-SPACING", f"{fault}; squares needed")
         return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
     if kind == "circlegrid":
         data = validated(content, _CircleGrid, where)

@@ -219,9 +219,8 @@ def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
-        raise InputError(
-            "E-TARGET-OUTLINE", f"{where}: outline_mm has the same corner twice; each once, in order, needed"
-        )
+        fault = f"{where}: outline_mm has the same corner twice"
+        raise InputError("E-TARGET-OUTLINE", f"{fault}; each once, in order, needed")
     from_corner = face.xy_mm[:, None] - outline
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
     gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - face.radius_mm
@@ -235,9 +234,8 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     x, z = np.array(pose.x), np.array(pose.normal)
     for key, direction in (("x", x), ("normal", z)):
         if (length := float(np.linalg.norm(direction))) < MIN_DIRECTION:
-            raise InputError(
-                "E-TARGET-ROUGH-POSE", f"{where}: rough_pose: {key} {direction.tolist()}; a direction needed"
-            )
+            fault = f"{where}: rough_pose: {key} {direction.tolist()}"
+            raise InputError("E-TARGET-ROUGH-POSE", f"{fault}; a direction needed")
         direction /= length
     angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))
     if abs(angle - 90) > MAX_SKEW_DEG:

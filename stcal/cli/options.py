@@ -328,9 +328,8 @@ def _protected(command: Callable) -> Callable:
         for option, path in written:
             if option == "--report" and path.suffix.lower() == ".pdf":
                 also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
-                raise InputError(
-                    "E-OUTPUT-SUFFIX", f"--report {path}: a page of HTML; give {path.with_suffix('.html')}{also}"
-                )
+                fault = f"--report {path}: a page of HTML"
+                raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {path.with_suffix('.html')}{also}")
         keep_apart(written, read)
         token = _replacing.set(overwrite)
         try:

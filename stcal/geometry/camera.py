@@ -139,9 +139,8 @@ class Camera(ByValue):
             count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
             return matrix, self.distortion[:count].copy()
         if self.distortion[[2, 3, 8, 10]].any():
-            raise InputError(
-                "E-CAMERA-MODEL", "camera: p1, p2 or prisms, which OpenCV's fisheye lacks; write it in COLMAP's form"
-            )
+            fault = "camera: p1, p2 or prisms, which OpenCV's fisheye lacks"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; write it in COLMAP's form")
         return matrix, self.distortion[[0, 1, 4, 5]]
 
     def colmap_params(self) -> list[float]:

@@ -134,9 +134,8 @@ class Rigid(ByValue, _Frames):
         if m.shape not in ((4, 4), (3, 4)):
             raise InputError("E-ARRAY-SHAPE", f"rigid transform: shape {m.shape}, 4×4 needed")
         if (m[3:] != [0, 0, 0, 1]).any():
-            raise InputError(
-                "E-MATRIX-LAST-ROW", f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is it transposed?"
-            )
+            fault = f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed"
+            raise InputError("E-MATRIX-LAST-ROW", f"{fault}; is it transposed?")
         u, s, vt = np.linalg.svd(m[:3, :3])
         if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
             raise InputError("E-ROTATION-IMPROPER", "rigid transform: 3×3 part is no rotation (left-handed or scaled)")
@@ -361,9 +360,8 @@ class Affine(ByValue):
     def inverse(self) -> "Affine":
         """Return b_from_a; a singular linear part is refused."""
         if np.linalg.cond(self.linear) > 1e12:
-            raise DegenerateError(
-                "E-AFFINE-SINGULAR", "affine transform: 3×3 part is singular; an invertible one needed"
-            )
+            fault = "affine transform: 3×3 part is singular"
+            raise DegenerateError("E-AFFINE-SINGULAR", f"{fault}; an invertible one needed")
         back = np.linalg.inv(self.linear)
         return Affine(back, -back @ self.translation)
 
@@ -404,9 +402,8 @@ def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | Non
     root = np.sqrt(w)[:, None]
     linear, _, _, s = np.linalg.lstsq(root * (b - mean_b), root * (a - mean_a), rcond=None)
     if s[2] <= 1e-9 * s[0]:
-        raise DegenerateError(
-            "E-POINTS-COPLANAR", "alignment: the points are coplanar; an affine transform needs points off the plane"
-        )
+        fault = "alignment: the points are coplanar"
+        raise DegenerateError("E-POINTS-COPLANAR", f"{fault}; an affine transform needs points off the plane")
     return Affine(linear.T, mean_a - linear.T @ mean_b)
 
 
@@ -444,9 +441,8 @@ def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
     da, db = a - mean_a, b - mean_b
     for points in (da, db):
         if _collinear(points[w > 0]):
-            raise DegenerateError(
-                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line needed"
-            )
+            fault = "alignment: the points are collinear"
+            raise DegenerateError("E-POINTS-COLLINEAR", f"{fault}; points off the line needed")
     rotation, product = best_rotations((w[:, None] * da).T @ db)
     scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0
     return Similarity(scale, Rigid(rotation, mean_a - scale * rotation @ mean_b))

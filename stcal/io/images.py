@@ -337,9 +337,8 @@ def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], st
     """Return width and height, px, of most of the images, and the name of one of them."""
     found = common_size(files)
     if found is None:
-        raise InputError(
-            "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check them"
-        )
+        fault = f"no readable image among {len(files)}, first {files[0].name}"
+        raise InputError("E-IMAGES-NONE-READABLE", f"{fault}; check them")
     return found
 
 
@@ -367,22 +366,19 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
             with Image.open(BytesIO(data)) as image:
                 return image.size
     except Image.DecompressionBombError as error:
-        raise InputError(
-            "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send the file of the camera unchanged"
-        ) from error
+        fault = f"{name}: more pixels than any camera has"
+        raise InputError("E-IMAGE-TOO-LARGE", f"{fault}; send the file of the camera unchanged") from error
     except Exception as error:  # data that are no image fail in many ways
-        raise InputError(
-            "E-IMAGE-UNREADABLE", f"{name}: no readable image; convert it to {', '.join(USUAL)}"
-        ) from error
+        fault = f"{name}: no readable image"
+        raise InputError("E-IMAGE-UNREADABLE", f"{fault}; convert it to {', '.join(USUAL)}") from error
 
 
 def grey_of(image: np.ndarray, name: str) -> np.ndarray:
     """Return the grey image (height, width) of an array, grey or with three channels RGB."""
     image = np.asarray(image)
     if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
-        raise InputError(
-            "E-ARRAY-SHAPE", f"{name}: shape {image.shape}; (height, width), or (height, width, 3) of RGB needed"
-        )
+        fault = f"{name}: shape {image.shape}"
+        raise InputError("E-ARRAY-SHAPE", f"{fault}; (height, width), or (height, width, 3) of RGB needed")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     if image.ndim == 2:
@@ -408,9 +404,8 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
         raise InputError("E-IMAGE-TYPE", f"{name}: {type(image).__name__}, no image; leave lost frames out")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
-        raise InputError(
-            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; 8 or 16 bits of grey needed{remedy}"
-        )
+        fault = f"{name}: {image.dtype} of shape {image.shape}"
+        raise InputError("E-IMAGE-TYPE", f"{fault}; 8 or 16 bits of grey needed{remedy}")
     if size is not None and image.shape[::-1] != size:
         fault = f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px"
         raise InputError("E-IMAGE-SIZE", f"{fault}; give images as the camera took them")

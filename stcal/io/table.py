@@ -209,9 +209,8 @@ class Table(ByValue):
 
     def _need(self, column: str) -> None:
         if column not in self.columns:
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: no column {column}; the header is {self.header()}"
-            )
+            fault = f"{self.where}: no column {column}"
+            raise InputError("E-TABLE-COLUMN-MISSING", f"{fault}; the header is {self.header()}")
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:

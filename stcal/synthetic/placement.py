@@ -67,9 +67,8 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
     """Returns the axes (3, 3) of the view that shows two faces equally well: rows right, up, towards the camera."""
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
     if not 5 <= angle <= 130:
-        raise DegenerateError(
-            "E-SCENE-FACES", f"{where}: {angle:.0f}° between the faces, 5° to 130° needed; pair others"
-        )
+        fault = f"{where}: {angle:.0f}° between the faces, 5° to 130° needed"
+        raise DegenerateError("E-SCENE-FACES", f"{fault}; pair others")
     up, towards = np.cross(normal_a, normal_b), normal_a + normal_b
     up, towards = up / np.linalg.norm(up), towards / np.linalg.norm(towards)
     return np.array([np.cross(up, towards), up, towards])

@@ -103,9 +103,8 @@ def simulate(
         names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
         others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
-            raise InputError(
-                "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
-            )
+            fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
         shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1, body_seed=body_seed)
         file = None if camera is None else read_camera(camera)
         if file is not None and not (file.width and file.height):

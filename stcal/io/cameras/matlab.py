@@ -77,9 +77,8 @@ def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
         return _from_bouguet(values)
     structures = dict(_structures({key: value for key, value in values.items() if not key.startswith("__")}, ""))
     if not structures:
-        raise InputError(
-            "E-CAMERA-CONTENT", "no structure of a camera; save toStruct(cameraParams), not MATLAB's object"
-        )
+        fault = "no structure of a camera"
+        raise InputError("E-CAMERA-CONTENT", f"{fault}; save toStruct(cameraParams), not MATLAB's object")
     return from_structure(structures[one_of(list(structures), choice)])
 
 

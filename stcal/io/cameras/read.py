@@ -76,9 +76,8 @@ def camera_of_photograph(path: str | Path) -> Photograph:
             width, height = height, width
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {path}: no photograph that can be read ({reason}); give another"
-        ) from error
+        fault = f"camera file {path}: no photograph that can be read ({reason})"
+        raise InputError("E-CAMERA-UNREADABLE", f"{fault}; give another") from error
     focal, source = _focal_px(exif, width, height)
     if focal is None:
         focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
