@@ -97,7 +97,6 @@ _DESIGNS = "--target @data/target.toml --board @data/board.toml"
 _SET = f"@data/images --camera @data/cameras.txt {_DESIGNS} --workers 1"
 _LOCATE = "--layout @locate/layout.toml --camera @locate/cameras.txt"
 _ALL = "--json >all.json --report >page.html"
-
 CALLS = (
     Call("sfm run", f"{_SET} --out ~run", 3.5),
     Call("sfm run", f"{_SET} --out +new", 9.0),

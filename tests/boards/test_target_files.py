@@ -14,7 +14,6 @@ from tests.outcome import fails_with
 
 ROUNDED_MM = 1e-9
 """Lengths are written with nine decimals: half a unit of the last is 5e-10 mm."""
-
 CIRCLES = """\
   { id = "1", x_mm = 0, y_mm = 0, radius_mm = 8 },
   { id = "2", x_mm = 40, y_mm = 0, radius_mm = 8 },

@@ -60,8 +60,7 @@ rpy_deg = [0.0, 30.0, 0.0]
 """
 HOLDS = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
 """Joint values of an arm at the first photograph."""
-BOARD_AT_MM = (30, 230)
-"""Of the board beside the tags, on the sheet."""
+BOARD_AT_MM = (30, 230)  # of the board beside the tags, on the sheet
 
 
 def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None = None) -> Path:

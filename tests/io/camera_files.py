@@ -104,7 +104,6 @@ MRCAL = (
 )
 OLD_NAMES = ("Camera_Matrix", "Distortion_Coefficients", "image_Width", "image_Height")
 SKEWED = "911.5 0.7 639. 0. 910.25 359. 0. 0. 1."
-
 FILES = {
     "OpenCV": (storage(), perspective(D5)),
     "OpenCV, fisheye": (storage("<fisheye_model>1</fisheye_model>", d=K4), equidistant(K4)),
@@ -142,7 +141,6 @@ FILES = {
     "mrcal": (MRCAL, perspective(D5)),
 }
 """A file of each program, and the pixels of RAYS."""
-
 FX = "fx: 911.5\n{0}fy: 910.25\n{0}cx: 639.0\n{0}cy: 359.0\n"
 LENS_JSON = '"fx": 911.5, "fy": 910.25, "cx": 639.0, "cy": 359.0'
 MATRIX_JSON = "[[911.5, 0, 639.0], [0, 910.25, 359.0], [0, 0, 1]]"

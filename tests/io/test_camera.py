@@ -15,8 +15,6 @@ from tests.outcome import fails_with
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
 D5 = [0.1, -0.2, 0.003, -0.004, 0.05]
-
-
 COLMAP_CASES = {
     "SIMPLE_PINHOLE": [1000, 500.5, 400.5],
     "PINHOLE": [1000, 1100, 500.5, 400.5],
