@@ -178,7 +178,7 @@ def several_tables(
 
 def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
-    from stcal.io.transforms import require_form
+    from stcal.io.static_transforms import require_form
 
     exports = []
     for word in words:

@@ -13,8 +13,8 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written
 from stcal.io.rotations import MOST_RAD
+from stcal.io.static_transforms import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
 from stcal.io.table import pose_values
-from stcal.io.transforms import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward

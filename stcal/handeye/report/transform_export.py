@@ -12,8 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pose_pairs import FRAMES, Setup
 from stcal.handeye.handeye_result import HandEye
-from stcal.io.toml import opencv_matrix
-from stcal.io.transforms import (
+from stcal.io.static_transforms import (
     Static,
     fixed_joint,
     metres,
@@ -24,6 +23,7 @@ from stcal.io.transforms import (
     ros2_launch,
     xyzw,
 )
+from stcal.io.toml import opencv_matrix
 
 OPTICAL = "_optical_frame"
 CAMERA_FRAME = f"camera{OPTICAL}"

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import require_same, save
+from stcal.io.static_transforms import Static, fixed_joint, messages, ros1_launch, ros2_launch
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
-from stcal.io.transforms import Static, fixed_joint, messages, ros1_launch, ros2_launch
 from stcal.sfm.interop import gltf
 from stcal.sfm.interop.export_content import Content, content_of, require_new
 from stcal.sfm.runs.saved import AnyRun, saved_run
