@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stcal.cli.cameras import app
+from stcal.cli.instruments import camera_app as app
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.difference import compare_cameras

@@ -16,7 +16,7 @@ import typer
 from typer._completion_classes import completion_init
 
 import stcal
-from stcal.cli import cameras, handeye, instruments, robot, sfm
+from stcal.cli import handeye, instruments, robot, sfm
 from stcal.cli.help import group
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
@@ -35,7 +35,7 @@ app = group("stcal", "Calibrate stereo targets from photographs of a single came
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(instruments.app, name="locate")
-app.add_typer(cameras.app, name="camera")
+app.add_typer(instruments.camera_app, name="camera")
 app.add_typer(handeye.app)
 app.command("register")(instruments.register)
 protect_outputs(app)

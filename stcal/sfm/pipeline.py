@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.board_file import board_of as board_of
-from stcal.boards.on_faces import tags_of_no_face
+from stcal.boards.finders import tags_of_no_face
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign, scale_reference, with_drawn_size
 from stcal.errors import ConvergenceError, InputError, InputNote, StcalError

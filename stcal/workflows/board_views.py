@@ -20,8 +20,7 @@ from stcal.boards.board_designs import (
     TagLayout,
     turns,
 )
-from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
-from stcal.boards.on_faces import shift_by_curves, straightened
+from stcal.boards.finders import find_charuco, find_chessboard, shift_by_curves, straightened, why_no_chessboard
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.cli.cameras import Form
+from stcal.cli.instruments import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.read import SUFFIXES, WRITERS, read_camera, written

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_designs import CharucoDesign
-from stcal.boards.on_faces import find_on_faces
+from stcal.boards.finders import find_on_faces
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid, align_rigid

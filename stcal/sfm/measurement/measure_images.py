@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 from threadpoolctl import ThreadpoolController
 
-from stcal.boards.on_faces import why_unseen
+from stcal.boards.finders import why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.board_designs import CornerBoard
-from stcal.boards.on_faces import why_unseen
+from stcal.boards.finders import why_unseen
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.arrays import Brief
