@@ -8,7 +8,7 @@ from pathlib import Path
 
 import lazy_loader
 
-from stcal.alone import fault
+from stcal.errors import fault
 
 if _fault := fault(Path(__file__).parent):
     raise ImportError(_fault)

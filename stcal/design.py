@@ -28,10 +28,8 @@ class PrintedPattern(Protocol):
         ...
 
 
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-DOTS_SIGMA_MM = 0.005
-"""σ of the places of a board's dots where its file states none, mm per axis."""
+MIN_SINE = 0.02  # smallest sine of the angle between the X and Y circles as seen from the origin circle
+DOTS_SIGMA_MM = 0.005  # σ of the places of a board's dots where its file states none, mm per axis
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -95,20 +93,15 @@ class FaceDesign(Brief):
             freeze(self, "rim_mm", (len(self.ids),), f"face {self.id}: rims")
 
     def _require_possible(self) -> None:
-        """Refuses circles that occur twice or overlap, and frame circles that give no frame."""
         where, ids, xy, radius = f"face {self.id}", self.ids, self.xy_mm, self.radius_mm
         frame = self.origin, self.x, self.y
         _require_different(ids, f"{where}: circle id")
         for key, circle in zip(("origin", "x", "y"), frame, strict=True):
             if circle not in ids:
-                raise InputError(
-                    "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
-                )
+                raise InputError("E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among {', '.join(ids)}")
         if radius.min() <= 0:
-            raise InputError(
-                "E-TARGET-RADIUS",
-                f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
-            )
+            fault = f"{where}: circle {ids[int(radius.argmin())]}: radius {radius.min():g} mm"
+            raise InputError("E-TARGET-RADIUS", f"{fault}; more needed")
         gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
         np.fill_diagonal(gap, np.inf)
         if gap.min() <= 0:
@@ -122,9 +115,7 @@ class FaceDesign(Brief):
         axis = (x - origin) / length_x
         sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
         if abs(sine) < MIN_SINE:
-            raise InputError(
-                "E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line"
-            )
+            raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} on one line; choose others")
         if sine < 0:
             raise InputError(
                 "E-TARGET-FRAME",
@@ -149,8 +140,7 @@ class FaceDesign(Brief):
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A measured distance between two points of the target, mm, with its σ: a scale bar; ``drawn`` : True if it is that
-    of the drawing, and defines the unit of a target of which no size is known."""
+    """A measured distance between two points of the target, mm, with σ; ``drawn`` : it defines the unit."""
 
     first: CircleLabel
     second: CircleLabel
@@ -234,9 +224,7 @@ class TargetDesign(Brief):
             if face.id == face_id:
                 return face
         known = ", ".join(face.id for face in self.faces)
-        raise InputError(
-            "E-TARGET-NO-FACE", f"target {self.name}: no face {face_id}; the design has {known}, choose one of them"
-        )
+        raise InputError("E-TARGET-NO-FACE", f"target {self.name}: no face {face_id}; choose one of {known}")
 
     def rough_poses(self) -> dict[str, Rigid]:
         """Returns the rough poses by face id, of the faces that have one."""
@@ -262,13 +250,11 @@ def _by_label(faces: Iterable[tuple[FaceDesign, np.ndarray]]) -> dict[CircleLabe
 
 @dataclass(frozen=True, slots=True)
 class StatedSize:
-    """Size of a body as stated in addition to its drawing; None for values that are not stated.
-
-    Only the uncertainty budget uses it. ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch, common to all
-    dots; ``expansion_ppm_per_k`` : coefficient of linear thermal expansion, with its σ; ``temperature_c`` : temperature
-    of the body in the photographs, with its σ; ``reference_temperature_c`` : temperature at which its size is stated,
-    or is to be reported (ISO 1: 20 °C).
-    """
+    """Size of a body as stated in addition to its drawing; None for values that are not stated. Only the uncertainty
+    budget uses it. ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch, common to all dots;
+    ``expansion_ppm_per_k`` : coefficient of linear thermal expansion, with its σ; ``temperature_c`` : temperature of
+    the body in the photographs, with its σ; ``reference_temperature_c`` : temperature at which its size is stated,
+    or is to be reported (ISO 1: 20 °C)."""
 
     pitch_sigma_ppm: float | None = None
     expansion_ppm_per_k: float | None = None
@@ -332,22 +318,17 @@ class BoardDesign(ByValue):
             raise InputError("E-BOARD-SIZE", "board: {} rows and {} columns; 1 or more of each needed".format(*size))
         if not 0 < 2 * self.radius_mm < self.pitch_mm:
             raise InputError(
-                "E-BOARD-RADIUS",
-                f"board: radius {self.radius_mm:g} mm, under half the pitch {self.pitch_mm:g} mm needed",
+                "E-BOARD-RADIUS", f"board: radius {self.radius_mm:g}, under half the pitch {self.pitch_mm:g} mm needed"
             )
         if corner is None:
             return
         if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
-            )
+            fault = f"board: corner dot at row {corner[0]}, column {corner[1]}"
+            raise InputError("E-BOARD-CORNER", f"{fault}; a corner needed")
         least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
         if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"board: corner radius {self.corner_radius_mm} mm; at least {least:g} mm and under {most:g} mm needed",
-            )
+            fault = f"board: corner radius {self.corner_radius_mm} mm"
+            raise InputError("E-BOARD-CORNER", f"{fault}; at least {least:g} mm and under {most:g} mm needed")
 
     def scaled(self, factor: float) -> "BoardDesign":
         """Returns the board printed larger by a factor."""
@@ -434,8 +415,7 @@ def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleReference(BoardDesign):
-    """All that a run takes its scale from: the board, of no rows and columns if there is none, faces of known shape,
-    and known distances."""
+    """All that a run takes its scale from: the board, if any, faces of known shape, and known distances."""
 
     faces: tuple[FaceDesign, ...] = ()
     distances: tuple[KnownDistance, ...] = ()
@@ -460,23 +440,18 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     if board is not None and not faces and not target.distances:
         return board
     if board is not None and type(board) is not BoardDesign:
-        raise InputError(
-            "E-BOARD-TYPE",
-            "--board: a lattice of circles or corners, beside a target whose own size is known; a rectangular board "
-            "of dots needed, or none",
-        )
+        fault = "--board: a lattice of circles or corners, beside a target whose own size is known"
+        raise InputError("E-BOARD-TYPE", f"{fault}; a rectangular board of dots needed, or none")
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
     return ScaleReference(**(known or none), faces=faces, distances=target.distances)
 
 
-DRAWN_SIGMA = 1e-7
-"""Relative σ of the drawn distance that defines the unit where no size is known."""
+DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit where no size is known
 
 
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
-    """Returns the design with one drawn distance as the unit: the longest on a face that most images, by their labels,
-    see whole."""
+    """Returns the design with one drawn distance as the unit: the longest on the face that most images see whole."""
     views = [set(labels) for labels in images]
     best: tuple[int, float, KnownDistance] | None = None
     for face in target.faces:

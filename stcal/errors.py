@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 COMMAND_LINE = "STCAL_COMMAND_LINE"
 """Environment variable that a program sets for itself and its processes: errors then speak of ``--options``."""
@@ -141,3 +142,19 @@ def lacks_memory(error: BaseException) -> bool:
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)
     return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)
+
+
+OTHER = "stcal-*.dist-info"
+"""What another project named ``stcal`` on the package index leaves beside the package, whose files it overwrites."""
+
+
+def fault(package: Path) -> str:
+    """Returns in one line that another distribution shares the folder of the package, or an empty string."""
+    for other in sorted(package.parent.glob(OTHER)):
+        name, version = other.name.removesuffix(".dist-info").split("-", 1)
+        return (
+            f"{package}: the distribution {name} {version}, another project or an early release of this one, shares "
+            "this folder; `pip uninstall stcal`, then `pip install --force-reinstall --no-deps "
+            "stereo-target-calibration`, or give each its own environment"
+        )
+    return ""

@@ -103,8 +103,5 @@ def unseen_lines(labels: Iterable[Label], rows: int, columns: int) -> list[str]:
     """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden, or nonexistent."""
     lines = zip(("row", "column"), (rows, columns), dot_cells(labels).T, strict=True)
     unseen = [(line, ", ".join(str(i) for i in range(count) if i not in numbers)) for line, count, numbers in lines]
-    return [
-        f"board {line} {missing}: not seen in any image; check {line}s in the board file"
-        for line, missing in unseen
-        if missing
-    ]
+    said = "board {0} {1}: not seen in any image; check {0}s in the board file"
+    return [said.format(line, missing) for line, missing in unseen if missing]

@@ -9,17 +9,12 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
-MAX_GAP = 0.5
-"""Largest distance of two circles' centres, in radii, at which the circles coincide."""
-MAX_RADIUS_RATIO = 1.3
-"""Largest ratio of two circles' radii at which the circles coincide."""
+MAX_GAP = 0.5  # largest distance of two circles' centres, in radii, at which the circles coincide
+MAX_RADIUS_RATIO = 1.3  # largest ratio of two circles' radii at which the circles coincide
 MIN_COMMON = 4
-BLOCK = 4000
-"""Number of motions tested together, which bounds the memory for patterns of many circles."""
+BLOCK = 4000  # number of motions tested together, which bounds the memory for patterns of many circles
 MOST_CIRCLES = 100
 """Largest number of circles of a pattern that is compared as a whole; larger ones take minutes."""
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -58,12 +53,11 @@ class Likeness:
 
 @_kept
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
-    """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap.
-
-    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among the
-    other's, if both are parts of one pattern; the motion that leaves them there is excluded. None if no motion puts all
-    circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more than ``MOST_CIRCLES``.
-    """
+    """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest
+    gap. ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among
+    the other's, if both are parts of one pattern; the motion that leaves them there is excluded. None if no motion
+    puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more than
+    ``MOST_CIRCLES``."""
     centres, other_centres = (x + 1j * y for x, y in (np.asarray(points, float).T for points in (xy, other_xy)))
     n, m = len(centres), len(other_centres)
     if not 2 <= n <= m <= MOST_CIRCLES:
@@ -93,32 +87,26 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
         gap = abs(change * centred - target)
         coincides = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
         if coincides.all() and alike(scale * radius, other_radius).all():
-            radius_difference = float(abs(scale * radius - other_radius).max())
+            radii_mm = float(abs(scale * radius - other_radius).max())
             shift = other.mean() - change * own.mean()
-            return Likeness(
-                float(gap.max()), radius_difference, float(np.angle(change)), scale, (shift.real, shift.imag)
-            )
+            return Likeness(float(gap.max()), radii_mm, float(np.angle(change)), scale, (shift.real, shift.imag))
     return None
 
 
 @_kept
 def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
-    """Finds sets of ``MIN_COMMON`` or more circles that coincide with circles of another pattern under a rigid motion.
-
-    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``same`` : True if both are the same pattern, so that the
-    motion that leaves it in place is excluded. Returns places in ``xy``.
-    """
+    """Finds sets of ``MIN_COMMON`` or more circles that coincide with circles of another pattern under a rigid
+    motion. ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``same`` : True if both are the same pattern, so
+    that the motion that leaves it in place is excluded. Returns places in ``xy``."""
     fits, _ = _motions(xy, radius, other_xy, other_radius, same)
     return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
 
 
 @_kept
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
-    """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, as above.
-
-    Returns places of the same circles in ``xy`` and in ``other_xy`` for each motion, the most circles first. A part of
-    another result is omitted.
-    """
+    """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, as above. Returns
+    places of the same circles in ``xy`` and in ``other_xy`` for each motion, the most circles first. A part of
+    another result is omitted."""
     fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
     found: list[np.ndarray] = []
     known: list[set[tuple[int, int]]] = []

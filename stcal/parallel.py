@@ -33,8 +33,6 @@ FOR_WORKERS: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1"
 AT_ONCE = 4  # number of jobs that are handed over for each process, so that the next ones are there when one is done
 _limited = threading.Lock()
 _one_starts = threading.Lock()
-
-
 LOCK = ".lock"  # file of a scratch folder; the system releases it when its process ends, in whatever way
 YOUNG_S = 1.0  # age below which such a file may not be locked yet
 
@@ -69,11 +67,9 @@ def counted(progress: Progress, stage: str, total: int) -> Callable[[object], No
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Limits BLAS and OpenMP to one thread in the context, or, as a decorator, ``@one_thread()``, during each call.
-
-    The matrices here are small, or sparse: threads that wait for each other took most of a run's processor time. Only
-    public functions set the limit, so that program and callers behave alike. A nested call, or one while another thread
-    holds the limit, changes nothing: two that each restored the state before could leave it behind.
-    """
+    The matrices here are small, or sparse: threads that wait for each other took most of a run's processor time.
+    Only public functions set the limit, so that program and callers behave alike. A nested call, or one while
+    another thread holds the limit, changes nothing: two that each restored the state before could leave it behind."""
     if not _limited.acquire(blocking=False):
         yield
         return
@@ -100,13 +96,10 @@ def reserve_buffers() -> None:
 def run_parallel(
     function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None
 ) -> Iterator[tuple[int, R]]:
-    """Yields (index of the job, result of ``function(*job)``) as results arrive, in any order.
-
-    Processes are forked from a server that has loaded the libraries and has no threads, or spawned where the system
-    cannot fork; they do not import the caller's main module. One worker, or one job, runs in this process; so does all
-    work within a process of ``multiprocessing.Pool``. ``workers`` : one per core if None, or as :func:`kept_processes`
-    has it.
-    """
+    """Yields (index of the job, result of ``function(*job)``) as results arrive, in any order. Processes are forked
+    from a server that has loaded the libraries and has no threads, or spawned where the system cannot fork; they do
+    not import the caller's main module. One worker, or one job, runs in this process; so does all work within a
+    process of ``multiprocessing.Pool``. ``workers`` : one per core if None, or as :func:`kept_processes` has it."""
     kept = _kept.get()
     workers = min(kept.workers if kept else _number_of_processes(workers), len(jobs))
     if workers <= 1:
@@ -160,8 +153,6 @@ def hand_over(
 
 
 class _Processes:
-    """Pool of processes that starts with the first job and ends with the context."""
-
     def __init__(self, workers: int):
         self.workers = workers
         self._others = multiprocessing.active_children()

@@ -20,12 +20,10 @@ EQUAL = 4.6
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
     """A jump of the rows from ``row`` on, or a drift of all rows in proportion to their place in the order.
-
-    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift from
-    the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
-    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change by
-    chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors.
-    """
+    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift
+    from the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
+    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change
+    by chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors."""
 
     kind: Literal["jump", "drift"]
     row: int
@@ -135,14 +133,6 @@ def _best(errors: np.ndarray, basis: np.ndarray, motions: np.ndarray, good: np.n
     motion = step / np.where(scale > 0, scale, 1.0)
     variance = max(square - gain, 1e-300) / freedom
     near = places[:-1][(gain - gains[:-1]) / variance / 2 < EQUAL]
-    return Change(
-        kind="jump" if jump else "drift",
-        row=int(rows[place]) if jump else 0,
-        first=int(rows[near[0]]) if jump else 0,
-        last=int(rows[near[-1]]) if jump else 0,
-        motion=motion,
-        moves=moves,
-        share=gain / square,
-        log_p=float(chances[best] + np.log(len(places))),
-        good=good,
-    )
+    row, first, last = rows[[place, near[0], near[-1]]].tolist() if jump else (0, 0, 0)
+    told = motion, moves, gain / square, float(chances[best] + np.log(len(places))), good
+    return Change("jump" if jump else "drift", row, first, last, *told)

@@ -97,7 +97,6 @@ _DESIGNS = "--target @data/target.toml --board @data/board.toml"
 _SET = f"@data/images --camera @data/cameras.txt {_DESIGNS} --workers 1"
 _LOCATE = "--layout @locate/layout.toml --camera @locate/cameras.txt"
 _ALL = "--json >all.json --report >page.html"
-
 CALLS = (
     Call("sfm run", f"{_SET} --out ~run", 3.5),
     Call("sfm run", f"{_SET} --out +new", 9.0),
@@ -154,7 +153,6 @@ CALLS = (
     Call("camera convert", "@cameras/matlab.mat >camera.mat"),
     Call("camera convert", "@cameras/cameras.bin >camera.xml"),
     *(Call("camera show", f"@cameras/{name}") for name in ("camchain.yaml", "camera.cameramodel", "metashape.xml")),
-    Call("camera show", "@cameras/industrial.yaml --size 324x216"),
     Call("camera compare", "@cameras/sigma.txt @cameras/opencv.yaml --plot >camera.svg", 1.0),
     Call("robot init", "+robot.toml"),
     Call("robot convert", "@robot/made.toml >robot.urdf"),

@@ -39,8 +39,6 @@ from tests.shared import Once, without_rights
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(__file__).parent / "data" / "sample"
-
-
 multiprocessing.util.get_temp_dir()  # kept for the process: not in the folder of a test that has one of its own
 
 # How long examples take is the machine's, and no fault of a test.

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import stcal
-from stcal.alone import fault
+from stcal.errors import fault
 
 
 def test_a_package_by_itself_is_no_fault(tmp_path):
@@ -17,7 +17,7 @@ def test_a_package_by_itself_is_no_fault(tmp_path):
 def test_another_distribution_beside_it_is_refused_at_import(tmp_path):
     package = tmp_path / "stcal"
     package.mkdir()
-    for name in ("__init__.py", "alone.py"):
+    for name in ("__init__.py", "errors.py"):
         shutil.copy(Path(stcal.__file__).with_name(name), package)
     (tmp_path / "stcal-1.20.0.dist-info").mkdir()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import stcal"

@@ -10,8 +10,7 @@ ROOT = Path(stcal.__file__).parent
 FILES = sorted(path.relative_to(ROOT) for path in ROOT.rglob("*.py"))
 MOST_FILES = 14
 """Most files of a folder: what can be seen at a glance."""
-MOST_ENTRIES = 16
-"""Most folders and files of ``sfm/``."""
+MOST_ENTRIES = 16  # most folders and files of `sfm/`
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 
 

@@ -24,8 +24,7 @@ MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
 EIGHT = [-0.2, 0.08, 1e-3, -5e-4, 0.01, 0.02, -0.01, 0.005]
 POINTS = np.random.default_rng(1).uniform([-200, -100, 500], [200, 100, 900], (30, 3))
-ROUNDING_PX = 1e-9
-"""Of a dozen products of numbers below 1e3 in double precision."""
+ROUNDING_PX = 1e-9  # of a dozen products of numbers below 1e3 in double precision
 
 
 @pytest.mark.parametrize("count", [0, 4, 5, 8])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stcal.cli.cameras import app
+from stcal.cli.instruments import camera_app as app
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.difference import compare_cameras
@@ -93,7 +93,7 @@ def test_the_sigma_of_a_lens_that_is_fitted_is_missed(tmp_path):
 
 
 def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
-    (folder / "i.yaml").write_text("intrinsics:\n  fx: 900\n  fy: 905\n  cx: 640\n  cy: 475\n")
+    (folder / "i.yaml").write_text("K: [900, 0, 640, 0, 905, 475, 0, 0, 1]\nD: [0, 0, 0, 0]\n")
     refuses("E-CAMERA-SIZE … --size", call, "show", folder / "i.yaml")
     assert "1280×960" in call("show", folder / "i.yaml", "--size", "1280x960")
     refuses("E-OPTION-SIZE … --size … 12", call, "show", folder / "i.yaml", "--size", "12")

@@ -31,8 +31,7 @@ JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
 REACH = np.radians([8.0, 7.0, 9.0, 22.0, 22.0, 30.0])
 """Either side of the rest position: as far as the target stays in view of a camera a metre away."""
-BUILT_MM, BUILT_RAD = 0.5, 1e-3
-"""σ by which the arm differs from its drawing."""
+BUILT_MM, BUILT_RAD = 0.5, 1e-3  # σ by which the arm differs from its drawing
 
 
 class Cell:

@@ -25,8 +25,7 @@ BLOCK = re.compile(r"^## (\d+)\. .*?^```python\n(.*?)^```$", re.MULTILINE | re.D
 SCRIPTS = dict(BLOCK.findall((ROOT / "docs" / "howto" / "python.md").read_text(encoding="utf-8")))
 FLANGE_FROM_CAMERA = Rigid.exp([0.1, 0.2, -0.3, 30.0, -20.0, 90.0])
 B_FROM_A = Rigid.exp([0.3, -0.2, 0.5, 1000.0, 50.0, -200.0])
-WRONG = [4, 11]
-"""Rows of ``points.npz`` that are off by 20 mm."""
+WRONG = [4, 11]  # rows of `points.npz` that are off by 20 mm
 HOLDS = {
     "1": lambda found: len(found["seen"]) > 60,
     "2": lambda found: 0.001 < found["table"].residual_x_px.std() < 0.05,

@@ -26,8 +26,6 @@ FOLDERS |= {("export_model", "out"), ("capture", "out")}
 """New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
-
-
 PAIRS = [
     (command, output, read)
     for command in EVERY

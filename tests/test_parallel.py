@@ -17,7 +17,6 @@ from threadpoolctl import threadpool_info
 from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_parallel, scratch_folder
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
-
 CORES = str(len(os.sched_getaffinity(0)))  # OpenBLAS begins as many threads
 
 
@@ -35,7 +34,6 @@ from tests.test_parallel import threads
 def say():
     print(*{library["num_threads"] for library in threadpool_info()}, end=" ")
 """
-
 LIMIT = """
 say()
 try:
@@ -47,7 +45,6 @@ try:
 except ValueError:
     say()
 """
-
 SEVERAL_THREADS = """
 began, first_ended = threading.Event(), threading.Event()
 def second():
@@ -65,7 +62,6 @@ first()
 other.join()
 say()
 """
-
 NOTHING_LEFT = """
 import asyncio, ctypes, multiprocessing, os, signal, sys, warnings
 
@@ -113,7 +109,6 @@ for way in ways:
 signal.raise_signal(signal.SIGTERM)
 print(*answered, end=" ")
 """
-
 WORKERS = """
 print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in found))
 """

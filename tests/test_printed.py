@@ -12,7 +12,6 @@ BLOCKS = printed.of_documents()
 MARKED = [block for block in BLOCKS if block.command]
 NOT_YET = {"docs/accuracy.md: face as published + centres of blurred edges + eccentricity +"}
 """Of reproduce_paper.py, which takes long and whose output is not stored yet."""
-
 QUICK = {"register_shared": "hilti_stationing", "reproduce_registration": None, "camera_formats": None}
 """Commands of about half a minute, and the data set that they are run on, which is not part of the repository."""
 

@@ -31,8 +31,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "howto" / "python.md"
 ROW = re.compile(r"^\| `stcal([ -])([\w -]+)` \| (.+) \|$", re.MULTILINE)
 TABLE = {words: cell for _, words, cell in ROW.findall(PAGE.read_text(encoding="utf-8"))}
 """Cells of the table by the words of the command, ``sfm run``."""
-APART = {"sfm demo", "robot init"}
-"""Commands without a function of their own; the table says why."""
+APART = {"sfm demo", "robot init"}  # commands without a function of their own; the table says why
 
 
 def functions_of(command: str) -> dict[str, object]:

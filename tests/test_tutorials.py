@@ -17,8 +17,7 @@ LONG = ("cube-of-tags", "hand-eye", "own-target", "robot", "tags")
 """Tutorials of more than twenty seconds whose chains other slow tests make too; `test_documents` parses their calls."""
 HALF = {"(2016, 1512)": "(1008, 756)", "2016 1512 1530 1531 1012.3 748.6": "1008 756 765 765.5 506.15 374.3"}
 """Cameras of the tutorial of a target of one's own, and cameras of half their size, of which it says the same."""
-NUMBER = re.compile(r"\d+(?:\.\d+)?")
-"""Of what a page shows; another processor rounds otherwise."""
+NUMBER = re.compile(r"\d+(?:\.\d+)?")  # of what a page shows; another processor rounds otherwise
 
 
 def run(kind: str, code: str, folder: Path) -> str:

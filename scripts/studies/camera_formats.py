@@ -15,8 +15,7 @@ from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.forms import WRITERS, written
-from stcal.io.cameras.read import read_lens
+from stcal.io.cameras.read import WRITERS, read_lens, written
 from tests.io import camera_files, reported_cameras
 
 WIDTH, HEIGHT = 1280, 961

@@ -10,18 +10,13 @@ from scipy.special import ndtr
 
 from stcal.geometry.plane import apply_homography, fit_homographies
 
-PIXEL_VARIANCE = 1 / 12
-"""Variance of a square pixel about its centre, px²."""
-PRIOR_PX = 0.005
-"""σ of the displacement of edges by the pixels' sampling before an image is seen, px."""
+PIXEL_VARIANCE = 1 / 12  # variance of a square pixel about its centre, px²
+PRIOR_PX = 0.005  # σ of the displacement of edges by the pixels' sampling before an image is seen, px
 POINTS_PX = 0.01
 """The same of images that were resampled in points, as far as nothing shows that they were not, px."""
-LEAST_PX = 0.0005
-"""Least σ of a displacement that is told apart from another, px."""
-ROUNDS = 5
-"""Number of times that estimates are weighted by the variances found before."""
-BY_CHANCE = 3.0
-"""Number of σ up to which scatter of lines is taken for chance."""
+LEAST_PX = 0.0005  # least σ of a displacement that is told apart from another, px
+ROUNDS = 5  # number of times that estimates are weighted by the variances found before
+BY_CHANCE = 3.0  # number of σ up to which scatter of lines is taken for chance
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -135,17 +130,14 @@ def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[
 
 
 def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
-    """Return square, noise, lines and passed of the estimates that are known."""
     names = [part.name for part in fields(Displacement)]
     every = [np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names]
     known = np.isfinite(every[0]) & (every[2] > 0)
     return [values[known] for values in every]
 
 
-CLEAR_BLURS = 2.5
-"""Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
-END_BLURS = 2.0
-"""Distance from the ends of a cell's side, in the same, from which on pixels are used."""
+CLEAR_BLURS = 2.5  # distance from other lines, in σ of blur and pixel, from which on pixels are used
+END_BLURS = 2.0  # distance from the ends of a cell's side, in the same, from which on pixels are used
 LEAST_BLURS, MOST_BLURS = 1.5, 4.0
 """Least and largest reach of pixels to either side of a line, in σ of blur and pixel."""
 FARTHEST_PX = 0.1
@@ -183,8 +175,6 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pieces:
-    """s sides of cells between dark and bright."""
-
     tag: np.ndarray
     axis: np.ndarray  # 0: lines of one x
     line: np.ndarray
@@ -198,7 +188,6 @@ class _Pieces:
 
 
 def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pieces:
-    """Return the sides between cells of different colours."""
     found = []
     for axis in (0, 1):
         colour = np.swapaxes(bright, 1, 2) if axis == 0 else bright  # (n, line, along)

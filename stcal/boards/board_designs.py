@@ -1,13 +1,15 @@
-"""Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
+"""Boards and tags: places of their corners, rotations that leave their appearance unchanged, black areas to draw."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import ClassVar
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stcal.boards.dictionaries import known_tags
+from stcal.boards.dictionaries import dictionary_of, known_tags
 from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
@@ -28,11 +30,9 @@ class Distinct:
 
 @dataclass(frozen=True, slots=True)
 class ChessboardDesign:
-    """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``.
-
-    X along a row, Y down the columns, Z into the board, origin at inner corner (0, 0); the square between inner
-    corners (0, 0) and (1, 1) is black. ``sigma_mm`` : σ of a corner about the grid, per axis.
-    """
+    """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``. X along a row, Y down the
+    columns, Z into the board, origin at inner corner (0, 0); the square between inner corners (0, 0) and (1, 1) is
+    black. ``sigma_mm`` : σ of a corner about the grid, per axis."""
 
     rows: int
     columns: int
@@ -55,14 +55,11 @@ class ChessboardDesign:
 
 @dataclass(frozen=True, slots=True)
 class CharucoDesign(Distinct):
-    """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares.
-
-    The tags have the size ``marker_mm`` and are from ``dictionary``.
-
-    X along a row, Y down the columns, Z into the board, origin at the outer corner of the first square. ``legacy`` :
-    True for the pattern of OpenCV before 4.6, in which boards with an even number of rows began with a white square.
-    ``sigma_mm`` : σ of a corner about the grid, per axis. ``first_id`` : id of the first tag; ids count up from there.
-    """
+    """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares. The tags
+    have the size ``marker_mm`` and are from ``dictionary``. X along a row, Y down the columns, Z into the board,
+    origin at the outer corner of the first square. ``legacy`` : True for the pattern of OpenCV before 4.6, in which
+    boards with an even number of rows began with a white square. ``sigma_mm`` : σ of a corner about the grid, per
+    axis. ``first_id`` : id of the first tag; ids count up from there."""
 
     rows: int
     columns: int
@@ -85,8 +82,6 @@ class CharucoDesign(Distinct):
 
 UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 """Corners of a tag of side 1 about its middle: top left, top right, bottom right, bottom left."""
-
-
 NESTED = 0.5
 """Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 
@@ -97,10 +92,8 @@ def sides_mm(corners_mm: np.ndarray) -> np.ndarray:
 
 
 def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusual_size: bool, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other.
-
-    ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
-    """
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other. ``corners_mm`` : (n, 4,
+    2), NaN for tags of no known place."""
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
     lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))
@@ -133,10 +126,8 @@ class TagLayout(Distinct, Brief):
     unusual_size : bool
         True if unusually long or short sides are not a mistake of units.
 
-    Raises
-    ------
-    InputError
-        Tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that are not mm.
+    Raises InputError: tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that
+    are not mm.
     """
 
     tags: tuple[tuple[str, int], ...]
@@ -177,10 +168,7 @@ class TagLayout(Distinct, Brief):
         sigma_mm : float
             σ of a corner's coordinate, mm.
 
-        Raises
-        ------
-        InputError
-            A value is not finite, a size is not positive, or a tag is unknown or occurs twice.
+        Raises InputError: a value is not finite, a size is not positive, or a tag is unknown or occurs twice.
         """
         n = len(ids)
         middle = frozen(xy_mm, (n, 2), "tags' middles")
@@ -201,14 +189,12 @@ class TagLayout(Distinct, Brief):
 @dataclass(frozen=True, slots=True)
 class AprilGridDesign(Distinct):
     """An AprilGrid of ``rows`` × ``columns`` AprilTags of ``tag_mm`` (outer edge of the black border), as of Kalibr.
-
     The step from tag to tag is ``tag_mm`` · (1 + ``spacing``). Ids count up from ``first_id`` along the bottom row,
     then row by row upwards. X along a row, Y down the columns, Z into the board, origin at the bottom left corner of
     the first tag: Kalibr's frame, turned by half a turn about X, so that tag (row i from below, column j) has its
-    bottom left corner at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or the
-    usual 1; None if it is to be determined from images. ``upright`` : True if tags stand as OpenCV draws them; Kalibr
-    prints them rotated by half a turn. ``sigma_mm`` : σ of a corner about the grid, per axis.
-    """
+    bottom left corner at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or
+    the usual 1; None if it is to be determined from images. ``upright`` : True if tags stand as OpenCV draws them;
+    Kalibr prints them rotated by half a turn. ``sigma_mm`` : σ of a corner about the grid, per axis."""
 
     rows: int
     columns: int
@@ -265,14 +251,13 @@ class LatticePart(BoardDesign):
 
 @dataclass(frozen=True, slots=True)
 class AsymmetricCirclesDesign:
-    """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
-
-    Circle (i, j), row i and place j in it, both from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
-    ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into the
-    board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
-    circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a
-    circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its turn.
-    """
+    """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a
+    step. Circle (i, j), row i and place j in it, both from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
+    ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into
+    the board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
+    circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ
+    of a circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its
+    turn."""
 
     rows: int
     columns: int
@@ -330,11 +315,9 @@ HEXAGONAL = np.array([[1.0, 0.5], [0.0, np.sqrt(3) / 2]])
 
 @dataclass(frozen=True, slots=True)
 class HexagonalCirclesDesign(AsymmetricCirclesDesign):
-    """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
-
-    Circle (i, j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i ·
-    √3 / 2 · ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`.
-    """
+    """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step. Circle (i,
+    j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i · √3 / 2 ·
+    ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`."""
 
     hexagonal: ClassVar[bool] = True
 
@@ -352,12 +335,9 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign
-
-
 TAG_SIGMA_MM = 0.05
 """σ of a corner of a tag if its file states none: print on paper that is glued on."""
-PLACE_DIGITS = 6
-"""Decimals, mm, to which the places of points are the same row or column."""
+PLACE_DIGITS = 6  # decimals, mm, to which the places of points are the same row or column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -466,3 +446,98 @@ def view_of(image: str, board: FlatBoard, ids: np.ndarray, xy_px: np.ndarray, co
     """Return the view of the points ``ids`` of a flat board."""
     xy = board.xy_mm()[ids]
     return BoardView(image, ids, np.column_stack([xy, np.zeros(len(xy))]), xy_px, covariance_px2)
+
+
+SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
+SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+UNKNOWN_BITS = 2
+"""Border of an AprilGrid, in cells, if its file does not state it: Kalibr's."""
+
+
+def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
+    """Return areas as lists of closed lines (k, 2), mm in the board's frame; inner lines are holes, reversed."""
+    if isinstance(board, ChessboardDesign):
+        return _squares(board.rows + 1, board.columns + 1, board.square_mm, 0, -board.square_mm)
+    if isinstance(board, CharucoDesign):
+        first, size = int(board.legacy and board.rows % 2 == 0), (board.rows, board.columns, board.square_mm)
+        white = _squares(*size, 1 - first, (board.square_mm - board.marker_mm) / 2)
+        places = (at[0] + board.marker_mm * SQUARE for (at,) in white)  # the last square may be white without a tag
+        tags = [_tag(board.dictionary, tag, at, 1) for tag, at in zip(board.tag_ids(), places, strict=False)]
+        return _squares(*size, first, 0.0) + tags
+    if isinstance(board, AprilGridDesign):
+        bits = board.border_bits or UNKNOWN_BITS
+        layout = board.layout()
+        tags = [_tag(name, tag, at, bits) for (name, tag), at in zip(layout.tags, layout.corners_mm, strict=True)]
+        return tags + _between(board)
+    return [_tag(name, tag, at, 1) for (name, tag), at in zip(board.tags, board.corners_mm, strict=True)]
+
+
+def clear_mm(board: SquaresOrTags) -> float:
+    """Return the width of white, mm, that detectors need around the board: a square, or a quarter of a tag."""
+    if isinstance(board, ChessboardDesign | CharucoDesign):
+        return board.square_mm
+    if isinstance(board, AprilGridDesign):
+        return board.tag_mm / 4
+    sides = np.linalg.norm(board.corners_mm - np.roll(board.corners_mm, 1, axis=1), axis=2)
+    return float(sides.max()) / 4
+
+
+def outlines(black: np.ndarray) -> list[np.ndarray]:
+    """Return closed lines around the black cells of a mask (rows, columns). Each line is (k, 2) corners, column and
+    row, with the black on the right if rows go down. Areas that touch only at a corner stay separate."""
+    padded = np.pad(black, 1)
+    after: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for row, column in np.argwhere(black).tolist():
+        corners = [(column + x, row + y) for x, y in SQUARE.tolist()]
+        beside = [padded[row, column + 1], padded[row + 1, column + 2], padded[row + 2, column + 1]]
+        beside.append(padded[row + 1, column])
+        for k in range(4):
+            if not beside[k]:
+                after.setdefault(corners[k], []).append(corners[(k + 1) % 4])
+    lines = []
+    while after:
+        corner = start = next(iter(after))
+        step, line = (0, 0), []
+        while True:
+            ends = after[corner]
+            right = (corner[0] - step[1], corner[1] + step[0])
+            end = ends.pop(ends.index(right) if right in ends else 0)
+            if not ends:
+                del after[corner]
+            turned = (end[0] - corner[0], end[1] - corner[1])
+            if turned != step:
+                line.append(corner)
+            corner, step = end, turned
+            if corner == start:
+                break
+        first = (line[1][0] - line[0][0], line[1][1] - line[0][1])
+        if first[0] * step[1] == first[1] * step[0]:  # the line began in the middle of an edge
+            line = line[1:]
+        lines.append(np.array(line))
+    return lines
+
+
+def _squares(rows: int, columns: int, side: float, first: int, origin: float) -> list[list[np.ndarray]]:
+    """Return the black squares one by one; square (0, 0) begins at ``origin``, and is black if ``first`` is 0."""
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    black = (row + column) % 2 == first
+    return [[side * (at + SQUARE) + origin] for at in np.column_stack([column, row])[black]]
+
+
+def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.ndarray]:
+    """Return lines around the black cells of a tag with these ``corners`` (4, 2), as printed from top left."""
+    dictionary = dictionary_of(name)
+    cells = dictionary.markerSize + 2 * border_bits
+    black = cv2.aruco.generateImageMarker(dictionary, tag, cells, borderBits=border_bits) == 0
+    lines = []
+    for line in outlines(black):
+        u, v = (line / cells).T[:, :, None]
+        top = (1 - u) * corners[0] + u * corners[1]
+        lines.append((1 - v) * top + v * ((1 - u) * corners[3] + u * corners[2]))
+    return lines
+
+
+def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
+    gap = board.spacing * board.tag_mm
+    step, cells = board.tag_mm + gap, product(range(board.rows + 1), range(board.columns + 1))
+    return [[np.array([column * step - gap, -row * step]) + gap * SQUARE] for row, column in cells]

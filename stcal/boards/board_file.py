@@ -27,7 +27,7 @@ from stcal.boards.foreign import KEYS as BUNDLE_KEYS
 from stcal.boards.foreign import Count, Few, Squares, kalibr_board_of, tags_of_bundle, yaml_content
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, Polarity, StatedSize, board_lengths, reference_board
 from stcal.errors import InputError, named
-from stcal.io.covariance import Rows, require_covariance
+from stcal.geometry.arrays import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_of, toml_string, validated
@@ -48,7 +48,6 @@ OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_m
 LEAST_PPM, LEAST_PITCH_PPM = 1e-3, 0.1
 """Smallest expansion, ppm/K, and σ of a pitch, ppm, that anyone can state: less is in 1/K, or a fraction or mm."""
 LEAST_C, MOST_C = -100.0, 200.0
-
 Index = Annotated[int, Field(ge=0, strict=True)]
 RimHeight = Annotated[float, Field(ge=-20, le=20)]
 """Height in mm of a rim in front of a circle; negative for a disc that is raised from its plate."""
@@ -61,9 +60,7 @@ Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
 def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K", least: float = LEAST_PPM) -> float:
     if 0 < abs(value) < least:
         percent = "" if per else f", and in % {1e4 * value:g}"
-        raise ValueError(
-            f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or at least {least:g} needed"
-        )
+        raise ValueError(f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or {least:g} needed")
     return value
 
 
@@ -124,11 +121,10 @@ class _Dots(BoardSizeEntry):
 def _dots(data: _Dots, where: str) -> BoardDesign:
     same = data.model_dump(include={entry.name for entry in fields(BoardDesign)} - {"corner"})
     same["rings"] = _rings(data.rings, data.rows, data.columns, True, where)
-    corner = data.corner and (data.corner.row, data.corner.column)
+    stated = data.corner
+    corner, radius_mm = ((stated.row, stated.column), stated.radius_mm) if stated else (None, None)
     with named(where, "board"):
-        return BoardDesign(
-            **same, corner=corner, corner_radius_mm=data.corner and data.corner.radius_mm, stated=data.stated()
-        )
+        return BoardDesign(**same, corner=corner, corner_radius_mm=radius_mm, stated=data.stated())
 
 
 def _rings(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bool, where: str) -> tuple:
@@ -136,18 +132,13 @@ def _rings(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bo
     told = {(row, column) for row, column in rings}
     for row, column in told:
         if row >= rows or column >= columns:
-            raise InputError(
-                "E-BOARD-RINGS",
-                f"{where}: rings has [{row}, {column}] of {rows} rows of {columns} dots, counted from 0; correct it",
-            )
+            fault = f"{where}: rings has [{row}, {column}] of {rows} rows of {columns} dots, counted from 0"
+            raise InputError("E-BOARD-RINGS", f"{fault}; correct it")
     half = {(rows - 1 - row, columns - 1 - column) for row, column in told}
     quarter = {(column, rows - 1 - row) for row, column in told} if quarters and rows == columns else set()
     if told and told in (half, quarter):
-        raise InputError(
-            "E-BOARD-RINGS",
-            f"{where}: {len(told)} rings that look the same after a turn of the board; choose rings that distinguish "
-            "its ends, or leave rings out",
-        )
+        fault = f"{where}: {len(told)} rings that look the same after a turn of the board"
+        raise InputError("E-BOARD-RINGS", f"{fault}; choose rings that distinguish its ends, or leave rings out")
     return tuple(sorted(told))
 
 
@@ -176,7 +167,6 @@ def _form(word: str, design: type, number: Any, **more: Any) -> type[Sized]:
 
 
 def _grid(design: type[FlatBoard], data: Any, where: str) -> FlatBoard:
-    """Return a board of squares, of tags in rows or of circles, with sizes and tags that are possible."""
     keys = data.model_dump(exclude={"type", "unusual_size", "diameter_mm"})
     if issubclass(design, AsymmetricCirclesDesign):
         if (data.radius_mm is None) == (data.diameter_mm is None):
@@ -186,25 +176,16 @@ def _grid(design: type[FlatBoard], data: Any, where: str) -> FlatBoard:
     board = design(**keys)
     require_millimetres(_lengths(board), data.unusual_size, where)
     if isinstance(board, AsymmetricCirclesDesign) and board.radii_mm()[0] >= (most := board.nearest_mm() / 2):
-        raise InputError(
-            "E-BOARD-RADIUS",
-            f"{where}: radius {board.radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is "
-            f"{SPACING[design]}",
-        )
+        fault = f"{where}: radius {board.radius_mm:g} mm, under {most:g} mm needed for circles apart"
+        raise InputError("E-BOARD-RADIUS", f"{fault}; spacing_mm is {SPACING[design]}")
     if isinstance(board, CharucoDesign) and board.marker_mm > MOST_MARKER * board.square_mm:
-        raise InputError(
-            "E-BOARD-MARKER-SIZE",
-            f"{where}: marker_mm {board.marker_mm:g}, under {MOST_MARKER:g} of square_mm {board.square_mm:g} needed; "
-            "are they swapped?",
-        )
+        fault = f"{where}: marker_mm {board.marker_mm:g}, under {MOST_MARKER:g} of square_mm {board.square_mm:g} needed"
+        raise InputError("E-BOARD-MARKER-SIZE", f"{fault}; are they swapped?")
     if isinstance(board, CharucoDesign | AprilGridDesign):
         ids = board.tag_ids()
         if ids.stop > (count := count_of(board.dictionary)):
-            raise InputError(
-                "E-TAG-ID-RANGE",
-                f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
-                "columns, first_id or dictionary",
-            )
+            fault = f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}"
+            raise InputError("E-TAG-ID-RANGE", f"{fault}; correct rows, columns, first_id or dictionary")
     return board
 
 
@@ -236,9 +217,9 @@ class TagEntry(Strict):
         if self.x_mm is None or self.y_mm is None or self.size_mm is None:
             needed = f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
             raise InputError("E-TAG-PLACE", needed)
-        square, angle = self.size_mm * UNIT_SQUARE, np.radians(self.angle_deg)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
+        angle = np.radians(self.angle_deg)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return self.size_mm * UNIT_SQUARE @ turn + [self.x_mm, self.y_mm]
 
 
 class TagsFile(Sized):
@@ -311,9 +292,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         if place is None:
             raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
         if tag.id >= (count := count_of(tag.dictionary)):
-            raise InputError(
-                "E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct id or dictionary"
-            )
+            raise InputError("E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct it")
         along = np.roll(place, -1, axis=0) - place
         following = np.roll(along, -1, axis=0)
         turn = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
@@ -337,8 +316,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "hexagonal-circles": (HexagonalCirclesDesign, Count),
 }
 """Design of each kind of board by its word in files, and the type of its numbers of rows and columns."""
-TYPES = {design: word for word, (design, _) in KINDS.items()}
-"""The word of each kind of board in files."""
+TYPES = {design: word for word, (design, _) in KINDS.items()}  # the word of each kind of board in files
 _OF_CIRCLES = dict.fromkeys(("radius_mm", "diameter_mm"), (MaybeLength, None))
 READERS: Mapping[str, tuple[type[Strict], Callable[..., BoardDesign | FlatBoard]]] = {"circles": (_Dots, _dots)} | {
     word: (TagsFile, _tags)
@@ -388,57 +366,38 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
-    """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
+    """Return the board of a file of any kind (form: ``data_layout.md``), board frame, mm; without ``type`` one of dots.
 
     Parameters
     ----------
     path : str or Path
         The file: TOML, or Kalibr's YAML.
 
-    Returns
-    -------
-    BoardDesign or another board design
-        Board frame, mm.
-
-    Raises
-    ------
-    InputError
-        The file is unreadable, invalid for its kind, or of several boards; the message names file, place and reason.
+    Raises InputError: the file is unreadable, invalid for its kind, or of several boards; the message names file, place
+    and reason.
     """
     return design_of(path, board_content(path))
 
 
 def load_dots(path: str | Path) -> BoardDesign:
     """Read a board of dots; errors as :func:`load_flat_board`, and for a file of another kind of board."""
-    content = board_content(path)
-    kind = "circles" if content is None else content.get("type", content.get("target_type", "circles"))
-    if kind != "circles":
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"board file {path}: {kind}; a board of dots needed here: `calibrate-camera`, `handeye` and `locate` "
-            "take others",
-        )
-    return _dots(load_toml(path, _Dots, "board file", INIT), f"board file {path}")
+    board = load_flat_board(path)
+    if isinstance(board, BoardDesign):
+        return board
+    dots = "a board of dots needed here: `calibrate-camera`, `handeye` and `locate` take others"
+    raise InputError("E-BOARD-TYPE", f"board file {path}: {TYPES[type(board)]}; {dots}")
 
 
 def load_board(path: str | Path) -> BoardDesign:
-    """Read the file of a board beside a target: dots, asymmetric circles as places of a lattice, or points of a board
-    of squares or tags.
+    """Return the board beside a target, board frame, mm: dots, asymmetric circles as places of a lattice, or points of
+    a board of squares or tags.
 
     Parameters
     ----------
     path : str or Path
         ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
 
-    Returns
-    -------
-    BoardDesign
-        Board frame, mm.
-
-    Raises
-    ------
-    InputError
-        As :func:`load_flat_board`; or its circles have no radius.
+    Raises InputError: as :func:`load_flat_board`; or its circles have no radius.
     """
     board = load_flat_board(path)
     if isinstance(board, BoardDesign):
@@ -457,7 +416,6 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
 
 
 def _lengths(board: FlatBoard) -> list[Length]:
-    """Return the lengths of a board by which the unit of its file is judged."""
     if isinstance(board, TagLayout):
         return [side("side of a tag", float(mm)) for mm in sides_mm(board.corners_mm)]
     if isinstance(board, AsymmetricCirclesDesign):

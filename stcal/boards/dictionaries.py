@@ -12,8 +12,7 @@ import numpy as np
 
 from stcal.errors import InputError
 
-OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
-"""Families of AprilTag that OpenCV detects."""
+OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")  # families of AprilTag that OpenCV detects
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,6 @@ def dictionary_of(name: str):
 
 
 def _of_apriltag(name: str) -> str:
-    """Return the name of a family that OpenCV lacks, if it can be detected; errors as :func:`known_dictionary`."""
     instead = f"print tags of {', '.join(OF_OPENCV)}"
     unread = "OpenCV does not detect this family of AprilTag"
     if name in TOO_LARGE:
@@ -140,9 +138,7 @@ def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, 
         except ValueError as error:
             raise InputError("E-TAG-DICTIONARY", f"{where}: tag {tag}: dictionary {name!r}: {error}") from None
         if tag != int(tag) or not 0 <= tag < count_of(full):
-            raise InputError(
-                "E-TAG-ID-RANGE", f"{where}: tag {tag}: {full} has 0 … {count_of(full) - 1}; correct id or dictionary"
-            )
+            raise InputError("E-TAG-ID-RANGE", f"{where}: tag {tag}: {full} has 0 … {count_of(full) - 1}; correct it")
         known.append((full, int(tag)))
     if twice := [tag for k, tag in enumerate(known) if tag in known[:k]]:
         repeated = f"{where}: tag {twice[0][1]} of {twice[0][0]} occurs twice; tags must differ"

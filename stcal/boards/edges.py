@@ -26,16 +26,13 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.robust import median_length
 
-SAMPLES = 25
-"""Number of samples of a profile across an edge."""
-POINTS = 32
-"""Largest number of places along an edge that are used; at most one per pixel."""
+SAMPLES = 25  # number of samples of a profile across an edge
+POINTS = 32  # largest number of places along an edge that are used; at most one per pixel
 ALONG = (0.08, 0.92)
 """Range of an edge that is used, as shares of its length: near its ends the next edge's blur disturbs it."""
 LEAST_ALONG = 0.25
 """Share of an edge to either side of its middle that is used, however wide the blur is."""
-END_PX = 2.0
-"""Distance from an edge's ends from which on pixels are used, px."""
+END_PX = 2.0  # distance from an edge's ends from which on pixels are used, px
 CELLS_ACROSS = 0.8
 """Reach of a profile to either side, in cells; the border of a tag, and the white around it, is one cell wide."""
 REACH_PX = (1.5, 6.0)
@@ -43,32 +40,25 @@ MIN_RISE = 0.15
 """Smallest step that counts as a part of the edge, as a share of a profile's steepest step; smaller ones are noise."""
 MIN_CONTRAST = 0.3
 """Smallest contrast of a profile, as a share of the tag's; a lower one is another tag's edge, a stain or a shadow."""
-MIN_SHARE = 0.25
-"""Smallest share of good profiles of a visible edge."""
+MIN_SHARE = 0.25  # smallest share of good profiles of a visible edge
 MIN_CELL_PX = 2.0
-CUT = 2.5
-"""Largest distance of a point from the line, in robust σ; points beyond it are outliers."""
+CUT = 2.5  # largest distance of a point from the line, in robust σ; points beyond it are outliers
 CUT_ROUNDS = 4
 MIN_SIGMA_PX = 0.01
 """Smallest σ of edge points: below it printing, flatness and the lens limit the accuracy of a corner, not noise."""
-STEPS = 3
-"""Number of Gauss–Newton steps; the last one is below a thousandth of a pixel."""
-START_VARIANCE, MIN_VARIANCE = 0.4, 0.01
-"""Variance of the blur at the start, and its lower limit, px²."""
+STEPS = 3  # number of Gauss–Newton steps; the last one is below a thousandth of a pixel
+START_VARIANCE, MIN_VARIANCE = 0.4, 0.01  # variance of the blur at the start, and its lower limit, px²
 MOST_MOVED_PX = 1.0
 """Largest distance of an edge from where its profiles have it; one that ends farther away stays with the profiles."""
 SMEAR_SHARE, SMEAR_POWER = 0.08, 3
 """Error of an edge's place that motion over one cell causes, as a share of the cell, and how it grows with the way."""
 TOLD, LONG_SMEAR = 4.0, 0.4
 """Difference of two directions' blur, in RMS of what is left, from which it is motion; way that is named, in cells."""
-ROUNDING = 1 / 12
-"""Variance of rounding to whole grey values."""
+ROUNDING = 1 / 12  # variance of rounding to whole grey values
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
 """Distance of pixels from the tag's inner cells, in σ of blur and pixel, and least width of the border's band, px."""
-CLEAR_BLURS = 1.5
-"""Distance of pixels from the pattern next to a crossing, in σ of blur and pixel."""
-SHADED_HALF_PX = 4
-"""Half the side of a window from which on grey values may change along it."""
+CLEAR_BLURS = 1.5  # distance of pixels from the pattern next to a crossing, in σ of blur and pixel
+SHADED_HALF_PX = 4  # half the side of a window from which on grey values may change along it
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
@@ -103,7 +93,6 @@ def corners_from_edges(
 def _told_by_lines(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area"
 ) -> list[tuple[Displacement, Displacement]]:
-    """Return what the lines between the cells of tags say about sampling, for each number of cells."""
     told, n = [], len(corners)
     dark, rise = np.moveaxis(area.levels.reshape(n, 4, 2), 2, 0)
     spread = np.where(area.settled, area.by_noise[:, 0, 0].reshape(n, 4), np.nan)
@@ -154,7 +143,6 @@ class _Lines:
 
 
 def _frame(corners: np.ndarray, cells: np.ndarray) -> _Edges:
-    """Return the edges from each corner to the next."""
     end = np.roll(corners, -1, axis=1)
     length = np.linalg.norm(end - corners, axis=2)
     along = (end - corners) / length[..., None]
@@ -189,7 +177,6 @@ def _profiles(grey: np.ndarray, frame: _Edges) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
-    """Fit straight lines by least squares, with removal of outliers."""
     keep = good
     for _ in range(CUT_ROUNDS):
         value, spread = _line(place, offset, keep)
@@ -271,7 +258,6 @@ class _Area:
 
 
 def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
-    """Return the lines that split the pixels into dark and bright areas as the image has them."""
     pixels = _pixels(grey, frame, rough)
     m = len(pixels.level)
     normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
@@ -320,10 +306,8 @@ def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
-    levels = value[:, [3, 5]]
-    return _Area(
-        offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], passed, told, smeared
-    )
+    blur, levels, by_sampling = value[:, 2], value[:, [3, 5]], (inverse @ pull)[:, :2]
+    return _Area(offset, slope, settled, blur, levels, factor, by_noise, by_sampling, passed, told, smeared)
 
 
 def _smear(normal: np.ndarray, blur: np.ndarray, good: np.ndarray) -> np.ndarray:
@@ -480,9 +464,8 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
         off = pixels - (start + value[:, :2])[:, None]
         distance, place = (np.einsum("nki,nei->enk", off, axes) for axes in (normal, direction))
-        (one, slope1, wide1), (two, slope2, wide2) = (
-            integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1)
-        )
+        steps = (integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1))
+        (one, slope1, wide1), (two, slope2, wide2) = steps
         # Where edges are not square, the pixel sees both at once (first term of the tetrachoric series).
         both = (normal[:, 0] * normal[:, 1]).sum(1) * (value[:, 4] + PIXEL_VARIANCE)
         cross = one * two + (1 - one) * (1 - two) + 2 * both[:, None] * slope1 * slope2
@@ -492,15 +475,10 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
             value[:, 5:] = solved(levels, weight, level)[0]
         rise = (shade @ value[:, 8:, None])[..., 0]
         first, second = rise * by_first, rise * by_second
-        design = np.concatenate(
-            [
-                -first[..., None] * normal[:, None, 0] - second[..., None] * normal[:, None, 1],
-                np.stack([-first * place[0], -second * place[1]], axis=-1),
-                (rise * ((2 * two - 1) * wide1 + (2 * one - 1) * wide2))[..., None],
-                levels,
-            ],
-            axis=2,
-        )
+        by_shift = -first[..., None] * normal[:, None, 0] - second[..., None] * normal[:, None, 1]
+        by_turns = np.stack([-first * place[0], -second * place[1]], axis=-1)
+        by_blur = rise * ((2 * two - 1) * wide1 + (2 * one - 1) * wide2)
+        design = np.concatenate([by_shift, by_turns, by_blur[..., None], levels], axis=2)
         residual = level - (levels @ value[:, 5:, None])[..., 0]
         change, inverse = solved(design, weight, residual)
         if k < CROSSING_STEPS:

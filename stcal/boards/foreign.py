@@ -10,10 +10,10 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, ConfigDict, Field
 
-from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
+from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign, FlatBoard
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
-from stcal.io.poses.rotations import of_quaternions
+from stcal.io.rotations import of_quaternions
 from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
 from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM
 
@@ -21,16 +21,14 @@ KEYS = ("tag_bundles", "standalone_tags")
 Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
-"""Number in a row of a chessboard. A grid with fewer inner corners is not recognised as a chessboard; fewer squares
-have all inner corners on one line."""
+"""Number in a row of a chessboard. Smaller grids are not recognised, or have all inner corners on one line."""
 FAMILY = "tag36h11"
 """The family where the file names none: settings.yaml of apriltag_ros does."""
 METRE_MM = 1000.0
 FLAT_MM, FLAT_RAD = 0.01, 1e-3
 """Largest deviation of tags from one plane: what a file rounds off."""
 CORNERS = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
-"""Corners of a tag of side 1 in its frame (X right, Y up), in the order of OpenCV, which draws tags of this family half
-a turn from AprilTag's own pictures."""
+"""Corners of a tag of side 1 (X right, Y up), in the order of OpenCV, which draws this family half a turn round."""
 UPRIGHT = np.roll(CORNERS, 2, axis=0)
 """The same of a tag that stands as OpenCV draws it, and of families that OpenCV lacks."""
 
@@ -104,7 +102,6 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _metres(value: float) -> float:
-    """Refuses what no hardware has."""
     least, most = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
     if not least <= value <= most:
         raise ValueError(f"{least:g} … {most:g} m needed: Kalibr's lengths are metres, not mm")
@@ -113,11 +110,9 @@ def _metres(value: float) -> float:
 
 LEAST_GAP = 0.1
 """Smallest gap between tags over their side that grids have: with less white about them tags are not found."""
-SAME_WITHIN = 1e-6
-"""Largest relative difference between the sides of a square."""
+SAME_WITHIN = 1e-6  # largest relative difference between the sides of a square
 KALIBR_FAMILY = "DICT_APRILTAG_36h11"
 KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
-
 Metres = Annotated[Positive, AfterValidator(_metres)]
 
 
@@ -146,19 +141,15 @@ class _CircleGrid(Strict):
     asymmetricGrid: bool
 
 
-def kalibr_board_of(
-    content: dict[str, Any], where: str
-) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
+def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
     """Return the board of a file of Kalibr; its circle grids do not state the radius, which images determine."""
     kind = content["target_type"]
     if kind == "aprilgrid":
         data = validated(content, _KalibrAprilGrid, where)
         available = count_of(KALIBR_FAMILY)
         if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
-            raise InputError(
-                "E-TAG-ID-RANGE",
-                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
-            )
+            fault = f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}"
+            raise InputError("E-TAG-ID-RANGE", f"{fault}; correct them")
         size = METRE_MM * data.tagSize
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
             raise InputError(
@@ -171,10 +162,8 @@ def kalibr_board_of(
         data = validated(content, _Checkerboard, where)
         across, down = data.colSpacingMeters, data.rowSpacingMeters
         if abs(across - down) > SAME_WITHIN * across:
-            raise InputError(
-                "E-BOARD-SPACING",
-                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same",
-            )
+            fault = f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}"
+            raise InputError("E-BOARD-SPACING", f"{fault}; squares needed")
         return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
     if kind == "circlegrid":
         data = validated(content, _CircleGrid, where)

@@ -16,16 +16,13 @@ from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 
-UNREFINED_PX = 0.5
-"""σ of a corner whose edges cannot be measured."""
-SATURATED = 254
-"""Smallest grey value (8 bit) of a pixel that may be saturated."""
+UNREFINED_PX = 0.5  # σ of a corner whose edges cannot be measured
+SATURATED = 254  # smallest grey value (8 bit) of a pixel that may be saturated
 EDGE_PX = 0.1
 """σ of the shift that all edges of a tag share, by a nonlinear response, stray light or ink."""
 SATURATED_EDGE_PX = 0.7
 """σ that saturation adds to this shift: an edge blurred by 0.7 px and clipped at half its height moves by 0.6 px."""
-SATURATION_POINTS = 8
-"""Number of points along each edge at which saturation is tested."""
+SATURATION_POINTS = 8  # number of points along each edge at which saturation is tested
 WHITE_PX = 3
 """Side of the window of the dilation, px, which separates black squares that meet at a blurred corner."""
 TOGETHER_PX, APART_PX = (5, 25), ((5,), (21,))
@@ -131,7 +128,6 @@ def _looks(grey: np.ndarray, joined: bool) -> Iterator[tuple[np.ndarray, int, fl
 
 
 def _inside(place: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if the middle of a tag (4, 2) lies inside another tag."""
     x, y = place.mean(0).tolist()
     return cv2.pointPolygonTest(other, (x, y), False) > 0
 
@@ -208,8 +204,7 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
 def _refined(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return refined corners and covariances where all edges are visible, and the way of motion during the exposure;
-    ``white`` : (n,) white inside the edges."""
+    """Return corners and covariances, refined where all edges are seen, and motion; ``white`` : (n,) white inside."""
     if white.any():
         refined, covariance, smears = np.array(corners), np.zeros((len(corners), 8, 8)), [0.0, 0.0]
         for i, (colour, picture) in enumerate(((~white, grey), (white, 255 - grey))):
@@ -223,8 +218,7 @@ def _refined(
     return np.where(good, measured, corners), np.where(good, joint, UNREFINED_PX**2 * np.eye(8)), smear_px
 
 
-KALIBR_BITS, USUAL_BITS = 2, 1
-"""Widths of the black border of Kalibr's tags and of usual ones, cells."""
+KALIBR_BITS, USUAL_BITS = 2, 1  # widths of the black border of Kalibr's tags and of usual ones, cells
 TELLING_SHARE = 0.5
 """Smallest share of the tags read with a border of one cell that a border of two cells must read."""
 ENOUGH_SHARE = 0.5
@@ -293,7 +287,6 @@ def _off(view: BoardView, camera: Camera) -> np.ndarray:
 
 
 def _why_off(view: BoardView, board: AprilGridDesign, camera: Camera) -> str:
-    """Return why the tags do not fit the board: rotated printing, or another arrangement."""
     turned = replace(board, upright=not board.upright)
     if _off(replace(view, xyz_board=np.pad(turned.xy_mm()[view.ids], ((0, 0), (0, 1)))), camera).max() <= MAX_OFF_SHARE:
         value = "true" if turned.upright else "false"

@@ -1,32 +1,60 @@
-"""Files of targets, whose faces have circles, boards or tags: reader that names every mistake, and writer."""
+"""Files of targets with faces of circles, boards or tags, and of several boards in one frame: readers and writers."""
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_designs import TAG_SIGMA_MM, AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
-from stcal.boards.board_file import INIT, TYPES, RimHeight, flat_board, keys_of, number, tag_rows
-from stcal.design import POINT_RADIUS_MM, FaceDesign, KnownDistance, Polarity, TargetDesign, reference_target
+from stcal.boards.board_designs import (
+    TAG_SIGMA_MM,
+    AprilGridDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+    FlatBoard,
+    TagLayout,
+)
+from stcal.boards.board_file import (
+    INIT,
+    SET,
+    TYPES,
+    RimHeight,
+    board_content,
+    design_of,
+    flat_board,
+    keys_of,
+    load_flat_board,
+    number,
+    tag_rows,
+)
+from stcal.design import (
+    POINT_RADIUS_MM,
+    BoardDesign,
+    FaceDesign,
+    KnownDistance,
+    Polarity,
+    TargetDesign,
+    reference_target,
+)
 from stcal.errors import InputError, named
 from stcal.geometry.plane import inside
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
-from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string
+from stcal.io.toml import Finite, PoseEntry, Positive, Sized, Strict, load_toml, toml_string, validated
 from stcal.lengths import radius, stated_unusual
 
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
 """Form of the entry in which a face of a target file may state its rough pose."""
 MIN_DIRECTION = 1e-6
-MAX_SKEW_DEG = 5.0
-"""Largest deviation from a right angle between X and normal of a rough pose."""
+MAX_SKEW_DEG = 5.0  # largest deviation from a right angle between X and normal of a rough pose
 INWARDS = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 """Turns a frame whose Z points out of a body into that of a board or tag, whose Z points into it."""
-
 Vector = tuple[Finite, Finite, Finite]
 Outline = Annotated[list[tuple[Finite, Finite]], Field(min_length=3, max_length=1000)]
 Name = Annotated[
@@ -45,8 +73,6 @@ class _CircleFile(Strict):
 
 
 class _RoughPoseFile(Strict):
-    """Rough pose of a face's drawing, in a frame that all faces share."""
-
     origin_mm: Vector
     x: Vector
     normal: Vector
@@ -64,8 +90,6 @@ class _CirclesFile(Strict):
 
 
 class _PrintedFile(Strict):
-    """A face with a board or tags; their keys are those of a board file, and of a tag in a layout."""
-
     id: Name
     rough_pose: _RoughPoseFile | None = None
     outline_mm: Outline | None = None
@@ -101,7 +125,6 @@ class _TargetFile(Sized):
     @model_validator(mode="before")
     @classmethod
     def _without_circles(cls, content: Any) -> Any:
-        """Adds a polarity where no face has circles that could have one."""
         faces = content.get("face") if isinstance(content, dict) else None
         if isinstance(faces, list) and faces and all(_kind_of_face(face) == "<printed>" for face in faces):
             return {"polarity": "bright"} | content
@@ -109,7 +132,7 @@ class _TargetFile(Sized):
 
 
 def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
-    """Read ``target.toml`` with faces of circles, boards and tags.
+    """Return the target of ``target.toml``: faces of circles, boards and tags in their own frames, mm.
 
     Parameters
     ----------
@@ -118,15 +141,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
     printed : bool
         False if faces with a board or tags are to be refused.
 
-    Returns
-    -------
-    TargetDesign
-        Faces in their own frames, mm.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or is no design, or has a tag on two faces; the message names file, place and reason.
+    Raises InputError: the file cannot be read or is no design, or has a tag on two faces; the message names file, place
+    and reason.
     """
     data = load_toml(path, _TargetFile, "target file", INIT)
     where = f"target file {path}"
@@ -139,11 +155,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
         elif printed:
             faces.append(_of_print(face, data.unusual_size, of_face))
         else:
-            raise InputError(
-                "E-TARGET-PRINTED",
-                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect`, "
-                "`measure` and `simulate` do",
-            )
+            fault = f"{of_face}: a board or tags, which this command does not take yet"
+            raise InputError("E-TARGET-PRINTED", f"{fault}; `stcal-sfm run`, `detect`, `measure` and `simulate` do")
     with named(where, f"target {data.name}"):
         target = TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size)
     known = {str(label): label for face in faces for label in face.labels()}
@@ -168,14 +181,10 @@ def target_of(given: str | Path | TargetDesign | None, printed: bool = True) -> 
 
 
 def _distance(entry: _ScaleFile, known: dict[str, Any], where: str) -> KnownDistance:
-    """Return the known distance of an entry between points of the target, ``known`` by their names."""
     for name in (entry.first, entry.second):
         if name not in known:
-            raise InputError(
-                "E-TARGET-SCALE",
-                f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target; points are "
-                f"{', '.join(list(known)[:4])}, …",
-            )
+            fault = f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target"
+            raise InputError("E-TARGET-SCALE", f"{fault}; points are {', '.join(list(known)[:4])}, …")
     if entry.first == entry.second:
         raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")
     return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm, entry.drawn)
@@ -207,22 +216,17 @@ def _of_circles(face: _CirclesFile, where: str) -> FaceDesign:
 
 
 def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
-    """Refuse circles that extend beyond the outline of their plate."""
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
-        raise InputError(
-            "E-TARGET-OUTLINE",
-            f"{where}: outline_mm has the same corner twice; corners in order around the plate needed",
-        )
+        fault = f"{where}: outline_mm has the same corner twice"
+        raise InputError("E-TARGET-OUTLINE", f"{fault}; each once, in order, needed")
     from_corner = face.xy_mm[:, None] - outline
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
     gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - face.radius_mm
     for i in np.flatnonzero(~inside(outline, face.xy_mm) | (gap < 0))[:1]:
-        raise InputError(
-            "E-TARGET-OUTLINE",
-            f"{where}: circle {face.ids[i]} reaches beyond outline_mm; corners in order around all circles needed",
-        )
+        fault = f"{where}: circle {face.ids[i]} reaches beyond outline_mm"
+        raise InputError("E-TARGET-OUTLINE", f"{fault}; corners in order around all circles needed")
 
 
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
@@ -230,9 +234,8 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     x, z = np.array(pose.x), np.array(pose.normal)
     for key, direction in (("x", x), ("normal", z)):
         if (length := float(np.linalg.norm(direction))) < MIN_DIRECTION:
-            raise InputError(
-                "E-TARGET-ROUGH-POSE", f"{where}: rough_pose: {key} {direction.tolist()}; a direction needed, not zero"
-            )
+            fault = f"{where}: rough_pose: {key} {direction.tolist()}"
+            raise InputError("E-TARGET-ROUGH-POSE", f"{fault}; a direction needed")
         direction /= length
     angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))
     if abs(angle - 90) > MAX_SKEW_DEG:
@@ -393,3 +396,104 @@ def save_target(path: str | Path, target: TargetDesign) -> None:
     text = target_toml(target)
     save(Path(path), text)
     require_same(path, lambda: target_toml(load_target(path)), text)
+
+
+MOST_BOARDS = 100
+
+
+class _BoardsFile(Strict):
+    type: Literal["boards"]
+    board: list[dict[str, Any]] = Field(min_length=1, max_length=MOST_BOARDS)
+
+
+class _Place(PoseEntry):
+    """The pose of a board: position and quaternion, or ``rpy_deg`` about the fixed axes X, Y, Z; or a 4×4 matrix."""
+
+    rpy_deg: list[Finite] | None = Field(default=None, min_length=3, max_length=3)
+    common_from_board: list[list[Finite]] | None = None
+
+    def common(self, where: str) -> Rigid:
+        """Return common_from_board."""
+        given_keys = self.model_fields_set
+        if self.common_from_board is not None:
+            if further := given_keys - {"common_from_board"}:
+                conflict = f"{where}: common_from_board and {min(further)}; give one of them"
+                raise InputError("E-BOARD-KEY-CONFLICT", conflict)
+            if [len(row) for row in self.common_from_board] != [4] * 4:
+                raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: 4 rows of 4 numbers needed")
+            try:
+                return Rigid.from_matrix(self.common_from_board)
+            except InputError as error:
+                raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: {error}") from error
+        if self.rpy_deg is None:
+            return self.rigid(where)
+        if given_keys & {"qw", "qx", "qy", "qz"}:
+            raise InputError("E-BOARD-KEY-CONFLICT", f"{where}: rpy_deg and a quaternion; one of them needed")
+        turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True)
+        return Rigid(turn.as_matrix(), [self.x_mm, self.y_mm, self.z_mm])
+
+
+def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
+    """Read a board file of any kind, of one board or several (form: ``data_layout.md``)."""
+    content = board_content(path)
+    if content is None or content.get("type") != SET:
+        return design_of(path, content)
+    where = f"board file {path}"
+    names, boards, places = [], [], []
+    for count, entry in enumerate(validated(content, _BoardsFile, where).board, 1):
+        entry_place = f"{where}: board {count}"
+        place = {key: value for key, value in entry.items() if key in _Place.model_fields}
+        entry_board = {key: value for key, value in entry.items() if key not in place}
+        places.append(validated(place, _Place, entry_place).common(entry_place))
+        boards.append(_board(Path(path), entry_board, entry_place))
+        names.append(f"board {count}" + (f" ({Path(entry_board['file']).name})" if "file" in entry_board else ""))
+    board_set = BoardSet(tuple(names), tuple(boards), tuple(places))
+    _require_told_apart(board_set, where)
+    return board_set
+
+
+def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
+    if "file" not in entry:
+        return flat_board(entry, where)
+    if not isinstance(entry["file"], str):
+        raise InputError("E-BOARD-FILE-KEY", f"{where}: file: a string needed")
+    if extra := sorted(set(entry) - {"file"}):
+        beside = f"{where}: {', '.join(extra)} beside file; the board's file says what the board is"
+        raise InputError("E-BOARD-KEY-CONFLICT", beside)
+    with named(where):
+        return load_flat_board(path.parent / entry["file"])
+
+
+def _require_told_apart(found: BoardSet, where: str) -> None:
+    for name, board in zip(found.names, found.boards, strict=True):
+        if not board.unique() if isinstance(board, BoardDesign) else board.symmetries():
+            raise InputError(
+                "E-BOARD-AMBIGUOUS",
+                f"{where}: {name} looks the same when turned, so that its points cannot be numbered in the common "
+                "frame; a chessboard of an odd and an even side, a larger corner dot, or tags needed",
+            )
+    for (first_name, first), (second_name, second) in combinations(zip(found.names, found.boards, strict=True), 2):
+        if reason := _alike(first, second):
+            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {first_name} and {second_name} look alike: {reason}")
+
+
+def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:
+    if (colour := getattr(first, "polarity", "")) and colour == getattr(second, "polarity", ""):
+        return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
+    for whole, part in ((first, second), (second, first)):
+        if not isinstance(part, ChessboardDesign) or not (inner := _inner(whole)):
+            continue
+        if all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True)):
+            return (
+                f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
+                "and fewer columns, or tags, needed"
+            )
+    if common := sorted(set(tags_on(first)) & set(tags_on(second))):
+        return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
+    return ""
+
+
+def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
+    if isinstance(board, ChessboardDesign):
+        return board.rows, board.columns
+    return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None

@@ -25,11 +25,9 @@ def main_sfm() -> None:
 
 
 def _run(name: str) -> None:
-    """Runs a program. ``--version`` alone is answered at once, before the commands are loaded.
-
-    Signals after the end of the program do not change its exit code: Python removes handlers while it ends, and a
-    signal would then end a command as if it had failed, although its results are in place.
-    """
+    """Runs a program. ``--version`` alone is answered at once, before the commands are loaded. Signals after the end
+    of the program do not change its exit code: Python removes handlers while it ends, and a signal would then end a
+    command as if it had failed, although its results are in place."""
     _replace_closed_streams()
     try:
         if sys.argv[1:] == ["--version"]:
@@ -44,8 +42,7 @@ def _run(name: str) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Opens the null device in place of closed standard streams (`>&-`), whose numbers the first files would take, so
-    that C libraries print into these."""
+    """Opens the null device in place of closed standard streams (`>&-`), into which C libraries would print."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -99,7 +96,6 @@ def _answer() -> None:
 
 
 def _end(number: int, _) -> None:
-    """Ends the process at a signal while the commands are loaded."""
     word, code = LOADING[signal.Signals(number)]
     os.write(sys.stderr.fileno(), f"{word}\n".encode())
     os._exit(code)

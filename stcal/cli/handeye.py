@@ -166,7 +166,7 @@ def handeye(
     from stcal.handeye.report.outcome import judged
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
-    from stcal.io.poses.programs import messages
+    from stcal.io.static_transforms import messages
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye_inputs import without_flips
     from stcal.workflows.handeye_run import ALL, calibrate_handeye

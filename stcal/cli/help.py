@@ -13,8 +13,6 @@ PLAIN: dict[str, Any] = {
     "no_args_is_help": True,
 }
 """Settings of every group of commands."""
-
-
 PANELS = {
     "Input": "setup dry_run",
     "Method": "",
@@ -106,8 +104,7 @@ def group(name: str, text: str) -> typer.Typer:
 
 
 class Commands(TyperGroup):
-    """A group of commands, whose names may have two words. Its help has those that belong together, each with its
-    sentence."""
+    """A group of commands, whose names may have two words; its help has those that belong together."""
 
     def resolve_command(self, ctx, args):
         """Resolves ``handeye plan`` before ``handeye``, whose first argument is a file."""
@@ -172,7 +169,6 @@ EXAMPLES = {
     ),
 }
 """Arguments of typical calls of each command, by its words."""
-
 FIRST_WEEK = {
     "sfm run": "out camera target board refine_camera board_only exclude every expect_faces verbose",
     "sfm detect": "camera out target board exclude min_diameter max_diameter workers verbose",
@@ -194,7 +190,6 @@ FIRST_WEEK = {
 }
 FIRST_WEEK = {words: tuple(names.split()) for words, names in FIRST_WEEK.items()}
 """Parameters that `--help` shows of commands with more than a dozen options, in their order."""
-
 GROUPS = {
     "stcal": {
         "Stereo targets": ("sfm",),

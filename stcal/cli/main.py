@@ -16,31 +16,28 @@ import typer
 from typer._completion_classes import completion_init
 
 import stcal
-from stcal.cli import cameras, handeye, locate, register, robot, sfm
+from stcal.cli import handeye, instruments, robot, sfm
 from stcal.cli.help import group
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
 from stcal.errors import NO_MEMORY, InputError, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
-AGAIN_S = 0.02
-"""Time after which a signal is sent again, s."""
+AGAIN_S = 0.02  # time after which a signal is sent again, s
 MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy": "scipy"}
 """Module of each library, by name."""
-RESUMED = {"run", "detect"}
-"""Commands that keep finished detections when they are interrupted."""
+RESUMED = {"run", "detect"}  # commands that keep finished detections when they are interrupted
 # The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
-
 app = group("stcal", "Calibrate stereo targets from photographs of a single camera, and measure with them.")
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
-app.add_typer(locate.app, name="locate")
-app.add_typer(cameras.app, name="camera")
+app.add_typer(instruments.app, name="locate")
+app.add_typer(instruments.camera_app, name="camera")
 app.add_typer(handeye.app)
-app.command("register")(register.register)
+app.command("register")(instruments.register)
 protect_outputs(app)
 
 
@@ -64,28 +61,20 @@ def _version(
 
 
 def environment() -> dict[str, str]:
-    """Returns versions by name: stcal, Python, system, libraries or that one is missing, the native COLMAP on the
-    PATH."""
-    version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
-    return version_of | {name: _library(module) for name, module in LIBRARIES.items()} | {"native colmap": _native()}
-
-
-def _library(module: str) -> str:
-    try:
-        return str(import_module(module).__version__)
-    except Exception as error:  # raised by a broken installation, which this report is to reveal
-        return f"does not load: {error}"
-
-
-def _native() -> str:
+    """Returns versions by name: stcal, Python, system, libraries, and the native COLMAP on the PATH."""
     from stcal.sfm.interop.native import find_colmap
 
-    if shutil.which("colmap") is None:
-        return "not found"
+    version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
+    for name, module in LIBRARIES.items():
+        try:
+            version_of[name] = str(import_module(module).__version__)
+        except Exception as error:  # raised by a broken installation, which this report is to reveal
+            version_of[name] = f"does not load: {error}"
     try:
-        return find_colmap().version
+        version_of["native colmap"] = find_colmap().version if shutil.which("colmap") else "not found"
     except InputError as error:
-        return str(error)
+        version_of["native colmap"] = str(error)
+    return version_of
 
 
 def main() -> None:
@@ -159,16 +148,11 @@ def again(lost: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(lost)
         return
     signal.signal(signal.SIGTERM, _terminate)
-    threading.Timer(AGAIN_S, _send, (number,)).start()
-
-
-def _send(number: int) -> None:
-    """Sends this process a signal, to its main thread where the system can: that ends what it waits for."""
     main_thread = threading.main_thread().ident
     if sys.platform == "win32" or main_thread is None:
-        signal.raise_signal(number)
-    else:
-        signal.pthread_kill(main_thread, number)
+        threading.Timer(AGAIN_S, signal.raise_signal, (number,)).start()
+    else:  # to the main thread: that ends what it waits for
+        threading.Timer(AGAIN_S, signal.pthread_kill, (main_thread, number)).start()
 
 
 class _Terminated(BaseException):
@@ -176,7 +160,6 @@ class _Terminated(BaseException):
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    """Prints the error as one line of printable characters, and ends with the exit code."""
     line = " ".join(printable(message).split())
     half = (MESSAGE_CHARACTERS - len("error:  … ")) // 2
     if len(line) > 2 * half:

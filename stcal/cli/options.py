@@ -32,12 +32,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Opt:
-    """An option: what its help text and its parameter do not state.
-
-    ``name`` : its names, ``--held-out`` for ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes``
-    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value in the help text, and
-    variable that sets it.
-    """
+    """An option: what its help text and its parameter do not state. ``name`` : its names, ``--held-out`` for
+    ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is
+    written; ``metavar``, ``envvar`` : word for the value, and variable that sets it."""
 
     name: str = ""
     min: float | None = None
@@ -53,22 +50,15 @@ class Opt:
         return typer.Option(*names, help=text, min=self.min, max=self.max, **more)
 
 
-WRITES = Opt(writes=True)
-"""An option with the name of a file that is written."""
+WRITES = Opt(writes=True)  # an option with the name of a file that is written
 
 
-@dataclass(frozen=True, slots=True)
-class Arg:
-    """An argument: a parameter without the name of an option; fields as of :class:`Opt`."""
+class Arg(Opt):
+    """An argument, a parameter without the name of an option: ``name`` is the word for its value."""
 
-    metavar: str | None = None
-    min: float | None = None
-    max: float | None = None
-    writes: bool = False
-
-    def info(self, _: str, text: str) -> Any:
+    def info(self, parameter: str, text: str) -> Any:
         """Returns Typer's form of the argument."""
-        return typer.Argument(metavar=self.metavar, help=text, min=self.min, max=self.max, writable=self.writes)
+        return typer.Argument(metavar=self.name or None, help=text, min=self.min, max=self.max, writable=self.writes)
 
 
 def declared(parameter: inspect.Parameter) -> inspect.Parameter:
@@ -117,18 +107,14 @@ Quiet = Annotated[bool, "Print only warnings and errors, and a verdict that is n
 Verbose = Annotated[bool, "Print more: steps, times, and what is found in images.", Opt("--verbose -v")]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
-WRITE_NOTHING = ("serve", "live", "dry_run")
-"""Options with which no output is written."""
+WRITE_NOTHING = ("serve", "live", "dry_run")  # options with which no output is written
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command may replace existing outputs."""
 MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
-
 Scheduler = Annotated[str | None, "Send the images to the Dask scheduler at this address, tcp://host:8786."]
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
-
-
 Quaternions = Annotated[
     Literal["wxyz", "xyzw"], "Read quaternions by the names of their columns, or in their order as x, y, z, w (xyzw)."
 ]
@@ -144,8 +130,6 @@ MinDiameter = Annotated[
     float | None, "Ignore circles smaller than this, px; 4.5, 9 over 8 megapixels, if not given.", Opt(min=4, max=1e6)
 ]
 MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8, max=1e6)]
-
-
 FirstTable = Annotated[Path | None, "Read rows from this file (CSV), and join those of --b.", Opt("--a")]
 SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
@@ -194,7 +178,7 @@ def several_tables(
 
 def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
-    from stcal.io.poses.programs import require_form
+    from stcal.io.static_transforms import require_form
 
     exports = []
     for word in words:
@@ -226,25 +210,27 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
     """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
     command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
     others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
-    said = f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them"
-    _require(strict, said, report, bool(failed), verdict or f"failed: {', '.join(failed)}" * bool(failed))
+    said = [f"--strict: failed: {', '.join(failed[:2])}{others}"] * bool(failed)
+    require_usable(strict, said, report, verdict or f"failed: {', '.join(failed)}" * bool(failed), remedy="")
 
 
 def require_usable(
-    strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "", but: str = "do not use them"
+    strict: bool,
+    reasons: Sequence[str],
+    page: Path | None = None,
+    verdict: str = "",
+    but: str = "do not use them",
+    remedy: str = "; --no-strict ends with 0",
 ) -> None:
     """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given;
-    otherwise a quiet command writes ``verdict``, or the reasons. ``but`` : ends what is said of the results, which are
-    written."""
-    said = f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0"
-    _require(strict, said, page, bool(reasons), verdict or "; ".join(reasons))
-
-
-def _require(strict: bool, said: str, page: Path | None, failed: bool, verdict: str) -> None:
-    if strict and failed:
-        raise ChecksFailed("E-CHECKS-FAILED", said + (f"; see {page}" if page else ""))
-    if verdict:
-        warn_if_quiet(verdict)
+    otherwise a quiet command writes ``verdict``, or the reasons. ``but``, ``remedy`` : end the message, after that the
+    results are written."""
+    said = "; ".join(reasons)
+    if strict and reasons:
+        see = f"; see {page}" if page else ""
+        raise ChecksFailed("E-CHECKS-FAILED", f"{said}; results are written, {but}{remedy}{see}")
+    if verdict or said:
+        warn_if_quiet(verdict or said)
 
 
 def load_ahead(workers: int | None) -> None:
@@ -260,7 +246,7 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
 
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(
-            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g} px, more than --min-diameter {min_diameter:g} px needed"
+            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g}: over --min-diameter {min_diameter:g} needed"
         )
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
@@ -274,11 +260,9 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
 
 
 def protect_outputs(application: typer.Typer) -> None:
-    """Prevents the commands of an application from overwriting their inputs, or other files without a request.
-
-    Every path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``,
-    all of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output.
-    """
+    """Prevents the commands of an application from overwriting their inputs, or other files without a request. Every
+    path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``, all
+    of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output."""
     for command in application.registered_commands:
         if command.callback is not None:
             command.callback, command.cls = _protected(command.callback), Command
@@ -288,8 +272,7 @@ def protect_outputs(application: typer.Typer) -> None:
 
 
 def _grouped(command: Callable) -> Callable:
-    """Returns the command with the options of each group, a dataclass, as parameters. An instance as a group's default
-    has their defaults."""
+    """Returns the command with the options of each group, a dataclass, as parameters, and an instance's defaults."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, type] = {
         name: each.annotation
@@ -309,7 +292,7 @@ def _grouped(command: Callable) -> Callable:
     @wraps(command)
     def together(**given):
         made = {
-            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)}) for name, kind in groups.items()
+            name: kind(**{each.name: given.pop(each.name) for each in fields(kind)}) for name, kind in groups.items()
         }
         return command(**given, **made)
 
@@ -331,37 +314,22 @@ def _protected(command: Callable) -> Callable:
     outputs = {name for name, info in infos.items() if info.writable}
 
     @wraps(command)
-    def checked(
-        overwrite: bool = False,
-        quiet: bool = False,
-        verbose: bool = False,
-        camera_name: str = "",
-        **given,
-    ):
-        paths = [
-            (name, path)
-            for name, value in given.items()
-            for path in (value if isinstance(value, list | tuple) else [value])
-            if isinstance(path, Path)
-        ]
-        written, read = (
-            [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
-        )
+    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, camera_name: str = "", **given):
+        values = {name: value if isinstance(value, list | tuple) else [value] for name, value in given.items()}
+        paths = [(name, path) for name, several in values.items() for path in several if isinstance(path, Path)]
+        written, read = ([(words[n], p) for n, p in paths if (n in outputs) is out] for out in (True, False))
         exports = (word.partition("=")[2] for word in given.get("export") or ())
         written += [("--export", Path(path)) for path in exports if path]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":
-                raise InputError(
-                    "E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give the name of a file"
-                )
+                raise InputError("E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give a file")
         written = [each for each in written if each[1] != STANDARD_OUTPUT]
         for option, path in written:
             if option == "--report" and path.suffix.lower() == ".pdf":
                 also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
-                raise InputError(
-                    "E-OUTPUT-SUFFIX", f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}"
-                )
+                fault = f"--report {path}: a page of HTML"
+                raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {path.with_suffix('.html')}{also}")
         keep_apart(written, read)
         token = _replacing.set(overwrite)
         try:
@@ -422,8 +390,7 @@ def designs_told(
 
     assumed = []
     if target is not None:
-        design = target_of(target)
-        print_each("note", likeness_notes(design))
+        print_each("note", likeness_notes(design := target_of(target)))
         with_board = with_board and not design.has_scale
     elif with_target:
         faces = reference_target().faces

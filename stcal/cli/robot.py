@@ -121,9 +121,7 @@ def _is_xml(path: Path) -> bool:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
 
 
-def init(
-    file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
-) -> None:
+def init(file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml")) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.robot_model import mh80
 
@@ -178,7 +176,6 @@ def axes(
 
 
 def _length(text: str, data: "Measurements") -> float | None:
-    """Returns the distance of virtual reflectors, mm; None for positions alone."""
     from stcal.robot.axes.sweeps import length_of
 
     if text in ("auto", "off"):
@@ -189,8 +186,7 @@ def _length(text: str, data: "Measurements") -> float | None:
         raise InputError("E-OPTION-VALUE", f"--orientations {text}: a length in mm, auto or off needed") from error
 
 
-Model = Literal["rigid", "elastic", "auto"]
-"""Model of the arm."""
+Model = Literal["rigid", "elastic", "auto"]  # model of the arm
 
 
 def identify(
@@ -368,9 +364,7 @@ def compensate(
     write_if(json_file, lambda: compensation.CompensationFile.model_validate(result))
     write_if(report, document.page)
     if not result.found.usable.any():
-        raise DegenerateError(
-            "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"
-        )
+        raise DegenerateError("E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see above")
 
 
 def design(

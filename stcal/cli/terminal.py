@@ -24,15 +24,11 @@ from stcal.io import files
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-LINE_EVERY_S = 2.0
-"""Longest silence of a command at work, s."""
-LEFT_FROM_S = 2.0
-"""Shortest remaining time that a stage shows, s."""
-STANDARD_OUTPUT = Path("-")
-"""Name that means standard output instead of a JSON file."""
+LINE_EVERY_S = 2.0  # longest silence of a command at work, s
+LEFT_FROM_S = 2.0  # shortest remaining time that a stage shows, s
+STANDARD_OUTPUT = Path("-")  # name that means standard output instead of a JSON file
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
-
 _quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
 _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
 _beating: ContextVar["_Beat | None"] = ContextVar("_beating", default=None)
@@ -42,16 +38,16 @@ _beating: ContextVar["_Beat | None"] = ContextVar("_beating", default=None)
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
     """Sets the verbosity within the context: warnings and errors only, or more than usual."""
     beat = _Beat()
-    tokens = _quiet.set(quiet), _verbose.set(verbose), _beating.set(beat)
+    given = ((_quiet, quiet), (_verbose, verbose), (_beating, beat))
+    tokens = [(choice, choice.set(value)) for choice, value in given]
     if not quiet:
         beat.start()
     try:
         yield
     finally:
         beat.over.set()
-        _beating.reset(tokens[2])
-        _quiet.reset(tokens[0])
-        _verbose.reset(tokens[1])
+        for choice, token in tokens:
+            choice.reset(token)
 
 
 def verbose() -> bool:
@@ -81,8 +77,7 @@ class _Beat(threading.Thread):
 
 
 class StageProgress:
-    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else plain lines, or
-    quiet."""
+    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else lines, or quiet."""
 
     def __init__(self):
         self.bar, self.beat = None, _beating.get() or _Beat()
@@ -137,13 +132,11 @@ def time_left(taken_s: float, done: int, total: int) -> str:
 
 def printable(text: str) -> str:
     """Returns the text with white space as a space, and other unprintable characters as question marks."""
-    return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
 
+    def shown(c: str) -> str:
+        return c if c.isprintable() or c == "\n" or unicodedata.category(c) == "Zs" else " " if c.isspace() else "?"
 
-def _instead(character: str) -> str:
-    if unicodedata.category(character) == "Zs":
-        return character
-    return " " if character.isspace() else "?"
+    return "".join(map(shown, text))
 
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
@@ -166,8 +159,7 @@ def said_apart() -> Iterator[None]:
 
 @contextmanager
 def printed_last() -> Iterator[None]:
-    """Holds back what is printed within the context, in which files are written: a reader such as ``head`` may end the
-    command as soon as it has its lines."""
+    """Holds back what is printed while files are written: ``head`` ends a command as soon as it has its lines."""
     held = StringIO()
     try:
         with redirect_stdout(held):
@@ -190,11 +182,17 @@ def write(path: Path, content, said: str = "written") -> None:
 
 
 def write_out(text: str) -> None:
-    """Writes JSON to standard output, which is reserved for it."""
+    """Writes JSON to standard output, which is reserved for it, with ``\\u....`` for characters that a terminal would
+    execute, or that its encoding lacks."""
     taker = _taker.get() or sys.stdout
     if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
         raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
-    taker.write(_escaped(text, taker.encoding or "ascii"))
+    is_utf8 = (taker.encoding or "ascii").lower().replace("-", "") == "utf8"
+
+    def escaped(c: re.Match) -> str:
+        return c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1]
+
+    taker.write(re.sub(r"[^ -~\n]", escaped, text))
     taker.flush()
 
 
@@ -202,12 +200,6 @@ def write_if(path: Path | None, content: Callable[[], object], said: str = "writ
     """Writes the result of ``content`` if a path is given; otherwise ``content`` is not called."""
     if path:
         write(path, content(), said)
-
-
-def _escaped(text: str, encoding: str) -> str:
-    """Returns JSON with ``\\u....`` for characters that a terminal would execute, or that the encoding lacks."""
-    is_utf8 = encoding.lower().replace("-", "") == "utf8"
-    return re.sub(r"[^ -~\n]", lambda c: c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
 
 
 def warn(line: object) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 
 from stcal.boards.board_designs import BoardSet, FlatBoard
 from stcal.boards.board_file import board_content
-from stcal.boards.several import load_boards
-from stcal.boards.target_file import load_target
+from stcal.boards.target_file import load_boards, load_target
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.net import net_part
 from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, corners_of, parts_of, said_mm

@@ -12,9 +12,11 @@ from stcal.boards.board_designs import (
     BoardSet,
     ChessboardDesign,
     FlatBoard,
+    SquaresOrTags,
     TagLayout,
+    black_areas,
+    clear_mm,
 )
-from stcal.boards.cells import SquaresOrTags, black_areas, clear_mm
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.geometry.rigid import Rigid
 

@@ -1,8 +1,9 @@
-"""Read-only arrays of a checked shape, for the fields of the package's frozen dataclasses."""
+"""Read-only arrays of a checked shape, for the fields of frozen dataclasses; and the only check of covariances from
+outside."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache, wraps
 from inspect import signature
 from numbers import Integral, Real
@@ -15,7 +16,6 @@ from numpy.typing import ArrayLike, DTypeLike
 from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
-
 LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
@@ -23,12 +23,10 @@ MYPY = False
 if TYPE_CHECKING and not MYPY:
 
     class Array:
-        """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`.
-
-        To pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
+        """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`. To
+        pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
         ``np.ndarray``. At run time, and to mypy, it is ``np.ndarray``. Only for fields; an optional one is
-        ``np.ndarray | None``.
-        """
+        ``np.ndarray | None``."""
 
         def __get__(self, instance: object, owner: Any) -> np.ndarray: ...
         def __set__(self, instance: object, value: ArrayLike) -> None: ...
@@ -70,8 +68,7 @@ def _same(one: Any, two: Any) -> bool:
 
 
 class Brief(ByValue):
-    """Base of results, made with ``@dataclass(eq=False, repr=False)``, that show plain values, notes, and the size of
-    everything else in one line."""
+    """Base of results (``@dataclass(eq=False, repr=False)``) that show values, notes, and sizes in one line."""
 
     __slots__ = ()
 
@@ -142,7 +139,6 @@ PLAIN: dict[Any, Rule] = {
 
 
 def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None) -> None:
-    """Refuse a value that is not of its type, by the rule and the hint of it."""
     if known is None or known[0][0](value):
         return
     words, hint = known[0][1], known[1]
@@ -154,19 +150,14 @@ def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None
 
 @lru_cache
 def _rules(kind: type) -> dict[str, tuple[Rule, Any]]:
-    """Return the rules and hints of a dataclass's fields."""
     hints = get_type_hints(kind)
-    ends = {
-        each.name: isinstance(each.default, float) and math.isinf(each.default) for each in fields(kind) if each.init
-    }
+    ends = {e.name: isinstance(e.default, float) and math.isinf(e.default) for e in fields(kind) if e.init}
     return {name: (rule, hints[name]) for name, end in ends.items() if (rule := _rule(hints[name], end))}
 
 
 def require_fields(instance: object, what: str, **least: float) -> None:
-    """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``.
-
-    Numbers must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`.
-    """
+    """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``. Numbers
+    must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`."""
     for name, known in _rules(type(instance)).items():
         value = getattr(instance, name)
         _require(what, name, value, known)
@@ -203,11 +194,7 @@ def _holds_text(values: object) -> bool:
 
 
 def frozen(
-    values: ArrayLike,
-    shape: Shape | None = None,
-    what: str = "array",
-    dtype: DTypeLike = float,
-    finite: bool = True,
+    values: ArrayLike, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float, finite: bool = True
 ) -> np.ndarray:
     """Return a read-only copy of values of a shape, in which ``None`` admits any length; ``what`` : their name in
     messages; ``finite`` : whether NaN is refused, which else stands for what is not known."""
@@ -233,9 +220,7 @@ def _as_array(values: ArrayLike, shape: Shape | None, what: str, dtype: DTypeLik
     try:
         array = np.array(values)
     except ValueError as error:
-        raise InputError(
-            "E-ARRAY-SHAPE", f"{what}: rows of different lengths; {shape or 'equal ones'} needed"
-        ) from error
+        raise InputError("E-ARRAY-SHAPE", f"{what}: rows of different lengths; {shape or 'equal'} needed") from error
     if array.dtype.kind not in "biuf" and dtype is not object and array.size:
         raise InputError("E-ARRAY-TYPE", f"{what}: {array.dtype} values; real numbers needed")
     if array.dtype.kind == "f" and np.dtype(dtype).kind in "iu" and (array != np.rint(array)).any():
@@ -253,3 +238,101 @@ def freeze(
 def rms(values: np.ndarray) -> float:
     """Return the root of the mean square of all values."""
     return float(np.sqrt((values**2).mean()))
+
+
+ROUNDING = 1e-5
+"""Tolerance of a correlation per row of its matrix: files state six digits, so that 1.00000 may be off by 5e-6."""
+LARGEST = 1e24
+"""Largest variance in any unit: a σ of 1e12 exceeds anything that is measured."""
+TINY = 1e-300  # value that replaces a variance of zero, to avoid division by zero
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """The rows of a covariance: ``names``; ``nothing`` : variance of each row that counts as zero (rounding)."""
+
+    names: tuple[str, ...]
+    nothing: float | tuple[float, ...] = 0.0
+
+    @classmethod
+    def of(cls, names: Iterable[str], axes: str) -> "Rows":
+        """Return the rows for the coordinates, in mm, of several named points."""
+        return cls(tuple(f"{axis} of {name}" for name in names for axis in axes), NANOMETRE)
+
+
+TWIST = ("rx", "ry", "rz", "x", "y", "z")
+"""Rows of the covariance of a pose: rotation vector (rad) and translation (mm), left perturbation."""
+NANOMETRE = 1e-12  # square of a nanometre in mm²
+NANORADIAN = 1e-18
+"""Square of a nanoradian in rad²: a point at a distance of a metre moves by a nanometre."""
+OF_POSE = Rows(TWIST, (*[NANORADIAN] * 3, *[NANOMETRE] * 3))
+OF_POINT = Rows(("x", "y", "z"), NANOMETRE)
+OF_PIXEL = Rows(("x", "y"))
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """An invalid covariance. ``row`` : index of the matrix, from 0; ``reason`` : measured and needed values."""
+
+    row: int
+    reason: str
+
+
+def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
+    """Return the fault of the first of m matrices (m, n, n) that is no covariance, None if all are. A covariance is
+    finite, symmetric and without negative eigenvalues of its correlations, up to rounding; without any that are not
+    positive if it will be inverted, ``definite``."""
+    size = matrices.shape[-1]
+    nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)
+    variance = np.diagonal(matrices, axis1=1, axis2=2) + nothing
+    with np.errstate(all="ignore"):
+        scale = np.sqrt(np.maximum(variance, TINY))
+        scales = scale[:, :, None] * scale[:, None, :]
+        correlation = matrices / scales
+        correlation[:, range(size), range(size)] = variance / scale**2
+        odd = np.abs(matrices - np.swapaxes(matrices, 1, 2)) - np.sqrt(np.outer(nothing, nothing))
+        odd /= scales
+        acceptable = (variance >= 0).all(axis=1) & (variance <= LARGEST).all(axis=1)
+        acceptable &= (odd <= ROUNDING * size).all(axis=(1, 2))
+        acceptable &= (np.abs(correlation) <= 1 + ROUNDING * size).all(axis=(1, 2))
+    lowest = np.full(len(matrices), -np.inf)
+    lowest[acceptable] = np.linalg.eigvalsh(correlation[acceptable])[:, 0]
+    bad = np.flatnonzero(~(lowest > 0 if definite else lowest >= -ROUNDING * size))
+    if not len(bad):
+        return None
+    row = int(bad[0])
+    suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+    return Fault(row, _reason(matrices[row], odd[row], correlation[row], float(lowest[row]), rows, definite) + suffix)
+
+
+def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
+    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
+    if matrix.shape != (size, size):
+        raise InputError(
+            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'one number'}, {size}×{size} needed"
+        )
+    fault = first_fault(matrix[None], rows, definite)
+    if fault is not None:
+        raise InputError("E-COVARIANCE-VALUE", fault.reason)
+
+
+def _reason(matrix, odd, correlation, lowest: float, rows: Rows, definite: bool) -> str:
+    """Return why one matrix is not a covariance; ``odd`` : asymmetry of its correlations."""
+    variance, needed = np.diagonal(matrix), "a positive number" if definite else "0 or more"
+    if not np.isfinite(matrix).all():
+        return "a value is not finite, finite numbers needed"
+    below = variance <= 0 if definite else np.diagonal(correlation) < 0
+    if below.any() or variance.max() > LARGEST:
+        k = int(np.argmax(below if below.any() else variance))
+        needed = needed if below.any() else f"up to {LARGEST:g}"
+        return f"variance {variance[k]:.3g} of {rows.names[k]}, {needed} needed"
+    if odd.max() > ROUNDING * len(matrix):
+        i, j = np.unravel_index(int(np.argmax(odd)), odd.shape)
+        share = abs(matrix[i, j] - matrix[j, i]) / max(abs(matrix[i, j]), abs(matrix[j, i]))
+        return f"not symmetric by {round(100 * share, 1):g} % at {rows.names[i]}, {rows.names[j]}"
+    off = np.abs(correlation - np.diag(np.diagonal(correlation)))
+    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+    if off[i, j] > 1 + ROUNDING * len(matrix):
+        named = f"{rows.names[i]} and {rows.names[j]}"
+        return f"correlation {correlation[i, j]:.3g} of {named}, −1 to 1 needed"
+    return f"its correlations have the eigenvalue {lowest:.3g}, {needed} needed"

@@ -34,8 +34,6 @@ COLMAP_LAYOUT = {
 COLMAP_MODELS = tuple(COLMAP_LAYOUT)  # camera models that stcal supports
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 FISHEYE = "FISHEYE"  # part of the names of COLMAP's equidistant models
-
-
 MAX_FOCAL_RATIO = 10.0  # largest ratio between fx and fy; anamorphic lenses have 2
 FARTHEST = 1e12  # largest value of any parameter, whose square does not overflow
 MAX_SIDE_PX = 1_000_000  # longest image side that a camera file may state, px
@@ -86,9 +84,7 @@ class Camera(ByValue):
             object.__setattr__(self, "distortion", np.pad(self.distortion, (0, 4)))
         freeze(self, "distortion", (COEFFICIENTS,), "distortion")
         if self.fisheye and self.distortion[[6, 7, 9, 11]].any():
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera; 0 needed")
         if not self.colmap_model:
             object.__setattr__(self, "colmap_model", "THIN_PRISM_FISHEYE" if self.fisheye else "FULL_OPENCV")
         if self.colmap_model not in COLMAP_LAYOUT or (FISHEYE in self.colmap_model) != self.fisheye:
@@ -129,27 +125,22 @@ class Camera(ByValue):
         """
         k = frozen(matrix, (3, 3), "camera matrix")
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
-            raise InputError(
-                "E-CAMERA-MATRIX",
-                f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed; skew is not supported",
-            )
+            fault = f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed"
+            raise InputError("E-CAMERA-MATRIX", f"{fault}; skew is not supported")
         given = frozen(np.ravel(distortion), None, "distortion")
         with named("camera"):
             flat, model = opencv_lens(given, fisheye)
         return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
 
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four, without
-        prisms."""
+        """Return OpenCV's camera matrix (3, 3) and its 4, 5, 8 or 12 coefficients; four of a fisheye without prisms."""
         matrix = np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]])
         if not self.fisheye:
             count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
             return matrix, self.distortion[:count].copy()
         if self.distortion[[2, 3, 8, 10]].any():
-            raise InputError(
-                "E-CAMERA-MODEL",
-                "camera: tangential terms or prisms, which OpenCV's fisheye lacks; write it in COLMAP's form",
-            )
+            fault = "camera: p1, p2 or prisms, which OpenCV's fisheye lacks"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; write it in COLMAP's form")
         return matrix, self.distortion[[0, 1, 4, 5]]
 
     def colmap_params(self) -> list[float]:
@@ -269,15 +260,12 @@ class Camera(ByValue):
         return moved_x, moved_y
 
     def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the distortion folds the image
-        over."""
+        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the image is folded over."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
             return self._perspective(target.copy(), target)
         if not np.isfinite(target).all():
-            raise ConvergenceError(
-                "E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite coordinates needed"
-            )
+            raise ConvergenceError("E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite ones needed")
         x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
         steps = 0
         with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported below
@@ -359,9 +347,7 @@ def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> t
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of a fisheye; k1 to k4 needed")
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
     if given[8:].any():

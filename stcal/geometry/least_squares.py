@@ -13,15 +13,13 @@ from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 200
 SETTLED = 1e-12
-"""Largest predicted decrease of the last step, as a share of the cost. At a cost of 10⁴ such a step moves no parameter
-by more than 1e-4 σ, and the remaining error is far smaller."""
+"""Largest predicted decrease of the last step, as a share of the cost; such a step moves nothing by 1e-4 σ."""
 LEAST_GAIN = 1e-12
 """Decrease that rounding alone predicts for exact data, in units of σ²: a step of a millionth of σ."""
 ROUNDING = 1e-12  # share of the cost by which rounding may seem to raise the cost at the minimum
 MAX_DAMPING = 1e12
 UNKEPT, KEPT = 1e-8, 0.1
-"""A descent ends if the predicted decrease is at most ``UNKEPT``, in units of σ², and the actual decrease is less than
-the share ``KEPT`` of it: what remains is rounding."""
+"""A descent ends if a decrease of at most ``UNKEPT`` σ² is predicted, and less than ``KEPT`` of it comes."""
 TRUSTED = 0.5  # ratio of actual to predicted decrease above which the damping shrinks; below KEPT it grows
 DAMPED = 1e-4
 """Largest predicted decrease of an undamped step at which a damped descent counts as ended, in units of σ²: a step of a
@@ -29,8 +27,7 @@ hundredth of σ. Where the derivatives neglect the curvature of the residuals, o
 NEARLY_WHOLE = 1e-3
 """Largest damping at which a step's predicted decrease stands for that of the undamped step."""
 SLOW = 0.01
-"""A problem whose cost exceeds the best one by more than ``hopeless`` is given up when its predicted decrease is less
-than this share of the excess: with large residuals the last steps are many and short."""
+"""A problem whose excess over the best cost is beyond ``hopeless`` is given up if it falls by less than this share."""
 TINY = 1e-300
 
 
@@ -95,11 +92,8 @@ class Minimum(Generic[S, L]):
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
         """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ²."""
         if not (self.converged | (self.promised <= accepted)).all():
-            raise ConvergenceError(
-                "E-NO-MINIMUM",
-                f"{what}: no minimum after {self.steps} steps, the last was to gain {np.max(self.promised):.2g} σ²; "
-                f"{remedy}",
-            )
+            fault = f"{what}: no minimum after {self.steps} steps, the last was to gain {np.max(self.promised):.2g} σ²"
+            raise ConvergenceError("E-NO-MINIMUM", f"{fault}; {remedy}")
         return self
 
 
@@ -116,15 +110,14 @@ def minimise(
     max_steps: int = MAX_STEPS,
     hopeless: float = np.inf,
 ) -> Minimum[S, L]:
-    """Return the state of least cost, of one problem, or of h problems at once if costs are (h,), found from a start.
-
-    ``linearise`` : returns the problem about a state; ``moved`` : a state after a step (k,), or (h, k); ``cost`` : that
-    of a state, where it is cheaper, so that accepted states alone are linearised; ``select`` : returns the new state or
-    :class:`Linear` where ``take`` (h,), else the old one; ``damping``, ``least_damping`` : at the start, and the lower
-    limit, which regularises what nothing determines; ``settled``, ``least_gain`` : a minimum is reached when the next
-    undamped step promises at most ``settled`` times the cost plus ``least_gain``, in σ²; ``hopeless`` : excess of a
-    problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`.
-    """
+    """Return the state of least cost, of one problem, or of h problems at once if costs are (h,), found from a
+    start. ``linearise`` : returns the problem about a state; ``moved`` : a state after a step (k,), or (h, k);
+    ``cost`` : that of a state, where it is cheaper, so that accepted states alone are linearised; ``select`` :
+    returns the new state or :class:`Linear` where ``take`` (h,), else the old one; ``damping``, ``least_damping`` :
+    at the start, and the lower limit, which regularises what nothing determines; ``settled``, ``least_gain`` : a
+    minimum is reached when the next undamped step promises at most ``settled`` times the cost plus ``least_gain``,
+    in σ²; ``hopeless`` : excess of a problem's cost over the best one up to which it is followed to its end; see
+    :data:`SLOW`."""
     current = linearise(state)
     damp = np.full(np.shape(current.cost), float(damping))
     done = np.zeros(damp.shape, bool)
@@ -167,8 +160,7 @@ def minimise(
 
 MAX_POSE_STEPS = 60
 ACCEPTED = 1e-2
-"""Largest predicted decrease, in σ², that counts as settled after the last step: a tenth of σ. In a flat valley steps
-are many and short."""
+"""Largest predicted decrease, in σ², that counts as settled after the last step: flat valleys need many steps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,10 +172,8 @@ class Normal(NormalEquations):
 
     @classmethod
     def of(cls, residual: np.ndarray, by_pose: np.ndarray, possible: np.ndarray, huber: float) -> "Normal":
-        """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2).
-
-        ``by_pose`` : (h, n, 2, 6) negative derivatives; the cost is infinite where a pose is not ``possible`` (h,).
-        """
+        """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2). ``by_pose`` :
+        (h, n, 2, 6) negative derivatives; the cost is infinite where a pose is not ``possible`` (h,)."""
         length = np.sqrt((residual**2).sum(2))
         cost = np.where(possible, huber_cost(length, huber).sum(1), np.inf)
         h = len(residual)
@@ -218,12 +208,7 @@ class Minima:
         return Minima(self.poses + other.poses, *both)
 
 
-def descend(
-    evaluate: Callable[[Poses], Normal],
-    poses: Poses,
-    settled: float,
-    hopeless: float = np.inf,
-) -> Minima:
+def descend(evaluate: Callable[[Poses], Normal], poses: Poses, settled: float, hopeless: float = np.inf) -> Minima:
     """Return the minima reached from h poses at once; a step that lowers χ² by less than ``settled``, or by less than
     this share, is the last, and so is any one of a pose whose χ² exceeds the best one by ``hopeless``."""
     result = minimise(

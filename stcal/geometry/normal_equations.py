@@ -10,10 +10,8 @@ from stcal.geometry.rigid import skew
 
 SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
-
 TINY = 1e-300
-SPARSE = 0.1
-"""Share of entries that are not 0 below which a product of sparse matrices is faster."""
+SPARSE = 0.1  # share of entries that are not 0 below which a product of sparse matrices is faster
 LARGE = 100  # number of unknowns of a block from which on its inverse is computed from Cholesky's factors
 
 
@@ -78,10 +76,8 @@ def inverse_and_size(normal: np.ndarray) -> tuple[np.ndarray, float]:
 def blocks_of(
     jacobian: np.ndarray, residual: np.ndarray, index: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k).
-
-    Of n observations: derivatives (n, c, k) and residuals (n, c), both over σ, and the block of each, (n,).
-    """
+    """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k). Of n
+    observations: derivatives (n, c, k) and residuals (n, c), both over σ, and the block of each, (n,)."""
     n, _, k = jacobian.shape
     if count == 1:
         flat = jacobian.reshape(residual.size, k)

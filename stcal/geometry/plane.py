@@ -15,22 +15,18 @@ from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
     """Return points (..., 3) whose ordinary projection is the centre of the ellipse that each circle projects to.
-
     With centre C, unit normal n and radius r it is that of ``C + (r²/C_z)(n_z·n − e_z)``, e_z the optical axis (from
-    the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C]; Hartley & Zisserman, sec. 2.2 and 8.3). All in the camera frame
-    and one unit; normals (..., 3) of either sign.
-    """
+    the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C]; Hartley & Zisserman, sec. 2.2 and 8.3). All in the camera
+    frame and one unit; normals (..., 3) of either sign."""
     c, n = np.asarray(xyz_camera, float), np.asarray(normal_camera, float)
     shift = n[..., 2:] * n - np.array([0.0, 0.0, 1.0])
     return c + (np.asarray(radius_mm, float) ** 2 / c[..., 2])[..., None] * shift
 
 
 def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
-
-    Centres (n, 3), radii (n,), and two orthonormal directions in the plane, (3, 2), give centres (n, 2) and symmetric
-    shapes (n, 2, 2), normalised: the rim is ``centre + shape @ unit circle``.
-    """
+    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`. Centres
+    (n, 3), radii (n,), and two orthonormal directions in the plane, (3, 2), give centres (n, 2) and symmetric shapes
+    (n, 2, 2), normalised: the rim is ``centre + shape @ unit circle``."""
     dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
     dual = -dual / dual[:, 2:, 2:]
     centre = -dual[:, :2, 2]
@@ -41,12 +37,6 @@ def shape_of_square(square: np.ndarray) -> np.ndarray:
     """Return the symmetric shapes S of ellipses, (..., 2, 2), from S·Sᵀ; negative eigenvalues count as zero."""
     value, vector = np.linalg.eigh(square)
     return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
-
-
-MAX_STEPS = 100
-EXACT = 1e-22
-"""Largest predicted decrease at the minimum of a pose, in squared normalised coordinates: a step of a hundred-billionth
-of the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,15 +95,12 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
         raise DegenerateError("E-POINTS-FEW", f"homography: {len(b)} point pairs, 4 needed")
     (homography,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
     if not np.isfinite(homography).all():
-        raise DegenerateError(
-            "E-POINTS-COLLINEAR", "homography: the points do not determine it (three of four on a line)"
-        )
+        raise DegenerateError("E-POINTS-COLLINEAR", "homography: the points do not determine it (three on a line)")
     return homography
 
 
 def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the homographies (k, 3, 3) of k sets of pairs, (k, n, 2), each of the four or more that ``used`` (k, n)
-    marks; NaN where they do not determine it."""
+    """Return homographies (k, 3, 3) of k sets of pairs (k, n, 2) among ``used`` (k, n); NaN if undetermined."""
     count, on = used.sum(1), used[..., None]
 
     def normalised(p):
@@ -174,9 +161,7 @@ def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
     """Return the pose of a plane with a metric frame from its homography into normalised coordinates (Zhang 2000).
-
-    The plane's origin has a positive depth where the homography has that sign.
-    """
+    The plane's origin has a positive depth where the homography has that sign."""
     h = np.asarray(normalised_from_plane, float)
     h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
     if h[2, 2] < 0:
@@ -185,11 +170,14 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
     return Rigid(rotation, h[:, 2])
 
 
-def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Return camera_from_plane of least reprojection error, from a start before which the points lie.
+MAX_STEPS = 100
+EXACT = 1e-22
+"""Largest predicted decrease at a pose's minimum, in squared normalised coordinates."""
 
-    ``xy_plane`` : (n, 2) mm; ``xy_normalised`` : (n, 2) ideal coordinates.
-    """
+
+def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
+    """Return camera_from_plane of least reprojection error, from a start before which the points lie. ``xy_plane`` :
+    (n, 2) mm; ``xy_normalised`` : (n, 2) ideal coordinates."""
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
 
     def linearise(pose: Rigid) -> NormalEquations:
@@ -207,14 +195,12 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
 
 
 OUTLIER = 6.0
-"""Length of an outlier, in stated σ or the residuals' robust σ, whichever is larger; chance exceeds it for one point in
-6·10⁷ (Rayleigh)."""
+"""Length of an outlier, in the larger of stated and robust σ; chance exceeds it in one of 6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
 """Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
 SAME = 1.0  # distance, in σ, below which two minima count as one: the covariance covers both
 WIDER = 1.1
-"""Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
-loss."""
+"""Increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's loss."""
 MAX_SIGMA_RAD = 0.5  # largest σ of a usable rotation; beyond it linear error propagation is meaningless
 Descend = Callable[[Poses, float], Minima]
 """Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
@@ -245,27 +231,19 @@ def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
 
 def distinct(poses: Poses, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
     """Return True if the second of two poses differs significantly from the first, of the normal matrix (6, 6).
-
-    ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose.
-    """
+    ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose."""
     step = poses[1].difference(poses[0])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
 
 
 def two_minima(
-    descend_near: Callable[[Poses], Descend],
-    start: Poses,
-    target_from_plane: Rigid,
-    failure: str,
-    planar: bool = True,
+    descend_near: Callable[[Poses], Descend], start: Poses, target_from_plane: Rigid, failure: str, planar: bool = True
 ) -> PlaneMinima:
-    """Return one or two distinct minima of the residuals of single points.
-
-    ``descend_near`` : whitens residuals near one pose, alike for both minima, and returns the descent; ``start`` : one
-    pose, to which its mirror image is added, or two, the likelier one first; ``target_from_plane`` : origin in the
-    middle of the points, Z along the normal; ``planar`` : whether all points are in the plane, so that two starts that
-    end alike may have been on one side, and the mirror image of their minimum is tried.
-    """
+    """Return one or two distinct minima of the residuals of single points. ``descend_near`` : whitens residuals near
+    one pose, alike for both minima, and returns the descent; ``start`` : one pose, to which its mirror image is
+    added, or two, the likelier one first; ``target_from_plane`` : origin in the middle of the points, Z along the
+    normal; ``planar`` : whether all points are in the plane, so that two starts that end alike may have been on one
+    side, and the mirror image of their minimum is tried."""
     poses = start + mirrored(start, target_from_plane) if len(start) == 1 else start
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
@@ -339,11 +317,9 @@ class PlanePoses:
 
 
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:
-    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
-
-    The homography's derivative is taken at their mean. Z of the plane points away from the camera. DegenerateError: the
-    points determine no homography, or the plane is seen edge-on or from behind.
-    """
+    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2). The
+    homography's derivative is taken at their mean. Z of the plane points away from the camera. DegenerateError: the
+    points determine no homography, or the plane is seen edge-on or from behind."""
     xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
     middle = xy.mean(0)
     homography = fit_homography(xy - middle, xy_image)

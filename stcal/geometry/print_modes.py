@@ -117,8 +117,7 @@ class Told:
 
 
 def found_amplitude(prints: Sequence[Told], amplitude: float) -> float:
-    """Return the amplitude that explains the modes of all prints best, by restricted maximum likelihood, from the one
-    of the adjustment; near 1 where the data tell nothing."""
+    """Return the amplitude that explains the modes of all prints best (REML); near 1 where data tell nothing."""
     images = []
     for each in prints:
         known = np.linalg.inv(each.covariance)

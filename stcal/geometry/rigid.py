@@ -19,8 +19,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import MYPY, Array, Brief, ByValue, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
-"""Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
-order of the columns."""
+"""Order of a quaternion's components; in tables by the names of columns (``wxyz``), or by their order (``xyzw``)."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
@@ -54,14 +53,9 @@ def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
     (a, b, c), (d, e, f), (g, h, i) = x, y, z
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         return math.inf
-    return max(
-        abs(a * a + b * b + c * c - 1),
-        abs(d * d + e * e + f * f - 1),
-        abs(g * g + h * h + i * i - 1),
-        abs(a * d + b * e + c * f),
-        abs(a * g + b * h + c * i),
-        abs(d * g + e * h + f * i),
-    )
+    own = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    across = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+    return max(*(abs(square - 1) for square in own), *map(abs, across))
 
 
 if TYPE_CHECKING and not MYPY:
@@ -76,8 +70,6 @@ else:
 
 
 class _Frames:
-    """What one transform a_from_b and a stack of them share; all arrays with leading axes (...)."""
-
     __slots__ = ()
     rotation: np.ndarray
     translation: np.ndarray
@@ -130,9 +122,7 @@ class Rigid(ByValue, _Frames):
         freeze(self, "translation", (3,), "translation")
         deviation = _off_proper(*self.rotation.tolist())
         if deviation > 1e-6:
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rotation: not a proper rotation matrix; orthogonal with determinant +1 needed"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rotation: improper; orthogonal with determinant +1 needed")
         if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could fail the check above
             u, _, vt = np.linalg.svd(self.rotation)
             object.__setattr__(self, "rotation", frozen(u @ vt))
@@ -144,15 +134,11 @@ class Rigid(ByValue, _Frames):
         if m.shape not in ((4, 4), (3, 4)):
             raise InputError("E-ARRAY-SHAPE", f"rigid transform: shape {m.shape}, 4×4 needed")
         if (m[3:] != [0, 0, 0, 1]).any():
-            raise InputError(
-                "E-MATRIX-LAST-ROW",
-                f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed; is the matrix transposed?",
-            )
+            fault = f"rigid transform: last row {m[3].tolist()}, 0 0 0 1 needed"
+            raise InputError("E-MATRIX-LAST-ROW", f"{fault}; is it transposed?")
         u, s, vt = np.linalg.svd(m[:3, :3])
         if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rigid transform: the 3×3 part is not a rotation (left-handed or scaled)"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rigid transform: 3×3 part is no rotation (left-handed or scaled)")
         return cls(u @ vt, m[:3, 3])
 
     def as_scipy(self) -> Rotation:
@@ -171,12 +157,10 @@ class Rigid(ByValue, _Frames):
         return np.concatenate([self.as_scipy().as_rotvec(), self.translation])
 
     def log_sigma(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the σ (6,) of :meth:`log`, rad and mm, from the covariance (6, 6) of a left perturbation.
-
-        A small turn ω moves the rotation vector φ by the inverse left Jacobian of SO(3), (φ/2) cot(φ/2) ω across φ, and
-        by half of ω × φ; σ about the axes are those of its components for small φ only (Barfoot, "State Estimation for
-        Robotics", 2017, sec. 7.1.5).
-        """
+        """Return the σ (6,) of :meth:`log`, rad and mm, from the covariance (6, 6) of a left perturbation. A small
+        turn ω moves the rotation vector φ by the inverse left Jacobian of SO(3), (φ/2) cot(φ/2) ω across φ, and by
+        half of ω × φ; σ about the axes are those of its components for small φ only (Barfoot, "State Estimation for
+        Robotics", 2017, sec. 7.1.5)."""
         turn = self.log()[:3]
         angle = float(np.linalg.norm(turn))
         across = 1 / 12 if angle < SMALL_RAD else (1 - angle / 2 / math.tan(angle / 2)) / angle**2
@@ -207,8 +191,7 @@ class Rigid(ByValue, _Frames):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity(ByValue):
-    """A similarity a_from_b, ``xyz_a = scale * rotation @ xyz_b + translation``, as from COLMAP's world, which has no
-    unit."""
+    """A similarity a_from_b, ``xyz_a = scale * rotation @ xyz_b + translation``, as from COLMAP's unitless world."""
 
     scale: float
     rigid: Rigid
@@ -269,9 +252,7 @@ class Poses(Brief, _Frames):
         freeze(self, "rotation", (len(self.translation), 3, 3), "rotations")
         r = self.rotation
         if len(r) and ((np.linalg.det(r) < 0).any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
-            raise InputError(
-                "E-ROTATION-IMPROPER", "rotations: not proper rotation matrices; orthogonal with determinant +1 needed"
-            )
+            raise InputError("E-ROTATION-IMPROPER", "rotations: improper; orthogonal with determinant +1 needed")
 
     @classmethod
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
@@ -300,7 +281,7 @@ class Poses(Brief, _Frames):
         if len(off) and off.max() > UNIT_WITHIN:
             raise InputError(
                 "E-QUATERNION-LENGTH",
-                f"quaternion {off.argmax() + 1}: length off 1 by {off.max():.3g}, {UNIT_WITHIN:g} allowed",
+                f"quaternion {off.argmax() + 1}: length off by {off.max():.3g}, {UNIT_WITHIN} allowed",
             )
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
@@ -346,9 +327,8 @@ class Poses(Brief, _Frames):
     def __matmul__(self, other):
         """Return a_from_c for a :class:`Rigid` or m :class:`Poses` b_from_c; points (m, 3) for one or m points."""
         if isinstance(other, Rigid | Poses):
-            translation = np.einsum(
-                "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation
-            )
+            sums = "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi"
+            translation = np.einsum(sums, self.rotation, other.translation)
             return Poses._of(self.rotation @ other.rotation, translation + self.translation)
         points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
         return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
@@ -380,9 +360,8 @@ class Affine(ByValue):
     def inverse(self) -> "Affine":
         """Return b_from_a; a singular linear part is refused."""
         if np.linalg.cond(self.linear) > 1e12:
-            raise DegenerateError(
-                "E-AFFINE-SINGULAR", "affine transform: its 3×3 part is singular; an invertible one needed"
-            )
+            fault = "affine transform: 3×3 part is singular"
+            raise DegenerateError("E-AFFINE-SINGULAR", f"{fault}; an invertible one needed")
         back = np.linalg.inv(self.linear)
         return Affine(back, -back @ self.translation)
 
@@ -398,8 +377,7 @@ class Affine(ByValue):
 
 
 def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields points (m, 3) with their axes in every other order and with every other sign: what stands in place of x, y
-    and z, such as ``y, x, −z``, and the points."""
+    """Yields points (m, 3) in every other order and sign of their axes: its name, like ``y, x, −z``, and the points."""
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         if (order, signs) != ((0, 1, 2), (1, 1, 1)):
             names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
@@ -407,11 +385,8 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
-    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
-
-    ``xyz_a``, ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` :
-    (n,)
-    """
+    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign). ``xyz_a``,
+    ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` : (n,)"""
     return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
 
 
@@ -427,9 +402,8 @@ def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | Non
     root = np.sqrt(w)[:, None]
     linear, _, _, s = np.linalg.lstsq(root * (b - mean_b), root * (a - mean_a), rcond=None)
     if s[2] <= 1e-9 * s[0]:
-        raise DegenerateError(
-            "E-POINTS-COPLANAR", "alignment: the points are coplanar; an affine transform needs points off the plane"
-        )
+        fault = "alignment: the points are coplanar"
+        raise DegenerateError("E-POINTS-COPLANAR", f"{fault}; an affine transform needs points off the plane")
     return Affine(linear.T, mean_a - linear.T @ mean_b)
 
 
@@ -467,9 +441,8 @@ def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
     da, db = a - mean_a, b - mean_b
     for points in (da, db):
         if _collinear(points[w > 0]):
-            raise DegenerateError(
-                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line are needed"
-            )
+            fault = "alignment: the points are collinear"
+            raise DegenerateError("E-POINTS-COLLINEAR", f"{fault}; points off the line needed")
     rotation, product = best_rotations((w[:, None] * da).T @ db)
     scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0
     return Similarity(scale, Rigid(rotation, mean_a - scale * rotation @ mean_b))

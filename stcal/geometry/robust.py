@@ -6,8 +6,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri
 
 HUBER = 3.0
-"""Limit of Huber's loss for the length of two coordinates over their robust σ. One inlier in ninety is longer, and
-loses hardly any weight."""
+"""Limit of Huber's loss for the length of two coordinates over their robust σ; one inlier in ninety is longer."""
 
 
 def length_limit(coordinates: int, beyond: float) -> float:
@@ -22,12 +21,10 @@ TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
 
 
 def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
-    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a sample
-    (n,).
-
-    Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the fewest that the
-    ratio of two quantiles admits, both far below gross errors. ``together`` : number of lengths that share an error.
-    """
+    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a
+    sample (n,). Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the
+    fewest that the ratio of two quantiles admits, both far below gross errors. ``together`` : number of lengths that
+    share an error."""
 
     def quantile(exceeded: float, freedom: float) -> float:
         return float(np.sqrt(freedom * np.expm1(-2 / freedom * np.log(exceeded))))
@@ -50,8 +47,7 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
 
 
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:
-    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F, by its lower
-    tail, which stays exact for small probabilities."""
+    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F."""
     return float(1 / fdtri(redundancy, freedom, beyond))
 
 
@@ -73,9 +69,7 @@ def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
 
 def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
     """Return σ of one coordinate from the median of lengths (n,) over ``coordinates``, up to half of them outliers.
-
-    ``redundancy`` : per observation; residuals are shorter than errors by its square root.
-    """
+    ``redundancy`` : per observation; residuals are shorter than errors by its square root."""
     n = len(length)
     if n < 2:
         median = float(np.median(length))
@@ -87,8 +81,7 @@ def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1
 
 
 def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m), of those ``among`` (n, m); NaN without
-    any."""
+    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m) ``among`` these (n, m); NaN of none."""
     ordered = np.sort(np.where(among, length, np.inf), axis=1)
     count = among.sum(1)
     middle = np.maximum(np.stack([(count - 1) // 2, count // 2], 1), 0)

@@ -28,10 +28,8 @@ R = TypeVar("R")
 META, MADE_FROM, CHECKSUM = "meta", "made_from", "checksum"
 DAMAGE = (OSError, ValueError, LookupError, EOFError, TypeError, zipfile.BadZipFile, zlib.error, StcalError)
 """Exceptions of reading a file, or of rebuilding its result, if the file is truncated or of another form."""
-
 _parsing = threading.Lock()
-"""A lock for parsing heads of arrays: Python's parser counts its depth for all threads together, and can fail where
-several use it (https://github.com/python/cpython/issues/106905)."""
+"""A lock for parsing heads of arrays, which fails in several threads (github.com/python/cpython/issues/106905)."""
 
 
 @functools.cache
@@ -41,8 +39,7 @@ def made_by() -> str:
 
 
 def packed(key: str, arrays: Mapping[str, Any], meta: dict[str, Any]) -> bytes:
-    """Return the content of a file that :func:`kept` reads: arrays by name, plain values ``meta``, and ``key``, the
-    hash of all that they were made from, by which the file is called."""
+    """Return the content of a file that :func:`kept` reads; ``key`` : hash of its inputs, by which it is called."""
     content = {name: np.asarray(values) for name, values in arrays.items()}
     content[META] = _bytes(json.dumps(meta | {MADE_FROM: key}).encode())
     stream = io.BytesIO()
@@ -91,7 +88,6 @@ def _bytes(data: bytes) -> np.ndarray:
 
 
 def _digest(content: Mapping[str, np.ndarray]) -> bytes:
-    """Return the SHA-256 of names, types, shapes and values of arrays."""
     hasher = hashlib.sha256()
     for name, values in sorted(content.items()):
         hasher.update(f"{name}\0{values.dtype.str}\0{values.shape}\0".encode() + values.tobytes())

@@ -60,16 +60,13 @@ LEAST_COLOUR = 0.05
 """Smallest relative difference between neighbours of two colours that tells a mosaic."""
 GREEN_ALIKE = 0.3
 """Largest difference between both greens, as a share of that between green and the other colours."""
-TRIED_PX = 1024
-"""Side of the middle of the image that is judged, px."""
+TRIED_PX = 1024  # side of the middle of the image that is judged, px
 
 
 def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
     """Return the patterns that a grey image may be a mosaic of: two, as red and blue look alike; none if it is none.
-
     Both greens, on one diagonal of each 2×2 pixels, are alike, and another colour differs all over the image, which
-    medians show: the scene favours no pixel of the four.
-    """
+    medians show: the scene favours no pixel of the four."""
     height, width = (min(side, TRIED_PX) // 2 * 2 for side in image.shape)
     if not height or not width:
         return ()
@@ -84,10 +81,7 @@ def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
     def apart(one: np.ndarray, two: np.ndarray) -> float:
         return float(np.median((one - two)[bright] / total[bright])) * 4
 
-    for greens, others, patterns in (
-        ((b, c), (a, d), ("RGGB", "BGGR")),
-        ((a, d), (b, c), ("GRBG", "GBRG")),
-    ):
+    for greens, others, patterns in (((b, c), (a, d), ("RGGB", "BGGR")), ((a, d), (b, c), ("GRBG", "GBRG"))):
         colour = max(min(abs(apart(other, green)) for green in greens) for other in others)
         if colour > LEAST_COLOUR and abs(apart(*greens)) < GREEN_ALIKE * colour:
             return patterns
@@ -99,16 +93,14 @@ RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", "
 EXPORT = "export it as JPEG of its full size, not edited"
 UNREAD = {
     **dict.fromkeys(
-        HEIC,
-        "a HEIC photograph, which is read after `pip install 'stereo-target-calibration[heic]'`; or " + EXPORT,
+        HEIC, "a HEIC photograph, which is read after `pip install 'stereo-target-calibration[heic]'`; or " + EXPORT
     ),
     **dict.fromkeys(RAW, "a raw photograph; develop it to TIFF or PNG without correction of the lens, crop or turn"),
 }
 """What photographs of these suffixes are, and what to do where they are not read."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands of HEIC files, in the bytes 8 to 12."""
-DNG_VERSION = 50706
-"""Tag of a TIFF that is a raw photograph."""
+DNG_VERSION = 50706  # tag of a TIFF that is a raw photograph
 
 
 def readable() -> tuple[str, ...]:
@@ -147,7 +139,6 @@ def heic_grey(data: bytes, name: str) -> np.ndarray:
 
 
 def _properties(data: bytes) -> bytes:
-    """Return the part of a HEIC file that describes its images."""
     start = data.find(b"meta")
     return data[start : start + int.from_bytes(data[max(start - 4, 0) : start], "big")] if start >= 0 else b""
 

@@ -20,14 +20,11 @@ if TYPE_CHECKING:
 MB = 1_000_000
 SETTINGS_BYTES = 10 * MB
 """Largest size of a file that people write: camera, designs, robot, layout."""
-TABLE_BYTES = 100 * MB
-"""Largest size of tables and result files."""
-COMPACT_FROM = TABLE_BYTES // 10
-"""Length from which JSON is written without line breaks."""
+TABLE_BYTES = 100 * MB  # largest size of tables and result files
+COMPACT_FROM = TABLE_BYTES // 10  # length from which JSON is written without line breaks
 IMAGE_BYTES = 500 * MB
 """Largest size of an image file: 80 megapixels, 16 bit, colour, uncompressed."""
-MODEL_BYTES = 1000 * MB
-"""Largest size of a file of a COLMAP model."""
+MODEL_BYTES = 1000 * MB  # largest size of a file of a COLMAP model
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
@@ -71,34 +68,18 @@ DATABASE, MODELS, TARGET_MODEL = "colmap/database.db", "colmap/models", "colmap/
 """COLMAP's database, its models by group, and the final model in mm in the target frame."""
 REFINED_CAMERA = "colmap/refined_cameras.txt"
 """Camera file with the intrinsics that a run refined, and their σ."""
-REPORT_PDF, COMPARISON = "report.pdf", "compare.json"
-"""What `report --pdf` and `compare` add."""
-RUN_ENTRIES = (
-    "faces.json",
-    "report.json",
-    "report.html",
-    REPORT_PDF,
-    COMPARISON,
-    "labels.csv",
-    "detections.csv",
-    "overlays",
-    "colmap",
-    "inputs",
-    INTERNAL,
-)
+REPORT_PDF, COMPARISON = "report.pdf", "compare.json"  # what `report --pdf` and `compare` add
+_RESULTS, _OTHERS = ("faces.json", "report.json", "report.html"), ("labels.csv", "detections.csv", "overlays")
+RUN_ENTRIES = (*_RESULTS, REPORT_PDF, COMPARISON, *_OTHERS, "colmap", "inputs", INTERNAL)
 """Files and folders of a run or, ``detections.csv`` and ``overlays``, of a detection alone."""
 NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
-"""Suffixes of outputs that no command reads from a folder. Besides a run's entries, commands read images, YAML poses,
-and COLMAP's models and databases from folders."""
+"""Suffixes of outputs that no command reads from a folder, beside a run's entries."""
 
 
 def unwritable(path: Path, error: OSError) -> InputError:
-    """Return the error of a file that cannot be written."""
-    return InputError(
-        "E-OUTPUT-UNWRITABLE",
-        f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give another "
-        "place",
-    )
+    """Return the error of a file or folder that cannot be written."""
+    remedy = "check the folder's space and rights, or give another place"
+    return InputError("E-OUTPUT-UNWRITABLE", f"{path}: cannot be written: {error.strerror or error}; {remedy}")
 
 
 def save(path: Path, content: str | bytes) -> None:
@@ -123,33 +104,28 @@ def require_new_folder(out: Path, images: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
     if real_place(images) in (real_place(out), *real_place(out).parents):
-        raise InputError(
-            "E-OUTPUT-PLACE", f"--out {out}: lies in the folder of the photographs {images}; give another place"
-        )
+        among = f"--out {out}: lies in the folder of the photographs {images}"
+        raise InputError("E-OUTPUT-PLACE", f"{among}; give another place")
     above = next(parent for parent in out.absolute().parents if parent.exists())
     try:
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
     except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"--out {out}: cannot be written: {error.strerror or error}; give another place"
-        ) from error
+        raise unwritable(out, error) from error
 
 
 def require_written(
     path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike", most: float, unit: str
 ) -> None:
-    """Read a written file with the reader of later commands, and require that it gives the values that were reported.
-
-    ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest difference,
-    rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError.
-    """
+    """Read a written file with the reader of later commands, and require that it gives the values that were
+    reported. ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest
+    difference, rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError."""
     difference = _difference(path, read, reported)
     if not difference <= most:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
-            f"{most:g} allowed; do not use the file, and report this with its data",
-        )
+        differs = f"the file gives values that differ from those reported by up to {difference:.2g} {unit}"
+        raise ConvergenceError("E-WRITTEN-DIFFERS", f"{path}: {differs}, {most:g} allowed; {DO_NOT_USE}")
+
+
+DO_NOT_USE = "do not use the file, and report this with its data"
 
 
 def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
@@ -157,16 +133,13 @@ def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "Ar
     import numpy as np
 
     try:
-        again = np.asarray(read(), float)
+        again, values = np.asarray(read(), float), np.asarray(reported, float)
     except (StcalError, OSError, LookupError, ValueError, SyntaxError) as error:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
-        ) from error
-    reported = np.asarray(reported, float)
-    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
+        unread = f"{path}: written, and cannot be read again: {error}; {DO_NOT_USE}"
+        raise ConvergenceError("E-WRITTEN-DIFFERS", unread) from error
+    if again.shape != values.shape or (np.isnan(again) != np.isnan(values)).any():
         return float("inf")
-    return float(np.nanmax(np.abs(again - reported), initial=0.0))
+    return float(np.nanmax(np.abs(again - values), initial=0.0))
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
@@ -189,9 +162,7 @@ def save_folder(out: Path, files: dict[str, str]) -> None:
         try:
             made.replace(out)
         except OSError as error:
-            raise InputError(
-                "E-OUTPUT-UNWRITABLE", f"{out}: cannot be written: {error.strerror or error}; give another place"
-            ) from error
+            raise unwritable(out, error) from error
 
 
 def digest_of(path: Path) -> str:
@@ -220,9 +191,8 @@ def require_unchanged(path: str | Path) -> None:
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return
     if found != known:
-        raise InputError(
-            "E-RUN-CHANGED", f"{path}: changed since its run ended; take a copy that is whole, or run it again"
-        )
+        changed = f"{path}: changed since its run ended; take a copy that is whole, or run it again"
+        raise InputError("E-RUN-CHANGED", changed)
 
 
 def json_text(content) -> str:
@@ -232,35 +202,26 @@ def json_text(content) -> str:
     if len(text) > COMPACT_FROM:
         text = json.dumps(plain, separators=(",", ":"), ensure_ascii=False, allow_nan=False) + "\n"
     if len(text) > TABLE_BYTES:
-        raise InputError(
-            "E-OUTPUT-SIZE",
-            f"a result would have {len(text) / MB:.0f} MB, at most {TABLE_BYTES // MB} MB are read; give fewer rows",
-        )
+        size = f"a result would have {len(text) / MB:.0f} MB, at most {TABLE_BYTES // MB} MB are read"
+        raise InputError("E-OUTPUT-SIZE", f"{size}; give fewer rows")
     return text
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, outputs (option, path) that would replace an input, a file in an input folder, or each
-    other."""
+    """Refuse, before the work, outputs (option, path) that would replace an input, a file of it, or each other."""
     places: dict[Path, str] = {}
     for option, path in outputs:
-        place = real_place(path)
+        place, what = real_place(path), f"{option} {path}"
         for given, read in inputs:
-            input_place = real_place(read)
-            if place == input_place:
-                raise InputError(
-                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
-                )
-            if input_place in place.parents and place.exists() and _is_read(place, input_place):
-                raise InputError(
-                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
-                )
+            folder = real_place(read)
+            if place == folder:
+                raise InputError("E-OUTPUT-IS-INPUT", f"{what}: is an input of this command; give another name")
+            if folder in place.parents and place.exists() and _is_read(place, folder):
+                raise InputError("E-OUTPUT-IS-INPUT", f"{what}: is a file of {given} {read}; give another name")
         if place in places:
-            raise InputError(
-                "E-OUTPUT-TWICE", f"{option} {path}: is also what {places[place]} writes; give each its own name"
-            )
+            raise InputError("E-OUTPUT-TWICE", f"{what}: is also what {places[place]} writes; give each its own name")
         if place.is_dir():
-            raise InputError("E-OUTPUT-FOLDER", f"{option} {path}: is a folder; the name of a file needed")
+            raise InputError("E-OUTPUT-FOLDER", f"{what}: is a folder; the name of a file needed")
         places[place] = option
 
 
@@ -270,7 +231,6 @@ def real_place(path: str | Path) -> Path:
 
 
 def _is_read(place: Path, folder: Path) -> bool:
-    """Return True if commands read this file of an input folder: a run's own, or no table or page."""
     if (folder / RUN_MARKER).exists():
         return place.relative_to(folder).parts[0] in RUN_ENTRIES
     return place.name in RUN_ENTRIES or place.suffix.lower() not in NEVER_READ

@@ -1,27 +1,31 @@
-"""Find the image files, group by group, and decode them: pixels as the sensor gave them."""
+"""Image files by group, their pixels as the sensor gave them, and jobs on images, by processes or on a cluster."""
 
 import contextlib
 import os
 import re
+import socket
 import tempfile
 import threading
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from stcal.errors import InputError
+from stcal.errors import DetectionError, InputError
 from stcal.io import decoding
 from stcal.io.decoding import ends_properly, is_png, patterns_seen, png_intact
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
+from stcal.parallel import hand_over, run_parallel
 
 USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 SUFFIXES = (*USUAL, *decoding.readable())
@@ -29,44 +33,30 @@ SUFFIXES = (*USUAL, *decoding.readable())
 UNPACKED = (".png", ".tif", ".tiff", ".bmp")
 """Forms in which programs of industrial cameras write pixels as the sensor gave them."""
 EXCLUDED = "taken out with --exclude"
-HOLDS_IMAGES = "it holds images"
-"""Part of the reason why a folder is left out."""
-TOP_GROUP = "."
-"""Name of the group that images lying directly in the folder form."""
-
-NOISE_BLUR_PX = 1.5
-"""σ of the blur that removes noise."""
+HOLDS_IMAGES = "it holds images"  # part of the reason why a folder is left out
+TOP_GROUP = "."  # name of the group that images lying directly in the folder form
+NOISE_BLUR_PX = 1.5  # σ of the blur that removes noise
 SAME_NOISE = 1.2
-"""Largest RMS difference between two files of one photograph, in units of its RMS noise: a JPEG of low quality differs
-by 1.1, two exposures by 1.5."""
+"""Largest RMS difference of two files of one photograph, over its noise: JPEG differs by 1.1, exposures by 1.5."""
 SAME_GREY = 1.0
-"""Lower limit of the allowed RMS difference, grey values of 255: rounding and compression without noise cause as
-much."""
+"""Lower limit of the allowed RMS difference, of 255: rounding and compression cause as much without noise."""
 SAME_EDGES = 1.5
-"""Factor on the allowed RMS difference over the whole image, edges included: compression changes edges a little, a
-motion of the camera changes them much."""
-
-MAJORITY = "the majority of the images"
-"""What states the size of images where the camera file does not."""
+"""Factor on the allowed RMS difference with edges: compression changes them little, motion of the camera much."""
+MAJORITY = "the majority of the images"  # what states the size of images where the camera file does not
 TIFF_HEADS = (b"II*\0", b"MM\0*")
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
-MOST_JPEG_SIDE = 65_000
-"""Largest height of a thumbnail, px; the JPEG format is limited to 65 535."""
-
+MOST_JPEG_SIDE = 65_000  # largest height of a thumbnail, px; the JPEG format is limited to 65 535
 _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
 """Messages that decoders write to standard error without failing; stray bytes before the end of a JPEG do no harm."""
-
-_STANDARD_ERROR = threading.Lock()
-"""Lock that is held while standard error is redirected."""
+_STANDARD_ERROR = threading.Lock()  # lock that is held while standard error is redirected
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """An image file; ``name`` : path below the image folder, with forward slashes; ``content`` : its bytes if they are
-    carried along to a machine that does not see the path."""
+    """An image file; ``name`` : path below the image folder, with /; ``content`` : bytes carried to another machine."""
 
     path: Path
     name: str
@@ -74,11 +64,8 @@ class ImageFile:
     content: bytes | None = field(default=None, repr=False)
 
     def read(self) -> bytes:
-        """Return the content of the file.
-
-        Raises InputError: it is gone, and a result without it would be another one than was asked for. Raises OSError:
-        it cannot be read, or is too large for an image.
-        """
+        """Return the content of the file. Raises InputError: it is gone, and a result without it would be another
+        one than was asked for. Raises OSError: it cannot be read, or is too large for an image."""
         if self.content is not None:
             return self.content
         try:
@@ -125,7 +112,6 @@ def _mosaics(path: Path, _: int) -> tuple[str, ...]:
 
 
 def _refuse_mosaics(files: Sequence[ImageFile]) -> None:
-    """Refuse images that are mosaics, by the first one in a form without losses: read as grey, it shifts centres."""
     first = next((file for file in files if file.path.suffix.lower() in UNPACKED), None)
     if first is None:
         return
@@ -164,24 +150,19 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         else:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
-        # A nested folder is the most helpful hint: the images lie deeper than they should.
-        unread = set(decoding.UNREAD.values())
-        most_telling = sorted(
+        unread = set(decoding.UNREAD.values())  # then a nested folder is the most helpful hint: images lie too deep
+        telling = sorted(
             skipped, key=lambda s: (s.reason not in unread, s.gate != "folder", HOLDS_IMAGES not in s.reason)
-        )[:1]
-        hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
-        raise InputError(
-            "E-IMAGES-NONE",
-            f"image folder {root}: no image, one of {', '.join(s[1:] for s in USUAL)}{hint}; "
-            f"put them into {root}/<group>/",
         )
+        hint = "".join(f" (left out {s.name}: {s.reason})" for s in telling[:1])
+        kinds = f"{', '.join(s[1:] for s in USUAL)}{hint}"
+        raise InputError("E-IMAGES-NONE", f"image folder {root}: no image, {kinds}; put them into {root}/<group>/")
     _refuse_mosaics(files)
     return files, skipped
 
 
 def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list[ImageFile], list[Skipped]]:
-    """Return the result of :func:`find_images` with the images ``exclude``, by their names in results or their paths,
-    moved to the skipped files."""
+    """Return :func:`find_images` with the images ``exclude``, by name or path, among the skipped files."""
     return without_excluded(*find_images(folder), exclude, folder)
 
 
@@ -193,17 +174,13 @@ def without_excluded(
     for word in exclude:
         matching = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
         if not matching:
-            raise InputError(
-                "E-OPTION-EXCLUDE",
-                f"--exclude {word}: no such image in {folder}; give its name as results have it, such as "
-                f"{files[0].name}",
-            )
+            none = f"--exclude {word}: no such image in {folder}"
+            raise InputError("E-OPTION-EXCLUDE", f"{none}; give its name as results have it, such as {files[0].name}")
         excluded |= matching
     remaining = [file for file in files if file.name not in excluded]
     if not remaining:
-        raise InputError(
-            "E-OPTION-EXCLUDE", f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in"
-        )
+        every = f"image folder {folder}: --exclude takes out all {len(files)} images"
+        raise InputError("E-OPTION-EXCLUDE", f"{every}; leave some in")
     return remaining, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in excluded)]
 
 
@@ -242,12 +219,9 @@ def name_fault(name: str) -> str | None:
 
 
 def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor gave
-    them.
-
-    Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it is turned as
-    its EXIF says.
-    """
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor
+    gave them. Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it
+    is turned as its EXIF says."""
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
     if not ends_properly(data):
@@ -262,8 +236,10 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
         image = _decoded(data, name)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
-    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS and _tag(data, ExifTags.Base.PhotometricInterpretation) == 0:
-        image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
+    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS:
+        with contextlib.suppress(Exception), Image.open(BytesIO(data)) as file:  # damaged EXIF fails in many ways
+            if file.getexif().get(ExifTags.Base.PhotometricInterpretation) == 0:
+                image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
     if size is not None and size[0] != size[1] and image.shape == size:  # (height, width) is (width, height)
         turn = _turn(data)
         return image if turn is None else cv2.rotate(image, turn)
@@ -271,7 +247,6 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
 
 
 def _decoded(data: bytes, name: str) -> np.ndarray:
-    """Return the grey image of a JPEG, PNG, TIFF or BMP."""
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     with _STANDARD_ERROR, _decoder_messages() as messages:
         try:
@@ -281,22 +256,17 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
         if image is not None:
             image = _clearest(image, lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_COLOR))
     if image is None:
-        raise InputError(
-            "E-IMAGE-UNREADABLE",
-            f"{name}: not readable as an image; copy it again, or convert it to {', '.join(USUAL)}",
-        )
+        unread = f"{name}: not readable as an image; copy it again, or convert it to {', '.join(USUAL)}"
+        raise InputError("E-IMAGE-UNREADABLE", unread)
     if damage := _DAMAGE.search(messages):
-        raise InputError(
-            "E-IMAGE-DAMAGED", f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again"
-        )
+        seen = damage[0].decode(errors="replace").strip()
+        raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged ({seen}); copy it again")
     return image
 
 
-SPARSE = 5
-"""Only one row and column in this number is looked at."""
+SPARSE = 5  # only one row and column in this number is looked at
 FLAT, CLEARER = 0.1, 3.0
-"""Range of grey values, as a share of all, below which the channels of a colour image are looked at, and how many times
-larger that of a channel must be to be taken for the image."""
+"""Range of grey values below which channels are looked at, and how many times larger a channel's must be."""
 
 
 def _clearest(grey: np.ndarray, colours: Callable[[], Any]) -> np.ndarray:
@@ -328,27 +298,17 @@ def _turn(data: bytes) -> int | None:
         return None
 
 
-def _tag(data: bytes, tag: int) -> object:
-    try:
-        with Image.open(BytesIO(data)) as image:
-            return image.getexif().get(tag)
-    except Exception:  # damaged EXIF fails in many ways
-        return None
-
-
 def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
-    """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable,
-    an error if two sizes are equally frequent, so that the order of the files would decide."""
+    """Return width and height, px, of most files, and a name among them; None if no file is readable."""
     with_size: dict[tuple[int, int], list[ImageFile]] = {}
+    unknown: list[ImageFile] = []
     for file in files:
         try:
             with Image.open(BytesIO(file.content) if file.content is not None else file.path) as image:
                 with_size.setdefault(image.size, []).append(file)
         except Exception:  # a file that is no image fails in many ways
-            with_size.setdefault((0, 0), []).append(file)
-    unknown = with_size.pop((0, 0), [])
-    order = {file.name: i for i, file in enumerate(files)}
-    ranked = sorted(with_size.values(), key=lambda own: (-len(own), order[own[0].name]))
+            unknown.append(file)
+    ranked = sorted(with_size.values(), key=len, reverse=True)
     _refuse_a_tie({size: own for size, own in with_size.items() if len(own) == len(ranked[0])})
     for own in (*ranked, unknown):
         for file in own:
@@ -358,7 +318,6 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
 
 
 def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
-    """Raise an error if several sizes have the same number of images, and some of these images are readable."""
     sizes = [size for size, own in equal.items() if any(map(_shape, own))] if len(equal) > 1 else []
     if len(sizes) < 2:
         return
@@ -368,7 +327,6 @@ def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
 
 
 def _shape(file: ImageFile) -> tuple[int, ...]:
-    """Return height and width, px; empty if the image is not readable."""
     try:
         return decode(file.read(), file.name).shape
     except (InputError, OSError):
@@ -379,9 +337,8 @@ def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], st
     """Return width and height, px, of most of the images, and the name of one of them."""
     found = common_size(files)
     if found is None:
-        raise InputError(
-            "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
-        )
+        fault = f"no readable image among {len(files)}, first {files[0].name}"
+        raise InputError("E-IMAGES-NONE-READABLE", f"{fault}; check them")
     return found
 
 
@@ -409,23 +366,19 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
             with Image.open(BytesIO(data)) as image:
                 return image.size
     except Image.DecompressionBombError as error:
-        raise InputError(
-            "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send the file of the camera unchanged"
-        ) from error
+        fault = f"{name}: more pixels than any camera has"
+        raise InputError("E-IMAGE-TOO-LARGE", f"{fault}; send the file of the camera unchanged") from error
     except Exception as error:  # data that are no image fail in many ways
-        raise InputError(
-            "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(USUAL)}"
-        ) from error
+        fault = f"{name}: no readable image"
+        raise InputError("E-IMAGE-UNREADABLE", f"{fault}; convert it to {', '.join(USUAL)}") from error
 
 
 def grey_of(image: np.ndarray, name: str) -> np.ndarray:
     """Return the grey image (height, width) of an array, grey or with three channels RGB."""
     image = np.asarray(image)
     if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
-        raise InputError(
-            "E-ARRAY-SHAPE",
-            f"{name}: array of shape {image.shape}; (height, width) or (height, width, 3) needed, grey or RGB",
-        )
+        fault = f"{name}: shape {image.shape}"
+        raise InputError("E-ARRAY-SHAPE", f"{fault}; (height, width), or (height, width, 3) of RGB needed")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     if image.ndim == 2:
@@ -451,23 +404,17 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
         raise InputError("E-IMAGE-TYPE", f"{name}: {type(image).__name__}, no image; leave lost frames out")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
-        raise InputError(
-            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed{remedy}"
-        )
+        fault = f"{name}: {image.dtype} of shape {image.shape}"
+        raise InputError("E-IMAGE-TYPE", f"{fault}; 8 or 16 bits of grey needed{remedy}")
     if size is not None and image.shape[::-1] != size:
-        raise InputError(
-            "E-IMAGE-SIZE",
-            f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px; "
-            "give images as the camera took them",
-        )
+        fault = f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px"
+        raise InputError("E-IMAGE-SIZE", f"{fault}; give images as the camera took them")
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
     """Return True if two grey images are two files of one exposure, of equal noise but for losses by compression.
-
     The noise of two exposures from one place differs by √2 times itself. Brightness may differ by a factor and a
-    constant.
-    """
+    constant."""
     if image.shape != other.shape:
         return False
     first, second = (grey_8bit(grey).astype(np.float32) for grey in (image, other))
@@ -534,3 +481,53 @@ def _decoder_messages() -> Iterator[bytearray]:
             os.close(standard_error)
             caught.seek(0)
             messages += caught.read()
+
+
+R = TypeVar("R")
+_elsewhere: ContextVar[tuple[Executor, int, bool] | None] = ContextVar("executor of images", default=None)
+
+
+@contextlib.contextmanager
+def spread(executor: Executor, at_once: int, send_images: bool = False) -> Iterator[None]:
+    """Let an executor, which stays open, run the jobs on single images inside the ``with`` block; results are the
+    same. ``at_once`` : number of images that are handed over at a time; ``send_images`` : whether by content, and
+    not by their path on storage that all machines share."""
+    token = _elsewhere.set((executor, at_once, send_images))
+    try:
+        yield
+    finally:
+        _elsewhere.reset(token)
+
+
+def run_on_images(
+    function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None, kept: bool = False
+) -> Iterator[tuple[int, R]]:
+    """Yield index and result of each job, run by :func:`stcal.parallel.run_parallel` or the executor of
+    :func:`spread`. The first argument of a job is an image file, or a list of them. ``kept`` : True if the caller
+    keeps finished results, so that a second try continues there. Raises DetectionError: a process was ended from
+    outside. Raises InputError: a worker does not see the folder of an image."""
+    if current := _elsewhere.get():
+        executor, at_once, send_images = current
+        sent = ((function, _sent(files, send_images), *arguments) for files, *arguments in jobs)
+        yield from hand_over(executor, _on_worker, sent, at_once)
+        return
+    try:
+        yield from run_parallel(function, jobs, workers)
+    except BrokenExecutor as error:
+        died = f"images, {len(jobs)} of them: a process was ended from outside, for lack of memory perhaps"
+        again = f"run the same command again, with fewer --workers{', finished detections are kept' * kept}"
+        raise DetectionError("E-WORKER-DIED", f"{died}; {again}") from error
+
+
+def _sent(files: ImageFile | list[ImageFile], with_content: bool) -> list[ImageFile] | ImageFile:
+    if isinstance(files, list):
+        return [_sent(file, with_content) for file in files]  # type: ignore[misc]
+    return files.carried() if with_content else replace(files, path=files.path.absolute())
+
+
+def _on_worker(function: Callable, files: ImageFile | list[ImageFile], *arguments):
+    for file in [files] if isinstance(files, ImageFile) else files:
+        if file.content is None and not file.path.parent.is_dir():
+            fault = f"{file.path.parent}: does not exist on worker {socket.gethostname()}"
+            raise InputError("E-WORKER-PATH", f"{fault}; give a path that all workers see, or --send-images")
+    return function(files, *arguments)

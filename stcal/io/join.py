@@ -83,11 +83,8 @@ def join_tables(
     common = [name for name in places[0] if name in places[1]]
     if not common:
         first = [next(iter(row_of_key)) for row_of_key in places]
-        raise InputError(
-            "E-TABLES-UNMATCHED",
-            f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other; correct them, or give "
-            "another --key",
-        )
+        fault = f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other"
+        raise InputError("E-TABLES-UNMATCHED", f"{fault}; correct them, or give another --key")
     joined: dict[str, list[str] | np.ndarray] = {}
     for table, row_of_key, prefix in zip(tables, places, prefixes, strict=True):
         rows = [row_of_key[name] for name in common]
@@ -96,20 +93,16 @@ def join_tables(
             posed = bool(_OF_POSES.fullmatch(name))
             new = prefix + name if posed else name
             if new in joined and posed:
-                raise InputError(
-                    "E-TABLES-BOTH",
-                    f"{a}, {b}: both have {name}; positions or poses of one of them alone can be read here",
-                )
+                one = "positions or poses of one of them alone can be read here"
+                raise InputError("E-TABLES-BOTH", f"{a}, {b}: both have {name}; {one}")
             joined.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
     lines = [tables[0].lines[places[0][name]] for name in common]
     notes = []
     for path, row_of_key, rows_of_other in ((a, places[0], places[1]), (b, places[1], places[0])):
         unmatched = [name for name in row_of_key if name not in rows_of_other]
         if unmatched:
-            ellipsis = ", …" if len(unmatched) > SHOWN else ""
-            notes.append(
-                f"{len(unmatched)} rows of {path} have no partner: {key} {', '.join(unmatched[:SHOWN])}{ellipsis}"
-            )
+            names = ", ".join(unmatched[:SHOWN]) + ", …" * (len(unmatched) > SHOWN)
+            notes.append(f"{len(unmatched)} rows of {path} have no partner: {key} {names}")
     where = f"{Path(a).name} with {Path(b).name}"
     return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
@@ -132,18 +125,15 @@ def stack_tables(
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(
-            "E-TABLES-NAMES",
-            f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them",
-        )
+        called_so = f"{tables[0].where}: two files are called {twice}"
+        raise InputError("E-TABLES-NAMES", f"{called_so}; rename one, {column}s are called like them")
     common = [name for name in tables[0].columns if name != column and all(name in table for table in tables)]
     columns: dict[str, list[str] | np.ndarray] = {}
     for name in common:
         values_of_table = [table.kept(name) for table in tables]
         numeric = all(isinstance(part, np.ndarray) for part in values_of_table)
-        columns[name] = (
-            np.concatenate(values_of_table) if numeric else [v for table in tables for v in table.text(name)]
-        )
+        texts = (v for table in tables for v in table.text(name))
+        columns[name] = np.concatenate(values_of_table) if numeric else list(texts)
     columns |= {second: columns[first] for second, first in (called or {}).items()}
     columns[column] = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
     lines = [line for table in tables for line in table.lines]

@@ -16,13 +16,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandle
 from pydantic_core import PydanticCustomError, core_schema
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import OF_POINT, OF_POSE, Rows, frozen, require_covariance
 from stcal.geometry.rigid import Rigid
-from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
 from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, require_unchanged, text_of
 
-LONGEST = 80
-"""Largest number of characters of a value that a message shows."""
+LONGEST = 80  # largest number of characters of a value that a message shows
 WITHOUT_VALUE = "without value"
 """Type of a mistake whose message omits the value: the first numbers of a matrix, for example, are no help."""
 
@@ -157,9 +155,8 @@ class CovarianceShape(Shape):
 @dataclass(frozen=True, slots=True)
 class Named:
     """An object of a file that holds attributes of a result: those named, in words, or all fields of a dataclass.
-
-    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result, Named()]``.
-    """
+    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result,
+    Named()]``."""
 
     names: str = ""
 
@@ -221,7 +218,6 @@ Points = Annotated[np.ndarray, Shape((None, 3))]
 Vector = Annotated[np.ndarray, Shape((None,))]
 Vector3 = Annotated[np.ndarray, Shape((3,))]
 Pair = Annotated[np.ndarray, Shape((2,))]
-
 ByFace = Annotated[str, "face"]
 ByLabel = Annotated[str, "label"]
 ByGroup = Annotated[str, "group"]
@@ -238,13 +234,11 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # not UTF-8, a NUL in the name, a number of 5000 digits, deep nesting
-        raise InputError(
-            "E-JSON-INVALID", f"{where}: not JSON ({' '.join(str(error).split())[:100]}); {remedy}"
-        ) from error
+        reason = " ".join(str(error).split())[:100]
+        raise InputError("E-JSON-INVALID", f"{where}: not JSON ({reason}); {remedy}") from error
     if not isinstance(content, dict):
-        raise InputError(
-            "E-JSON-CONTENT", f"{where}: a {type(content).__name__}, an object with named keys needed; {remedy}"
-        )
+        kind = type(content).__name__
+        raise InputError("E-JSON-CONTENT", f"{where}: a {kind}, an object with named keys needed; {remedy}")
     return content
 
 

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import ByValue
+from stcal.geometry.arrays import OF_POSE, TWIST, ByValue, Rows, first_fault
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
-from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
@@ -24,8 +23,7 @@ FARTHEST = 1e12
 """Largest value in any unit: it exceeds anything that is measured, and its square does not overflow."""
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
-COMMON = re.compile(r"common\d+_.+")
-"""Names of columns with errors that all poses have in common."""
+COMMON = re.compile(r"common\d+_.+")  # names of columns with errors that all poses have in common
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
@@ -87,16 +85,13 @@ class Table(ByValue):
     def numbers(self, column: str) -> np.ndarray:
         """Return the finite numbers (m,) of a column."""
         self._need(column)
-        values = self.columns[column]
-        if not isinstance(values, np.ndarray):
-            try:
-                values = np.array(values, dtype=float)
-            except ValueError:
-                values = np.array([_number(v) for v in values])
         text = self.columns[column]
-        self.refuse(
-            ~np.isfinite(values), "E-TABLE-NUMBER", lambda i: f"{column} is {str(text[i])!r}, a finite number needed"
-        )
+        try:
+            values = np.asarray(text, float)
+        except ValueError:
+            values = np.array([_number(v) for v in text])
+        bad, code = ~np.isfinite(values), "E-TABLE-NUMBER"
+        self.refuse(bad, code, lambda i: f"{column} is {str(text[i])!r}, a finite number needed")
         return values
 
     def refuse(self, bad: np.ndarray, code: str, said: Callable[[int], str]) -> None:
@@ -108,11 +103,10 @@ class Table(ByValue):
 
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
         """Return the values (m,) of the column ``name_unit``, in mm or rad."""
-        column = f"{name}_{self.unit(name, units)}"
-        return self._near(column) * units[self.unit(name, units)]
+        unit = self.unit(name, units)
+        return self._near(f"{name}_{unit}") * units[unit]
 
     def _near(self, column: str) -> np.ndarray:
-        """Return the values (m,) of a column; refuse values whose squares may overflow."""
         values, far = self.numbers(column), f"up to {FARTHEST:g} possible"
         self.refuse(np.abs(values) > FARTHEST, "E-VALUE-TOO-FAR", lambda i: f"{column} is {values[i]:g}, {far}")
         return values
@@ -145,13 +139,11 @@ class Table(ByValue):
 
     def has_rotation(self, prefix: str = "") -> bool:
         """Return True if there are quaternions; raise an error if only some of their columns exist."""
-        present = [prefix + c for c in QUATERNION if prefix + c in self.columns]
-        if present and len(present) < 4:
-            missing = ", ".join(prefix + c for c in QUATERNION if prefix + c not in self.columns)
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING",
-                f"{self.where}: {', '.join(present)} without {missing}; all four or none needed",
-            )
+        present = [prefix + c for c in QUATERNION if prefix + c in self]
+        missing = [prefix + c for c in QUATERNION if prefix + c not in self]
+        if present and missing:
+            both = f"{', '.join(present)} without {', '.join(missing)}"
+            raise InputError("E-TABLE-COLUMN-MISSING", f"{self.where}: {both}; all four or none needed")
         return bool(present)
 
     def quaternion_columns(self, prefix: str) -> list[str]:
@@ -168,8 +160,7 @@ class Table(ByValue):
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
-        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`, positive definite; None if there are
-        none."""
+        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are none."""
         names = [prefix + name for name in COVARIANCE]
         if not any(name in self for name in names):
             return None
@@ -181,39 +172,29 @@ class Table(ByValue):
         return full
 
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
-        """Refuse covariances (m, n, n) of the rows unless all are positive definite, by the first bad line and its
-        fault."""
-        fault = first_fault(full, rows, definite=True)
-        if fault is not None:
-            raise InputError(
-                "E-TABLE-COVARIANCE",
-                f"{self.where}: line {self.lines[fault.row]}: covariance: {fault.reason}; correct it",
-            )
+        """Refuse covariances (m, n, n) unless all are positive definite, by the first bad line."""
+        if fault := first_fault(full, rows, definite=True):
+            where = f"{self.where}: line {self.lines[fault.row]}"
+            raise InputError("E-TABLE-COVARIANCE", f"{where}: covariance: {fault.reason}; correct it")
 
     def common_errors(self, covariance: np.ndarray | None, prefix: str = "") -> np.ndarray | None:
-        """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
-
-        ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them.
-        """
+        """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or
+        None. ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them."""
         stems = (name.removeprefix(prefix) for name in self.columns if name.startswith(prefix))
         count = len({stem.split("_")[0] for stem in stems if COMMON.fullmatch(stem)})
         if not count:
             return None
         if covariance is None:
             raise InputError(
-                "E-TABLE-COVARIANCE",
-                f"{self.where}: columns common1_… without columns cov_…, which must include them; give both",
+                "E-TABLE-COVARIANCE", f"{self.where}: columns common1_… without cov_…, which include them; give both"
             )
         names = [prefix + name for name in common_columns(count)]
         self._need_all(names, "columns common1_rx …")
         values = np.column_stack([self.numbers(name) for name in names])
         full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
-        fault = first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True)
-        if fault is not None:
-            where = f"{self.where}: line {self.lines[fault.row]}"
-            raise InputError(
-                "E-TABLE-COVARIANCE", f"{where}: common errors are larger than the covariance; correct them"
-            )
+        if fault := first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True):
+            too_large = f"{self.where}: line {self.lines[fault.row]}: common errors are larger than the covariance"
+            raise InputError("E-TABLE-COVARIANCE", f"{too_large}; correct them")
         return full
 
     def header(self) -> str:
@@ -224,26 +205,21 @@ class Table(ByValue):
     def _need_all(self, names: Iterable[str], which: str) -> None:
         for name in names:
             if name not in self:
-                raise InputError(
-                    "E-TABLE-COLUMN-MISSING", f"{self.where}: {name} is missing; all {which} or none needed"
-                )
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{self.where}: no {name}; all {which} or none needed")
 
     def _need(self, column: str) -> None:
         if column not in self.columns:
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: column {column} is missing; the header is {self.header()}"
-            )
+            fault = f"{self.where}: no column {column}"
+            raise InputError("E-TABLE-COLUMN-MISSING", f"{fault}; the header is {self.header()}")
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
     """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or ``%`` with a space are
-    ignored.
-
-    Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns, numbers may
-    have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
-    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A :class:`Table` is
-    returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order, whatever their names.
-    """
+    ignored. Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns,
+    numbers may have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header.
+    Units in brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A
+    :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order,
+    whatever their names."""
     if isinstance(path, Table):
         return path
     where = f"{what} {path}"
@@ -268,28 +244,22 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     try:
         names = [name.strip() for name in cells_of(used[0][1], between)]
     except csv.Error as error:
-        raise InputError(
-            "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
-        ) from error
+        raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header needed") from error
     names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
         raise InputError(
-            "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
+            "E-TABLE-HEADER", f"{where}: line {used[0][0]} is numbers, a header with units needed, like x_mm"
         )
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
-            raise InputError(
-                "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
-            )
+            raise InputError("E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; once needed")
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
         raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]} is no header of the rows below it; remove it")
     if len(used) == 1:
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
-    numbers = [i for i, _ in used[1:]]
-    rows = [line for _, line in used[1:]]
+    numbers, rows = [i for i, _ in used[1:]], [line for _, line in used[1:]]
     if between == ",":
         try:
             fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
@@ -303,16 +273,12 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     except csv.Error:  # an unclosed cell, longer than any may be
         cells = []
     if len(cells) != len(rows):
-        open_one = next((i for i, line in used[1:] if line.count('"') % 2), numbers[0])
-        raise InputError(
-            "E-TABLE-CELLS",
-            f"{where}: line {open_one}: a quoted cell goes over several lines; one row on one line needed",
-        )
+        first = next((i for i, line in used[1:] if line.count('"') % 2), numbers[0])
+        open_cell = "a quoted cell goes over several lines; one row on one line needed"
+        raise InputError("E-TABLE-CELLS", f"{where}: line {first}: {open_cell}")
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
-            raise InputError(
-                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
-            )
+            raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, the header has {len(names)}")
     columns = {name: [row[k] for row in cells] for k, name in enumerate(names)}
     if between == ",":
         return Table(where, dict(columns), numbers, quaternions)
@@ -340,8 +306,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _COMMA_NUMBER = r"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?"
 _POINT = re.compile(rf"(.*?::.*?)[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]*")
 _COMMA_POINT = re.compile(rf"(.*?::.*?)[\s;]+({_COMMA_NUMBER})[\s;]+({_COMMA_NUMBER})[\s;]+({_COMMA_NUMBER})[\s;]*")
-_STATES_SEPARATOR = re.compile(r"sep=([,;\t])")
-"""First line of a table that Excel wrote, or is to read."""
+_STATES_SEPARATOR = re.compile(r"sep=([,;\t])")  # first line of a table that Excel wrote, or is to read
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 """A number that may be of thousands as well as a decimal."""
 
@@ -377,12 +342,10 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 def _shown(cell: object) -> str:
     text = str(cell)
-    if FORMULA.match(text) is None:
-        return text
     try:
         float(text)
     except ValueError:
-        return "'" + text
+        return text if FORMULA.match(text) is None else "'" + text
     return text
 
 
@@ -407,8 +370,10 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
     found = []
     for name in names:
         bracketed = _UNIT.fullmatch(name)
-        new = name if bracketed is None else f"{bracketed[1]}_{_short(bracketed[2] or bracketed[3])}"
-        new = RTDE.get(new, new)
+        if bracketed is not None:
+            word = (bracketed[2] or bracketed[3]).lower().replace("µ", "u").replace("°", "deg")
+            name = f"{bracketed[1]}_{next((short for short, long in _LONG.items() if word.startswith(long)), word)}"
+        new = RTDE.get(name, name)
         lower = new.lower()
         if unit and lower in ("x", "y", "z"):
             lower = new = f"{lower}_{unit}"
@@ -420,11 +385,6 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
 RTDE = {f"actual_TCP_pose_{i}": name for i, name in enumerate(("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))}
 RTDE |= {f"actual_q_{i}": f"q{i + 1}_rad" for i in range(6)}
 """Names of columns in recordings of Universal Robots' interface RTDE: the pose of the tool, and joint values."""
-
-
-def _short(unit: str) -> str:
-    word = unit.lower().replace("µ", "u").replace("°", "deg")
-    return next((short for short, long in _LONG.items() if word.startswith(long)), word)
 
 
 def _with_units_of_a_row(
@@ -442,11 +402,9 @@ def _with_units_of_a_row(
 
 
 def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> tuple[dict[str, list[str]], bool]:
-    """Return the columns with decimal points in place of decimal commas, and whether there were such.
-
-    Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
-    show that its comma is not of thousands; decimal points beside it are refused.
-    """
+    """Return the columns with decimal points in place of decimal commas, and whether there were such. Semicolons
+    stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must show that
+    its comma is not of thousands; decimal points beside it are refused."""
     numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
     with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}
     if not with_comma:
@@ -455,10 +413,8 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
     points = [cell for cells in columns.values() for cell in cells if "." in cell and re.fullmatch(_NUMBER, cell)]
     if points or (between != ";" and all(_THOUSANDS.fullmatch(cell) for cell in commas)):
         beside = f" beside {points[0]}" if points else ""
-        raise InputError(
-            "E-TABLE-DECIMAL",
-            f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands; write points",
-        )
+        fault = f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands"
+        raise InputError("E-TABLE-DECIMAL", f"{fault}; write points")
     return columns | {n: [cell.replace(",", ".") for cell in cells] for n, cells in with_comma.items()}, True
 
 
@@ -481,11 +437,10 @@ def _points_of_analyzer(
     used: Sequence[tuple[int, str]], comments: Sequence[str], where: str, quaternions: Order
 ) -> Table | None:
     """Return the points of SpatialAnalyzer, a name of one or three parts and three numbers each; None for others."""
-    matches = [_COMMA_POINT.fullmatch(line.strip()) for _, line in used]
-    commas = all(matches) and any("," in match[k] for match in matches if match for k in (2, 3, 4))
-    if not commas:
-        matches = [_POINT.fullmatch(line.strip()) for _, line in used]
-    points = [match.groups() for match in matches if match is not None]
+    both = ([form.fullmatch(line.strip()) for _, line in used] for form in (_COMMA_POINT, _POINT))
+    with_commas, points = ([match.groups() for match in matches if match] for matches in both)
+    commas = len(with_commas) == len(used) and any("," in number for point in with_commas for number in point[1:])
+    points = with_commas if commas else points
     if len(points) < len(used):
         return None
     names = [point[0].strip() for point in points]
@@ -520,8 +475,7 @@ def _number(text: str) -> float:
         return np.nan
 
 
-LEVER_MM = 1000.0
-"""Distance at which an error of rotation is compared as one of position, mm."""
+LEVER_MM = 1000.0  # distance at which an error of rotation is compared as one of position, mm
 POSE_MM = 1e-6
 """Largest difference of a written pose, mm at :data:`LEVER_MM`. Decimals of degrees and quaternions cause less."""
 

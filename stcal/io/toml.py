@@ -20,10 +20,7 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
-YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)
-"""A line as YAML has it."""
-
-
+YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)  # a line as YAML has it
 DEEPEST = 60
 DEEP = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST}}}""")
 """A dotted name of more parts than any table needs."""
@@ -66,9 +63,7 @@ class PoseEntry(Strict):
         wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
         length = float(np.linalg.norm(wxyz))
         if abs(length - 1) > UNIT_WITHIN:
-            raise InputError(
-                "E-QUATERNION-LENGTH", f"{where}: quaternion of length {length:.4g}, 1 needed; normalise qw, qx, qy, qz"
-            )
+            raise InputError("E-QUATERNION-LENGTH", f"{where}: quaternion of length {length:.4g}, 1 needed; correct it")
         return Poses.from_quaternions([wxyz], [[self.x_mm, self.y_mm, self.z_mm]])[0]
 
 
@@ -138,8 +133,7 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
 def load_yaml(text: str):
-    """Return the values of a text; of aliases, or a key twice, YAMLError. ``%YAML:1.0`` of ``cv2.FileStorage`` is
-    removed."""
+    """Return the values of a text; YAMLError for aliases and repeated keys; ``%YAML:1.0`` of OpenCV is removed."""
     return yaml.load(_without_directive(text), _Loader)
 
 
@@ -156,10 +150,5 @@ def opencv_matrix(name: str, values: np.ndarray) -> list[str]:
     """Return the lines of a matrix as ``cv2.FileStorage`` writes it, with numbers of full precision."""
     rows, columns = values.shape
     numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
-    return [
-        f"{name}: !!opencv-matrix",
-        f"   rows: {rows}",
-        f"   cols: {columns}",
-        "   dt: d",
-        f"   data: [ {numbers} ]",
-    ]
+    head = f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"
+    return [*head, f"   data: [ {numbers} ]"]

@@ -15,7 +15,7 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, checked, read_result
-from stcal.io.poses.rotations import READINGS
+from stcal.io.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
 from stcal.locate.scenes import Located
 

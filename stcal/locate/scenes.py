@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.boards.board_designs import TagLayout
-from stcal.boards.on_faces import shift_by_curves
+from stcal.boards.finders import shift_by_curves
 from stcal.boards.tags import seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields

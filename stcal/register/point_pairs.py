@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
-from stcal.io.covariance import OF_POINT
+from stcal.geometry.arrays import OF_POINT, Array, Brief, freeze, require_arguments, require_fields
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
 

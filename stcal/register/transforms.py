@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import OF_POINT, first_fault
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import (
     Affine,
@@ -18,7 +19,6 @@ from stcal.geometry.rigid import (
     best_rotations,
     skew,
 )
-from stcal.io.covariance import OF_POINT, first_fault
 
 Transform = Rigid | Similarity | Affine
 EXACT = 1e-11

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.columns import fixed
+from stcal.io.rotations import fixed
 
 NONE = "–"
 WIDTH = 100

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from stcal.geometry.arrays import require_arguments
-from stcal.io.poses.columns import fixed
+from stcal.io.rotations import fixed
 from stcal.io.table import csv_text
 from stcal.report.document import (
     Answer,

@@ -15,7 +15,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
-from stcal.io.poses.programs import METRE_MM, from_roll_pitch_yaw
+from stcal.io.static_transforms import METRE_MM, from_roll_pitch_yaw
 from stcal.io.toml import Strict, load_yaml, validated
 from stcal.robot.kinematics.dh import robot_between
 from stcal.robot.kinematics.forward import fixed_values, forward

@@ -12,8 +12,8 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written
-from stcal.io.poses.programs import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
-from stcal.io.poses.rotations import MOST_RAD
+from stcal.io.rotations import MOST_RAD
+from stcal.io.static_transforms import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
 from stcal.io.table import pose_values
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain

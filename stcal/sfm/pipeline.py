@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.board_file import board_of as board_of
-from stcal.boards.on_faces import tags_of_no_face
+from stcal.boards.finders import tags_of_no_face
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign, scale_reference, with_drawn_size
 from stcal.errors import ConvergenceError, InputError, InputNote, StcalError
@@ -18,8 +18,8 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import CameraModel, camera_prior, model_of
 from stcal.io.cameras.read import camera_model
+from stcal.io.device import AUTO, write_frames
 from stcal.io.images import TOP_GROUP, chosen_images
-from stcal.io.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.cells import black_areas, clear_mm
+from stcal.boards.board_designs import black_areas, clear_mm
 from stcal.boards.target_file import save_target
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
@@ -32,8 +32,7 @@ BEND_MM = 0.02  # σ of a point of a printed face about its plane
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
-"""Largest angles between the normal of a face and the line of sight: where a photograph shows the face, and where it
-shows the face squarely."""
+"""Largest angles of a face's normal to the line of sight: shown by a photograph, and shown squarely."""
 ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
 """Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
 TRIALS, CHOICES = 2000, 24
@@ -64,10 +63,7 @@ class BodyOptions:
     body_seed : int, optional
         Draws the errors of the body, so that another ``seed`` photographs the same one again; ``seed`` by default.
 
-    Raises
-    ------
-    InputError
-        A value is of another type, or out of range.
+    Raises InputError: a value is of another type, or out of range.
     """
 
     images: int = 24
@@ -89,10 +85,8 @@ class BodyOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyScene:
-    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image.
-
-    ``off_mm`` : (n, 3) by face, how far its points are from the design, without a shift or turn of the whole.
-    """
+    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image. ``off_mm`` :
+    (n, 3) by face, how far its points are from the design, without a shift or turn of the whole."""
 
     target: TargetDesign
     target_from_face: dict[str, Rigid]
@@ -145,11 +139,9 @@ def body_camera(width: int) -> Camera:
     width : int
         Width of its images, px.
     """
-    height = round(width * 2 / 3)
-    focal = 1.1 * width
-    distortion = np.array([-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0])
-    centre = np.array([width / 2 + 0.006 * width, height / 2 - 0.004 * width])
-    return Camera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
+    height, distortion = round(width * 2 / 3), [-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0]
+    centre = width / 2 + 0.006 * width, height / 2 - 0.004 * width
+    return Camera(width, height, [1.1 * width] * 2, centre, distortion, False, "OPENCV")
 
 
 @require_arguments
@@ -169,18 +161,12 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     options : BodyOptions, optional
         The defaults if None.
 
-    Raises
-    ------
-    InputError
-        A face has no rough pose, or the camera is too near for the image to hold the body.
+    Raises InputError: a face has no rough pose, or the camera is too near for the image to hold the body.
     """
     options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
         if face.id not in rough:
-            raise InputError(
-                "E-SIMULATE-BODY",
-                f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
-            )
+            raise InputError("E-SIMULATE-BODY", f"face {face.id}: no rough_pose; each face needs one in target.toml")
     rng = np.random.default_rng(options.seed)
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
     moved = {}
@@ -316,10 +302,9 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarr
         plate = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     low, high = plate.min(0), plate.max(0)
     px_mm = DRAWING_PX / float((high - low).max())
-    width, height = np.ceil((high - low) * px_mm).astype(int)
+    width, height = np.ceil((high - low) * px_mm).astype(int).tolist()
     ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
-
-    size = int(height), int(width)
+    size = height, width
     grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
     solid = covered_share([[(plate - low) * px_mm]], size)
     if off_mm is None:
@@ -338,11 +323,9 @@ def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.nda
 
 
 def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
-    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly.
-
-    ``areas`` : lists of closed lines (k, 2), px: the outline, then holes in the other direction. Each piece of a line
-    within one pixel adds what is between it and the picture's right side.
-    """
+    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly. ``areas`` : lists of
+    closed lines (k, 2), px: the outline, then holes in the other direction. Each piece of a line within one pixel
+    adds what is between it and the picture's right side."""
     height, width = size
     added = np.zeros((height, width + 1))
     for area in areas:
@@ -459,10 +442,7 @@ def write_body(
     progress : callable, optional
         Called with (done, total).
 
-    Raises
-    ------
-    InputError
-        The folder is not empty or cannot be written.
+    Raises InputError: the folder is not empty or cannot be written.
     """
     folder, count = Path(folder), len(scene.camera_from_target)
     with new_dataset(folder):

@@ -16,6 +16,7 @@ from stcal.boards.target_file import save_target
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.read import save_camera
+from stcal.io.files import unwritable
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
@@ -88,23 +89,20 @@ class TruthFile(ResultFile):
         options = options or RenderOptions()
         lens = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
         optics: dict[str, Any] = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
+        groups = {}
+        for name, group in scene.groups.items():
+            shown = [_circles(scene, name, i) for i in range(len(group.camera_from_target))]
+            images = {
+                image_name(name, i, image_format): TrueImage(camera_from_target=pose.matrix(), circles=shown[i])
+                for i, pose in enumerate(group.camera_from_target)
+            }
+            groups[name] = TrueGroup(board_circles_target=group.board_circles_target, images=images)
         truth = cls(
             unit="mm",
             reference_face=scene.reference_face,
             target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
             circles={str(label): xyz for label, xyz in scene.circles_target.items()},
-            groups={
-                name: TrueGroup(
-                    board_circles_target=group.board_circles_target,
-                    images={
-                        image_name(name, i, image_format): TrueImage(
-                            camera_from_target=pose.matrix(), circles=_circles(scene, name, i)
-                        )
-                        for i, pose in enumerate(group.camera_from_target)
-                    },
-                )
-                for name, group in scene.groups.items()
-            },
+            groups=groups,
         )
         return truth.model_copy(update={"optics": TrueOptics(**optics)}) if optics else truth
 
@@ -117,16 +115,12 @@ def image_name(group: str, image: int, image_format: str = "jpg") -> str:
 def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
     shown = image_circles(scene, group, image)
     number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
-    return {
-        number.get(label, label): TrueCircle(
-            centre_px=np.array([round(float(x), 5) for x in centre]),
-            tilt_deg=round(float(np.degrees(tilt)), 2),
-            must_find=bool(must),
-        )
-        for label, centre, tilt, must in zip(
-            shown.labels, shown.centre_px, shown.tilt_rad, shown.must_find, strict=True
-        )
-    }
+    made = {}
+    for i, label in enumerate(shown.labels):
+        centre, tilt_deg = np.round(shown.centre_px[i], 5), round(float(np.degrees(shown.tilt_rad[i])), 2)
+        circle = TrueCircle(centre_px=centre, tilt_deg=tilt_deg, must_find=bool(shown.must_find[i]))
+        made[number.get(label, label)] = circle
+    return made
 
 
 @require_arguments
@@ -144,10 +138,7 @@ def render_all(
     workers : int, optional
         Number of processes that render; one per core by default.
 
-    Raises
-    ------
-    InputError
-        The lens does not fit the scene.
+    Raises InputError: the lens does not fit the scene.
     """
     options = options or RenderOptions()
     check_lens(scene, options.lens)
@@ -163,9 +154,7 @@ IMAGE_FORMATS = ("jpg", "png")
 def new_dataset(folder: Path) -> Iterator[None]:
     """Refuses a folder that is not empty or not writable; if the block fails, the folder is left as it was."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
-        )
+        raise InputError("E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give another")
     existed = folder.exists()
     try:
         yield
@@ -175,9 +164,7 @@ def new_dataset(folder: Path) -> Iterator[None]:
         if not existed and folder.is_dir():
             folder.rmdir()
         if isinstance(error, OSError):
-            raise InputError(
-                "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
-            ) from error
+            raise unwritable(folder, error) from error
         raise
 
 
@@ -207,16 +194,12 @@ def write_dataset(
     workers, progress : int, callable, optional
         Number of processes, one per core by default; called with (done, total).
 
-    Raises
-    ------
-    InputError
-        The folder is not empty or cannot be written, or the image format or the lens does not fit.
+    Raises InputError: the folder is not empty or cannot be written, or the image format or the lens does not fit.
     """
     folder, options = Path(folder), render_options or RenderOptions()
     if image_format not in IMAGE_FORMATS:
-        raise InputError(
-            "E-OPTION-FORM", f"data set: image format {image_format}, one of {', '.join(IMAGE_FORMATS)} needed"
-        )
+        known = ", ".join(IMAGE_FORMATS)
+        raise InputError("E-OPTION-FORM", f"data set: image format {image_format}, one of {known} needed")
     if image_format == "jpg" and options.bit_depth != 8:
         raise InputError("E-OPTION-FORM", f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
     if not 1 <= jpeg_quality <= 100:
@@ -256,6 +239,4 @@ def _write_image(make: Callable[..., np.ndarray], path: Path, arguments: tuple, 
     try:
         path.write_bytes(data)
     except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"image {path}: {error.strerror or error}; free space or choose another folder"
-        ) from error
+        raise unwritable(path, error) from error

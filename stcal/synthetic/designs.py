@@ -14,7 +14,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))  # groups of Zhang & Wei (2017), sec. 2.
-
 DRAWINGS = {
     "top": "A 15 16 6, B 50 18 6, C 85 14 6, D 17 60 6, E 62 55 6, F 34 38 3.5, G 84 50 3.5, H 40 84 3.5, I 76 82 3.5",
     "left": "p 15 26 6, q 46 15 6, r 82 40 6, s 24 82 6, t 60 78 6, u 32 52 3.5, v 56 44 3.5, w 85 80 3.5",
@@ -46,10 +45,8 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
 
 
 def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple[FaceDesign, Rigid]:
-    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face.
-
-    The face frame has its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``.
-    """
+    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face. The face frame has
+    its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``."""
     ids = tuple(row[0] for row in circles)
     xy = np.array([row[1:3] for row in circles], float)
     zero, on_x, on_y = (np.append(xy[ids.index(circle)], 0.0) for circle in (origin, x, y))
@@ -96,16 +93,12 @@ def tag_dodecahedron(
 
 MOST_WIDTH_MM = 10_000.0
 MIN_CELL_PX = 2.0  # width of a tag's cell below which its corners are several times less exact
-
-
 Body = Literal["cube", "dodecahedron"]
 
 
 def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, faces: str = "") -> TargetDesign:
-    """Return a body of tags by its width between opposite faces, mm, which may be a text.
-
-    ``faces`` : ids of the faces that it is to have, such as ``1,2,3,4,5``; all of them if empty.
-    """
+    """Return a body of tags by its width between opposite faces, mm, which may be a text. ``faces`` : ids of the
+    faces that it is to have, such as ``1,2,3,4,5``; all of them if empty."""
     width, count = width_of(size), 6 if kind == "cube" else 12
     family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
     if kind == "cube":
@@ -114,9 +107,7 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
         whole = tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
     if unknown := [name for name in kept if name not in ids]:
-        raise InputError(
-            "E-OPTION-VALUE", f"--faces {faces}: the {kind} has no face {unknown[0]}; use some of {', '.join(ids)}"
-        )
+        raise InputError("E-OPTION-VALUE", f"--faces {faces}: no face {unknown[0]}; use some of {', '.join(ids)}")
     if kept and len(set(kept)) < 2:
         raise InputError("E-OPTION-VALUE", f"--faces {faces}: one face; two or more needed, such as 1,2,3")
     return replace(whole, faces=tuple(face for face in whole.faces if not kept or face.id in kept))
@@ -129,9 +120,7 @@ def width_of(size: str | float) -> float:
     except ValueError:
         width = 0.0
     if not 0 < width <= MOST_WIDTH_MM:
-        raise InputError(
-            "E-OPTION-VALUE", f"--size {size}: one width between opposite faces, mm, such as 60, needed with --tags"
-        )
+        raise InputError("E-OPTION-VALUE", f"--size {size}: a width between opposite faces, mm, needed with --tags")
     return width
 
 
@@ -147,9 +136,7 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
         f"{tag_px:.0f} px at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
     )
     nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
-    tilted = (
-        f"\nwarning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm or nearer"
-    )
+    tilted = f"\nwarning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm"
     return text + tilted * (nearest < distance_mm)
 
 

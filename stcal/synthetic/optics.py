@@ -50,10 +50,8 @@ class ThinLens:
     def __post_init__(self):
         require_fields(self, "lens")
         for name in ("f_number", "focal_mm", "focus_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(
-                    "E-SIMULATE-OPTIONS", f"lens: {name} {getattr(self, name):g}, a positive number needed"
-                )
+            if (value := getattr(self, name)) <= 0:
+                raise InputError("E-SIMULATE-OPTIONS", f"lens: {name} {value:g}, a positive number needed")
         if self.focus_mm <= self.focal_mm:
             raise InputError(
                 "E-SIMULATE-OPTIONS",
@@ -67,11 +65,9 @@ class ThinLens:
         return camera.focal.mean() * aperture_mm / 2 * np.abs(1 / np.asarray(depth_mm) - 1 / self.focus_mm)
 
     def points(self, confusion_px: float, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns points of the aperture (n, 2), mm, and their weights (n,), for means over it.
-
-        Gauss's rule for the squared radius and even angles: exact for what a Gaussian blur of ``blur_px`` leaves of an
-        image blurred by this circle of confusion. The points lie in pairs on both sides of the centre.
-        """
+        """Returns points of the aperture (n, 2), mm, and their weights (n,), for means over it. Gauss's rule for the
+        squared radius and even angles: exact for what a Gaussian blur of ``blur_px`` leaves of an image blurred by
+        this circle of confusion. The points lie in pairs on both sides of the centre."""
         waves = HIGHEST_WAVE / max(blur_px, LEAST_SIGMA_PX) * confusion_px
         n_rings, n_angles = int(np.ceil(waves / 4)) + 2, 2 * int(np.ceil(waves / 2)) + 4
         node, weight = np.polynomial.legendre.leggauss(n_rings)
@@ -104,13 +100,11 @@ def defocused(
     blur_px: float,  # σ of the Gaussian blur that follows, which decides how many points of the lens are taken
     light: np.ndarray | None = None,  # (h, w) of the disc on the last plane; even if None
 ) -> np.ndarray:
-    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens.
-
-    Parallel planes hold one outline each, and a ray is seen that lies in all of them. Through a point p of the lens
-    each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z). On a plane 1/Z is linear in the image, with a
+    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens. Parallel
+    planes hold one outline each, and a ray is seen that lies in all of them. Through a point p of the lens each
+    plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z). On a plane 1/Z is linear in the image, with a
     gradient g, so that the movement is an affine map: what is seen at y was at y − p (1/z_f − 1/Z(y)) / (1 − g p).
-    The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion.
-    """
+    The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion."""
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)
     at_lens, weights = lens.points(widest, blur_px)
     base = np.array(corner_px) - 0.5 + 0.5 / cells  # pixel of the first square
@@ -144,8 +138,6 @@ def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
 
 
 DARKEST = 1e-3  # least grey value, as a share of white. The photograph holds no information below.
-
-
 FULL_WELL, READ_NOISE = 10_000.0, 8.0
 """Electrons of a sensor at full scale, whose shot noise is the root of their number, and read noise in electrons."""
 
@@ -166,13 +158,11 @@ def expose(
     photograph: np.ndarray, times: Sequence[float], light: Light | None = None, seed: int = 0
 ) -> list[np.ndarray]:
     """Exposes the scene of an 8-bit photograph (height, width) at other times; time 1 keeps its brightness.
-
-    Saturated pixels of the photograph are taken to have the light of white. The noise of the exposures is independent.
-    """
+    Saturated pixels of the photograph are taken to have the light of white. The noise of the exposures is
+    independent."""
     if photograph.dtype != np.uint8 or photograph.ndim != 2:
-        raise InputError(
-            "E-IMAGE-TYPE", f"photograph: {photograph.dtype} of shape {photograph.shape}; 8-bit grey needed"
-        )
+        kind = f"{photograph.dtype} of shape {photograph.shape}"
+        raise InputError("E-IMAGE-TYPE", f"photograph: {kind}; 8-bit grey needed")
     if not all(time > 0 for time in times):
         raise InputError("E-EXPOSURES-VALUE", "exposure times: positive numbers needed")
     rng, exposures = np.random.default_rng(seed), []

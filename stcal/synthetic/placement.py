@@ -67,10 +67,8 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
     """Returns the axes (3, 3) of the view that shows two faces equally well: rows right, up, towards the camera."""
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
     if not 5 <= angle <= 130:
-        raise DegenerateError(
-            "E-SCENE-FACES",
-            f"{where}: {angle:.0f}° between the faces, 5° to 130° needed to photograph both; pair other faces",
-        )
+        fault = f"{where}: {angle:.0f}° between the faces, 5° to 130° needed"
+        raise DegenerateError("E-SCENE-FACES", f"{fault}; pair others")
     up, towards = np.cross(normal_a, normal_b), normal_a + normal_b
     up, towards = up / np.linalg.norm(up), towards / np.linalg.norm(towards)
     return np.array([np.cross(up, towards), up, towards])
@@ -79,11 +77,9 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
 def place_group(
     shape: GroupShape, camera: Camera, count: int, distance_mm: float, spread_rad: float, rng: np.random.Generator
 ) -> tuple[Rigid, list[Rigid]]:
-    """Returns target_from_board and ``count`` camera_from_target.
-
-    In every view both faces are tilted by up to 67° and the board by up to 50°, all of target and board is inside
-    the image, and neither covers the other. Among the views that satisfy this, those farthest apart are chosen.
-    """
+    """Returns target_from_board and ``count`` camera_from_target. In every view both faces are tilted by up to 67°
+    and the board by up to 50°, all of target and board is inside the image, and neither covers the other. Among the
+    views that satisfy this, those farthest apart are chosen."""
     best, shown = None, 0
     for _ in range(PLACES):
         target_from_board = _board_place(shape, rng)
@@ -130,10 +126,8 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
     roll = np.radians(rng.uniform(-15, 15, n)) + np.pi / 2 * rng.choice([-1, 0, 1], n, p=[0.08, 0.84, 0.08])
     points = np.vstack([shape.body, target_from_board @ shape.outline_board])
     aim = (points.min(0) + points.max(0)) / 2
-    views = _Views(
-        look_along(-direction, shape.axes[1], roll),
-        aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None],
-    )
+    centres = aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None]
+    views = _Views(look_along(-direction, shape.axes[1], roll), centres)
     free = np.array([camera.width, camera.height]) / camera.focal / 2 - IMAGE_MARGIN * camera.width / camera.focal
     place = rng.uniform(-0.7, 0.7, (n, 2))
     for step in range(3):

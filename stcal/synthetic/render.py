@@ -57,10 +57,8 @@ def draw_background(
     lens: ThinLens | None = None,
     reflectance: float | None = None,
 ) -> np.ndarray:
-    """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery.
-
-    A thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
-    """
+    """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery. A
+    thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs."""
     g, look = scene.groups[group], look_of(scene.target.polarity)
     canvas = np.full((scene.camera.height, scene.camera.width), round(look.wall), np.uint8)
     painter = _Painter(scene.camera, g.camera_from_target[image], canvas)
@@ -145,7 +143,6 @@ def _edges(corners: np.ndarray, pieces: int = 12) -> np.ndarray:
 
 
 def _wall(scene: Scene, g: Group, rng) -> Rigid:
-    """Returns target_from_wall of a wall behind target and board, z towards the camera."""
     points = np.vstack([*(scene.face_outline(face.id) for face in scene.target.faces), scene.board_outline(g.name)])
     turn = Rigid.exp([*np.radians(rng.uniform(-10, 10, 3)), 0, 0, 0]).rotation
     rotation = g.axes.T @ turn
@@ -167,7 +164,6 @@ def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
 
 
 def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
-    """Draws random discs of all sizes, as bright as the circles or fainter, and random ellipses."""
     n_discs, n_ellipses = 120, 60
     n = n_discs + n_ellipses
     centre = np.column_stack([rng.uniform(-LAMP_REACH_MM, LAMP_REACH_MM, (n, 2)), np.full(n, 1.0)])
@@ -205,7 +201,6 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: fl
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
-    """Draws the box: its silhouette, which hides the background, then the faces towards the camera, far ones first."""
     outlines = {face.id: scene.face_outline(face.id) for face in scene.target.faces}
     pixel, _ = painter.pixels(np.concatenate([_edges(outline) for outline in outlines.values()]))
     points = pixel.reshape(-1, 2)
@@ -263,8 +258,6 @@ class RenderOptions:
         the face is. Dots of the board have the rims that its design states.
     slope : float
         Fraction by which the light of each disc of the faces rises from one side to the other, along x of its face.
-    fade : float
-        Fraction of its light that each disc of the faces lacks at its edge; the loss grows with the squared radius.
     """
 
     noise: float = 0.01
@@ -280,15 +273,12 @@ class RenderOptions:
     lens: ThinLens | None = None
     rim_mm: float = 0.0
     slope: float = 0.0
-    fade: float = 0.0
 
     def __post_init__(self):
         require_fields(self, "rendering", seed=0)
-        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure", "slope", "fade"):
-            if getattr(self, name) < 0:
-                raise InputError(
-                    "E-SIMULATE-OPTIONS", f"rendering: {name} {getattr(self, name):g}, zero or more needed"
-                )
+        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure", "slope"):
+            if (value := getattr(self, name)) < 0:
+                raise InputError("E-SIMULATE-OPTIONS", f"rendering: {name} {value:g}, zero or more needed")
         if self.bit_depth not in (8, 16):
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
         if self.reflectance is not None and not 0 <= self.reflectance <= 1:
@@ -300,10 +290,8 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
     if lens is None:
         return
     if scene.camera.fisheye:
-        raise InputError(
-            "E-SIMULATE-OPTIONS",
-            "rendering: thin lens of an equidistant camera; a perspective camera needed, or leave the f-number out",
-        )
+        fault = "rendering: thin lens of an equidistant camera"
+        raise InputError("E-SIMULATE-OPTIONS", f"{fault}; a perspective camera needed, or leave the f-number out")
     widest, at_mm = 0.0, lens.focus_mm
     for name, group in scene.groups.items():
         for image in range(len(group.camera_from_target)):
@@ -320,10 +308,8 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:
-    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16.
-
-    The same arguments give the same image.
-    """
+    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16. The same arguments give
+    the same image."""
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)
@@ -386,8 +372,8 @@ def _add_circles(
         ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
         shares = [_fine_coverage(camera, ideal, plane, normal, radius, steep) for plane in planes]
         own = None
-        if (options.slope or options.fade) and slopes[i].any():
-            own = _light_of_disc(ideal, planes[-1], normal, radius, slopes[i], options)
+        if options.slope and slopes[i].any():
+            own = _light_of_disc(ideal, planes[-1], normal, radius, slopes[i], options.slope)
         if lens is not None and confusion[i] > SHARP_PX:
             share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px, own)
         else:
@@ -429,12 +415,11 @@ def _fine_coverage(
     return share.transpose(0, 2, 1, 3).reshape(height * FINE, width * FINE)
 
 
-def _light_of_disc(ideal: np.ndarray, centre, normal, radius: float, x, options: RenderOptions) -> np.ndarray:
+def _light_of_disc(ideal: np.ndarray, centre, normal, radius: float, x, slope: float) -> np.ndarray:
     """Returns the light of a disc over its mean level on the squares of :func:`_fine_coverage`; ``x`` : unit vector."""
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
     place = (rays * ((normal @ centre) / (rays @ normal))[..., None] - centre) / radius
-    light = 1 + options.slope / 2 * np.clip(place @ x, -1.5, 1.5)
-    light -= options.fade * np.minimum((place**2).sum(-1), 1.5)
+    light = 1 + slope / 2 * np.clip(place @ x, -1.5, 1.5)
     return cv2.resize(light.astype(np.float32), None, fx=FINE, fy=FINE, interpolation=cv2.INTER_LINEAR)
 
 
@@ -448,7 +433,6 @@ def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, r
 
 
 def _expose(picture: np.ndarray, options: RenderOptions, rng: np.random.Generator) -> np.ndarray:
-    """Returns the grey levels of the light ``picture`` on the sensor, which is overwritten."""
     height, width = picture.shape
     x = ((np.arange(width) - (width - 1) / 2) / (width / 2)).astype(np.float32)
     y = ((np.arange(height) - (height - 1) / 2) / (width / 2)).astype(np.float32)

@@ -18,7 +18,6 @@ from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
 __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]
-
 FACE_MARGIN_MM = 15.0
 """How far a plate is assumed to reach beyond the rims of its circles, mm, if the design states no outline."""
 BOARD_MARGIN_MM = 15.0
@@ -94,9 +93,7 @@ class SceneOptions:
         if self.fisheye_deg is not None and not 60 <= self.fisheye_deg <= 170:
             raise InputError("E-OPTION-RANGE", f"scene: fisheye_deg {self.fisheye_deg:g}, 60 to 170 possible")
         if len(self.distortion) > 8:
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible"
-            )
+            raise InputError("E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} coefficients, at most 8 possible")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,20 +179,14 @@ def make_scene(
     camera : Camera, optional
         The camera, in place of the one that the options describe.
 
-    Raises
-    ------
-    InputError
-        A group names an unknown face, a nominal pose is missing, or the camera states no image size or is given beside
-        ``fisheye_deg``.
-    DegenerateError
-        The faces do not bound a convex body, or a group cannot be photographed.
+    Raises InputError: a group names an unknown face, a nominal pose is missing, or the camera states no image size or
+    is given beside ``fisheye_deg``.
+    Raises DegenerateError: the faces do not bound a convex body, or a group cannot be photographed.
     """
     options = options or SceneOptions()
     if camera is not None:
         if options.fisheye_deg is not None:
-            raise InputError(
-                "E-OPTION-CONFLICT", "scene: camera and fisheye_deg given, which are two cameras; give one of them"
-            )
+            raise InputError("E-OPTION-CONFLICT", "scene: camera and fisheye_deg are two cameras; give one of them")
         model = camera_model(camera)
         if not (model.width and model.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file")
@@ -206,8 +197,7 @@ def make_scene(
         return _seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
     target, board = target or reference_target(), board or reference_board()
     nominal = nominal or target.rough_poses()
-    missing = [face.id for face in target.faces if face.id not in nominal]
-    if missing:
+    if missing := [face.id for face in target.faces if face.id not in nominal]:
         raise InputError("E-TARGET-ROUGH-POSE", f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
@@ -242,15 +232,13 @@ def group_name(pair: tuple[str, str]) -> str:
 
 
 def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[CircleLabel, np.ndarray]]:
-    """Returns true poses and circles, in the frame of the reference face."""
     placed, frames = {}, {}
     for face in target.faces:
         turn, shift = rng.standard_normal((2, 3)) / np.sqrt(3)
         moved = Rigid.exp([*(np.radians(options.face_turn_deg) * turn), *(options.face_shift_mm * shift)])
         # The face turns about its own origin, so that only the shift moves the origin.
-        pose = Rigid(
-            moved.rotation @ nominal[face.id].rotation, nominal[face.id].translation + options.face_shift_mm * shift
-        )
+        rough = nominal[face.id]
+        pose = Rigid(moved.rotation @ rough.rotation, rough.translation + options.face_shift_mm * shift)
         xy = face.xy_mm + options.circle_sigma_mm * rng.standard_normal(face.xy_mm.shape)
         xyz = pose @ np.column_stack([xy, np.zeros(len(xy))])
         placed[face.id] = xyz
@@ -274,11 +262,8 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
     if is_reference and set(REFERENCE_GROUPS) <= set(visible_pairs):
         return list(REFERENCE_GROUPS)
     if not visible_pairs:
-        raise DegenerateError(
-            "E-SCENE-FACES",
-            f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both; "
-            "check the rough poses, or add a face",
-        )
+        fault = f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both"
+        raise DegenerateError("E-SCENE-FACES", f"{fault}; check the rough poses, or add a face")
     return visible_pairs
 
 
@@ -356,16 +341,12 @@ PAST = (0.42, 0.24)
 
 
 def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
-    """Returns the scene with cameras of COLMAP's OPENCV_FISHEYE at the same places, turned at random.
-
-    ``field_deg`` : field of view over the image's diagonal, without distortion.
-    """
+    """Returns the scene with cameras of COLMAP's OPENCV_FISHEYE at the same places, turned at random. ``field_deg``
+    : field of view over the image's diagonal, without distortion."""
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2
     focal = np.hypot(original.width, original.height) / 2 / half
-    camera = Camera(
-        original.width, original.height, np.array([focal, focal]), original.centre, np.array(DISTORTION), True
-    )
+    camera = Camera(original.width, original.height, [focal, focal], original.centre, DISTORTION, True)
     groups = {}
     for name, group in scene.groups.items():
         angles = rng.uniform(-1, 1, (len(group.camera_from_target), 2)) * half * PAST

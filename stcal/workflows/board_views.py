@@ -20,8 +20,7 @@ from stcal.boards.board_designs import (
     TagLayout,
     turns,
 )
-from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
-from stcal.boards.on_faces import shift_by_curves, straightened
+from stcal.boards.finders import find_charuco, find_chessboard, shift_by_curves, straightened, why_no_chessboard
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
@@ -32,8 +31,7 @@ from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_hom
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
-from stcal.io.image_jobs import run_on_images
-from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit
+from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit, run_on_images
 from stcal.labels import DotLabel
 from stcal.locate.layout_calibration import CalibrationImages
 from stcal.parallel import Progress, one_thread

@@ -11,7 +11,7 @@ from typing import Any
 
 import stcal
 from stcal.errors import DetectionError, InputError
-from stcal.io.image_jobs import spread
+from stcal.io.images import spread
 from stcal.parallel import AT_ONCE
 
 ANSWER_S = 10  # longest time that a scheduler, and the first worker, may take to answer, in s

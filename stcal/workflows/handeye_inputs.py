@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.several import load_boards
+from stcal.boards.target_file import load_boards
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import TWIST
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pose_pairs import SIDES, read_side
 from stcal.handeye.data.record import Said, require_each_once
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.io.covariance import TWIST
 from stcal.io.table import LENGTHS, read_table
 from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain

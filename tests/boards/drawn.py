@@ -7,8 +7,7 @@ from stcal.boards.board_designs import AprilGridDesign
 
 IMAGE_FROM_MM = np.array([[2.6, -0.5, 330.0], [0.4, 2.3, 180.0], [-2e-4, 3e-4, 1.0]])
 """A view with perspective, pixels of the image from millimetres on the sheet."""
-SHARPER = 3
-"""The view is drawn larger by this and averaged down, which makes the edges what pixels see."""
+SHARPER = 3  # the view is drawn larger by this and averaged down, which makes the edges what pixels see
 
 
 def chessboard_mm(rows: int, columns: int, square: float, per_mm: int = 4) -> tuple[np.ndarray, float]:

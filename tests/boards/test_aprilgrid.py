@@ -14,8 +14,7 @@ from stcal.workflows.board_views import _find_flat
 from tests.boards.drawn import IMAGE_FROM_MM, aprilgrid_mm, photograph
 
 CAMERA = Camera(1200, 900, [1500, 1500], [600, 450], np.zeros(8))
-CORNER_PX = 0.12
-"""As in the tests of the other boards."""
+CORNER_PX = 0.12  # as in the tests of the other boards
 GRID = AprilGridDesign(3, 4, 30.0, 0.3)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from stcal.boards.board_designs import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.board_file import load_flat_board
-from stcal.boards.chessboard import find_charuco, find_chessboard
+from stcal.boards.finders import find_charuco, find_chessboard
 from stcal.boards.tags import find_tags, view_of_tags
 from stcal.geometry.plane import apply_homography
 from tests.boards.drawn import IMAGE_FROM_MM, chessboard_mm, photograph

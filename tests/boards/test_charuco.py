@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_designs import CharucoDesign
-from stcal.boards.chessboard import find_charuco
+from stcal.boards.finders import find_charuco
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography
 from stcal.workflows.board_views import find_board

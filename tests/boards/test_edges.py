@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.boards.area import solved
 from stcal.boards.board_designs import CharucoDesign, ChessboardDesign, TagLayout
-from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.edges import crossings, integrated_step
+from stcal.boards.finders import find_charuco, find_chessboard
 from stcal.boards.tags import corner_blocks, find_tags
 from tests.support.areas import homography, rendered, squares_nees, warped
 

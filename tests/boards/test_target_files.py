@@ -14,7 +14,6 @@ from tests.outcome import fails_with
 
 ROUNDED_MM = 1e-9
 """Lengths are written with nine decimals: half a unit of the last is 5e-10 mm."""
-
 CIRCLES = """\
   { id = "1", x_mm = 0, y_mm = 0, radius_mm = 8 },
   { id = "2", x_mm = 40, y_mm = 0, radius_mm = 8 },
@@ -287,7 +286,11 @@ def test_corner_radii_at_the_bounds_are_taken(tmp_path, radius_mm):
     assert board_of(tmp_path, BOARD + corner(6, 8, radius_mm)).radii_mm()[-1] == radius_mm
 
 
-@pytest.mark.parametrize("text", ['type = "aprilgrid"\nrows = 3\n', "target_type: 'checkerboard'\ntargetCols: 6\n"])
+CHESSBOARD = 'type = "chessboard"\nrows = 3\ncolumns = 4\nsquare_mm = 20.0\n'
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.03\ntagSpacing: 0.3\n"
+
+
+@pytest.mark.parametrize("text", [CHESSBOARD, KALIBR])
 def test_another_kind_of_board_is_named(tmp_path, text):
     (tmp_path / "board").write_text(text)
     with fails_with("E-BOARD-TYPE … board of dots needed … calibrate-camera"):

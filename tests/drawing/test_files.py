@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import stcal
-from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign
+from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign, outlines
 from stcal.boards.board_file import board_toml
-from stcal.boards.cells import outlines
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import POINT_MM, draw

@@ -10,7 +10,7 @@ from stcal.boards.board_designs import (
     ChessboardDesign,
     TagLayout,
 )
-from stcal.boards.chessboard import find_charuco, find_chessboard
+from stcal.boards.finders import find_charuco, find_chessboard
 from stcal.boards.tags import find_aprilgrid, find_tags
 from stcal.boards.target_file import target_toml
 from stcal.design import BoardDesign, TargetDesign, reference_target

@@ -15,8 +15,7 @@ UNREAD = ("report.html", "detections.csv", "overlays", "compare.json", "no-colma
 """Of a run's folder: read by people alone, or by the next run alone."""
 BRIEF_S = 1.0
 """Processor time of a call up to which it is made with any mutation where time counts; else with one of ``REFUSED``."""
-OPTION_SHARE = 0.06
-"""Of cases that change no file but an option."""
+OPTION_SHARE = 0.06  # of cases that change no file but an option
 VALUES = (
     *("nan", "inf", "-1", "0", "1e308", "1e-308", "1e150", "1e-150", "-1e308", "abc"),
     *("", "\x1b[31m", "é", "1,5", "9" * 30, "x" * 3000),

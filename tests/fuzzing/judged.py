@@ -27,10 +27,8 @@ LONGEST_S = 60.0
 """Of processor time; three times as much by the clock, as others may have the processor."""
 MOST_BYTES = 2 << 30
 LONGEST_PRINTED = 4 << 20
-CODES = (0, 2, 3, 4)
-"""That a command ends with by itself."""
-FAILED_CHECKS = 4
-"""Of a run whose results are written, and not to be used."""
+CODES = (0, 2, 3, 4)  # that a command ends with by itself
+FAILED_CHECKS = 4  # of a run whose results are written, and not to be used
 EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
 _NO_POSE = "no pose accepted"

@@ -25,8 +25,7 @@ from tests.fuzzing.mutations import a_folder, emptied, flipped, missing, pick, t
 STREAM_KEPT, STREAM_CLOSED = 20_000_000, 30_000_000
 """Keep the random numbers of these cases from those of others."""
 LONGEST_CALL_S = 6.0
-KEPT_IN = ("run", "detected")
-"""Folders of the stock that commands keep for the next one."""
+KEPT_IN = ("run", "detected")  # folders of the stock that commands keep for the next one
 COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".nvm", ".bin", ".gltf", ".glb"}
 REMADE_BY = ("sfm run", "sfm detect")
 """Commands that make what they keep anew; others leave what was spoiled as it is."""

@@ -22,14 +22,11 @@ from tests.fuzzing.mutations import pick
 
 ENDED = {signal.SIGKILL: (-9, 2.0), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
 """Exit code, and within which time, s."""
-STARTING_S = 0.3
-"""Until then Python itself may be loading, and no program answers a signal yet."""
-LOADED_S = 1.0
-"""Time that Python and the libraries take before any work."""
+STARTING_S = 0.3  # until then Python itself may be loading, and no program answers a signal yet
+LOADED_S = 1.0  # time that Python and the libraries take before any work
 LARGEST_FILE = (100, 300_000)
 MEMORY = (500 << 20, 900 << 20)
-STREAM = 10_000_000
-"""Keeps the random numbers of kills from those of cases."""
+STREAM = 10_000_000  # keeps the random numbers of kills from those of cases
 _SEEN_BELOW = ("not one line", "broken result", "earlier run lost")
 """Of an ended program: its line is judged where it ends, and new results that are complete are as good as the earlier
 ones."""

@@ -18,9 +18,7 @@ from tests.fuzzing.stock import write_rows
 Edit = Callable[[Path], None]
 SAID = r"(?i)\b(warning|note|failed|suspicious|reject|layout does not have)\b"
 INCH = 1 / 25.4
-LENGTHS = ("target_from_face", "circles")
-"""Keys of a faces file and a truth."""
-
+LENGTHS = ("target_from_face", "circles")  # keys of a faces file and a truth
 TURNED = "a chessboard turned by a quarter is the same board"
 
 

@@ -63,7 +63,6 @@ def _flipped(data: bytes, rng: np.random.Generator) -> bytes:
 LINE_ENDS = (b"\r\n", b"\r", b"\n\n", "\u2028".encode(), b"\x0c\n")
 CONTROL = (b"\x1b[31;1m", b"\x00", b"\x07\x08", "\u202e\u200b".encode(), b"\x7f")
 ENCODINGS = ("utf-16", "utf-16-be", "utf-32")
-
 truncated = _bytes("truncated", lambda data, rng: data[: int(rng.integers(len(data) + 1))])
 flipped = _bytes("flipped", _flipped)
 emptied = _bytes("emptied", lambda *_: b"")

@@ -21,8 +21,7 @@ from tests.fuzzing.mistakes import MISTAKES, told
 from tests.fuzzing.writers import unchecked, watched
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
-MOST_MEMORY = 8 << 30
-"""Of a process, so that the machine lives."""
+MOST_MEMORY = 8 << 30  # of a process, so that the machine lives
 
 
 def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:

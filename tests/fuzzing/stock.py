@@ -12,8 +12,7 @@ from stcal.boards.target_file import target_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.forms import written
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, written
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml
@@ -61,8 +60,7 @@ rpy_deg = [0.0, 30.0, 0.0]
 """
 HOLDS = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
 """Joint values of an arm at the first photograph."""
-BOARD_AT_MM = (30, 230)
-"""Of the board beside the tags, on the sheet."""
+BOARD_AT_MM = (30, 230)  # of the board beside the tags, on the sheet
 
 
 def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None = None) -> Path:
@@ -127,7 +125,6 @@ def _cameras(folder: Path) -> None:
     storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     storage.write("distortion_coefficients", given.distortion[None, :5].copy())
     storage.release()
-    (forms / "industrial.yaml").write_text(f"intrinsics:\n  fx: {fx}\n  fy: {fy}\n  cx: {cx}\n  cy: {cy}\n")
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))

@@ -15,7 +15,6 @@ TEXTS = (
 )
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 KEYS = ("x", "", "a.b", "a b", "\x1b[1m", "é" * 300)
-
 YAML = {
     "an alias bomb": "a: &a [x,x,x,x,x,x,x,x,x]\n"
     + "".join(f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))

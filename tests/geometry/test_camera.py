@@ -10,7 +10,6 @@ from stcal.geometry.camera import Camera
 from tests.outcome import fails_with, refuses
 
 WIDTH, HEIGHT = 5184, 3456
-
 small = st.floats(-1, 1)
 # Lenses from strong barrel to strong pincushion that do not fold within ±0.5 (27° off axis).
 lenses = st.tuples(small, small, small, small, small, small, small, small).map(

@@ -21,7 +21,6 @@ from tests.outcome import fails_with
 GRID = np.array([[x, y] for y in range(0, 100, 25) for x in range(0, 125, 25)], float)
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 THREE_ON_A_LINE = np.array([[0.0, 0], [1, 0], [2, 0], [0, 1]])
-
 angle = st.floats(-0.8, 0.8)
 shift = st.floats(-100, 100)
 poses = st.builds(

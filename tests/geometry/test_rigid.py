@@ -13,7 +13,6 @@ from tests.outcome import fails_with
 
 TOLERANCE_MM = 1e-9
 """Rounding: three products of coordinates below 1e4 mm lose about 1e4 · 1e-16 · 10 = 1e-11 mm."""
-
 length_mm = st.floats(-1000, 1000)
 vectors = st.tuples(length_mm, length_mm, length_mm).map(np.array)
 unit = st.floats(-1, 1)

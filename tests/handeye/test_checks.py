@@ -18,7 +18,7 @@ from stcal.handeye.judge.observable import Observability
 from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.solving import handeye
-from stcal.io.poses.rotations import INVERTED
+from stcal.io.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses

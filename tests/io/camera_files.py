@@ -104,7 +104,6 @@ MRCAL = (
 )
 OLD_NAMES = ("Camera_Matrix", "Distortion_Coefficients", "image_Width", "image_Height")
 SKEWED = "911.5 0.7 639. 0. 910.25 359. 0. 0. 1."
-
 FILES = {
     "OpenCV": (storage(), perspective(D5)),
     "OpenCV, fisheye": (storage("<fisheye_model>1</fisheye_model>", d=K4), equidistant(K4)),
@@ -140,17 +139,13 @@ FILES = {
     "Metashape": (METASHAPE, perspective(D5)),
     "Kalibr": (CHAIN, perspective(D4)),
     "mrcal": (MRCAL, perspective(D5)),
-    "ROS-Industrial": (
-        "data: []\nfinder: {type: A}\nintrinsics:\n  fx: 911.5  # px\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
-        perspective([]),
-    ),
 }
 """A file of each program, and the pixels of RAYS."""
-
 FX = "fx: 911.5\n{0}fy: 910.25\n{0}cx: 639.0\n{0}cy: 359.0\n"
 LENS_JSON = '"fx": 911.5, "fy": 910.25, "cx": 639.0, "cy": 359.0'
 MATRIX_JSON = "[[911.5, 0, 639.0], [0, 910.25, 359.0], [0, 0, 1]]"
 REMOVED = {
+    "ROS-Industrial": "intrinsics:\n  fx: 911.5\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
     "ORB-SLAM": f'%YAML:1.0\nCamera.type: "PinHole"\nCamera.{FX.format("Camera.")}Camera.k1: -0.2\n',
     "Nerfstudio": '{"camera_model": "OPENCV", "fl_x": 911.5, "fl_y": 910.25, "cx": 639.5, "cy": 359.5, "frames": []}',
     "KITTI": f"S_00: 1280 720\nK_00: {FLAT}\nD_00: {D5}\nK_01: {FLAT}\nP_rect_00: {P}\n",

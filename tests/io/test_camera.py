@@ -15,8 +15,6 @@ from tests.outcome import fails_with
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
 D5 = [0.1, -0.2, 0.003, -0.004, 0.05]
-
-
 COLMAP_CASES = {
     "SIMPLE_PINHOLE": [1000, 500.5, 400.5],
     "PINHOLE": [1000, 1100, 500.5, 400.5],
@@ -124,19 +122,6 @@ def test_other_names_in_use(tmp_path, names):
 )
 def test_the_smallest_colmap_model_that_holds_it(tmp_path, distortion, expected):
     assert read(tmp_path, yaml_text(d=distortion)).colmap_model == expected
-
-
-def test_ros_industrial(tmp_path):
-    """Its form has no distortion, but the lens may have some: OPENCV, so that it can be adjusted."""
-    path = tmp_path / "cal_data.yaml"
-    path.write_text("data: []\nintrinsics:\n  fx: 1352.5  # px\n  fy: 1356\n  cx: 789.7\n  cy: 627.3\n")
-    camera = read_camera(path)
-    assert camera.focal.tolist() == [1352.5, 1356]
-    assert camera.centre.tolist() == [789.7, 627.3]
-    assert (camera.colmap_model, camera.width) == ("OPENCV", None)
-    path.write_text("intrinsics:\n  fx: 1352.5\n  cx: 789.7\n")
-    with fails_with("E-CAMERA-CONTENT … fy"):
-        read_camera(path)
 
 
 def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):

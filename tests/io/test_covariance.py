@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.io.covariance import OF_POSE, ROUNDING, Rows, first_fault, require_covariance
+from stcal.geometry.arrays import OF_POSE, ROUNDING, Rows, first_fault, require_covariance
 from stcal.io.json import Part, PoseCovariance, checked
 from tests.outcome import fails_with
 

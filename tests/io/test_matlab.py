@@ -8,8 +8,7 @@ from scipy.io import savemat
 
 from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.forms import written
-from stcal.io.cameras.read import read_camera, read_lens
+from stcal.io.cameras.read import read_camera, read_lens, written
 from tests.io.test_camera_forms import camera_of
 from tests.outcome import fails_with
 

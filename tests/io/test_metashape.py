@@ -5,8 +5,7 @@ import pytest
 
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.camera_model import camera_prior
-from stcal.io.cameras.forms import written
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, written
 from tests.io.test_camera_forms import camera_of
 from tests.outcome import fails_with
 

@@ -6,7 +6,7 @@ import pytest
 from PIL import ExifTags, Image
 
 import stcal
-from stcal.io.cameras.photograph import SIGMA_FOCAL, camera_of_photograph, is_photograph
+from stcal.io.cameras.read import SIGMA_FOCAL, camera_of_photograph, is_photograph
 from tests.outcome import fails_with
 
 

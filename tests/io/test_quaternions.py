@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses
-from stcal.io.poses.rotations import FIRST, INVERTED, LAST, READINGS
+from stcal.io.rotations import FIRST, INVERTED, LAST, READINGS
 from stcal.io.table import read_table
 
 XYZW = np.array([[0.1, 0.2, 0.3, 0.0], [0.5, -0.5, 0.1, 0.0]])

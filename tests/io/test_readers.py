@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_file import load_board, load_flat_board
-from stcal.boards.several import load_boards
-from stcal.boards.target_file import load_target
+from stcal.boards.target_file import load_boards, load_target
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.inputs import read_pairs, require_own
 from stcal.handeye.data.record import Said

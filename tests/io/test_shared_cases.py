@@ -7,8 +7,7 @@ import pytest
 from scipy.io import loadmat
 
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.photograph import camera_of_photograph
-from stcal.io.cameras.read import read_lens
+from stcal.io.cameras.read import camera_of_photograph, read_lens
 from tests.io.reported_cameras import CASES, RAYS, REFUSED, perspective
 from tests.outcome import fails_with
 

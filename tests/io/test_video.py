@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stcal.errors import InputNote
 from stcal.geometry.rigid import Rigid
+from stcal.io.device import AUTO, MOVED, chosen_frames, sharpness, write_frames
 from stcal.io.images import find_images
-from stcal.io.video import AUTO, MOVED, chosen_frames, sharpness, write_frames
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.body_scene import (

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_designs import CharucoDesign, TagLayout
-from stcal.boards.chessboard import find_charuco
+from stcal.boards.finders import find_charuco
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraModel

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid, UncertainRigid
-from stcal.io.poses.rotations import INVERTED
+from stcal.io.rotations import INVERTED
 from stcal.locate.base_chain import GoalChain, on_chain
 
 MOUNT = Rigid.exp([0.1, -0.2, 1.5, 60, -30, 110])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stcal.boards.on_faces import shift_by_curves
+from stcal.boards.finders import shift_by_curves
 from stcal.boards.target_file import load_target, target_toml
 from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.draw import net_text

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from stcal.boards.cells import SquaresOrTags, black_areas
+from stcal.boards.board_designs import SquaresOrTags, black_areas
 
-FINE = 4
-"""Pixels of the grid, along each axis of a pixel, on which blur is applied."""
+FINE = 4  # pixels of the grid, along each axis of a pixel, on which blur is applied
 
 
 def rendered(

@@ -7,8 +7,7 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.synthetic.scene import Scene
 
-PERIOD = 50.0
-"""Images of one swing, within a third."""
+PERIOD = 50.0  # images of one swing, within a third
 
 
 def filmed(

@@ -15,8 +15,6 @@ FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True)
 BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])
 BASE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [80, -10, -115], degrees=True).as_matrix(), [1250.0, -150.0, 640.0])
 FLANGE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [20, 178, 4], degrees=True).as_matrix(), [40.0, -55.0, 130.0])
-
-
 CAMERA = Camera(1280, 1024, [1450.0, 1450.0], [639.5, 511.5], [-0.08, 0.05, 2e-4, -1e-4, 0, 0, 0, 0])
 
 

@@ -11,13 +11,11 @@ from stcal.handeye.data.pose_pairs import HandEyePoses, Setup
 from stcal.handeye.data.stream import Stream
 from tests.support.handeye import BASE_FROM_BOARD, BASE_FROM_CAMERA, FLANGE_FROM_BOARD, FLANGE_FROM_CAMERA, disturbed
 
-SECONDS = 24.0
-"""That the robot moves."""
+SECONDS = 24.0  # that the robot moves
 TURN_RAD, WAY_MM = np.array([0.5, 0.45, 0.5]), np.array([90.0, 80.0, 120.0])
 TURN_RATE, WAY_RATE = np.array([1.1, 0.9, 0.7]), np.array([0.8, 1.3, 1.0])
 MIDDLE_MM = np.array([-100.0, -87.5, 500.0])
-SAMPLE = 2e-5, 0.01
-"""σ (rad, mm) of what a sample of the stream errs by."""
+SAMPLE = 2e-5, 0.01  # σ (rad, mm) of what a sample of the stream errs by
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,8 +19,7 @@ from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.scene import Scene
 
-FLATNESS_MM = 0.02
-"""As a run takes it by default."""
+FLATNESS_MM = 0.02  # as a run takes it by default
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,8 +22,7 @@ from stcal.synthetic.scene import rim_points
 
 EDGE_PX = 0.7
 """Gaussian blur of what is drawn: about that of the lens."""
-MARGIN_MM = 10.0
-"""From the outermost rims to a plate's edge."""
+MARGIN_MM = 10.0  # from the outermost rims to a plate's edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)

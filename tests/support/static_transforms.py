@@ -1,4 +1,4 @@
-"""Readers of the static transforms that ``stcal.io.poses.programs`` writes, as the other programs read them."""
+"""Readers of the static transforms that ``stcal.io.static_transforms`` writes, as the other programs read them."""
 
 import ast
 import shlex
@@ -9,7 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.programs import ARGUMENTS, METRE_MM, Static, from_roll_pitch_yaw
+from stcal.io.static_transforms import ARGUMENTS, METRE_MM, Static, from_roll_pitch_yaw
 
 
 def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:

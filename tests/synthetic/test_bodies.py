@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_designs import CharucoDesign
-from stcal.boards.on_faces import find_on_faces
+from stcal.boards.finders import find_on_faces
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.synthetic.body_scene import BLACK, WHITE, BodyOptions, body_camera, drawing_of, make_body_scene, render_body
 from stcal.synthetic.designs import tag_cube
 
-TIE_MM = 70.0
-"""Side of a cube whose tags have edges in the middle between two pixels of their drawing."""
+TIE_MM = 70.0  # side of a cube whose tags have edges in the middle between two pixels of their drawing
 
 
 @pytest.mark.parametrize("size_mm", [45.0, 60.0, TIE_MM])

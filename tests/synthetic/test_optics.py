@@ -17,8 +17,7 @@ from tests.outcome import fails_with, refuses
 
 OPTIONS = SceneOptions(seed=1, width=972, height=648, images_per_group=2, groups=(("1", "2"), ("1", "5")))
 PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0, bit_depth=16)
-PUPIL = 150
-"""Points of the lens of the traced rays."""
+PUPIL = 150  # points of the lens of the traced rays
 
 
 @pytest.fixture(scope="module")

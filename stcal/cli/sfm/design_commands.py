@@ -103,13 +103,9 @@ def simulate(
         names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
         others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
-            )
-        shape = BodyOptions(
-            images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0, body_seed=body_seed
-        )
+            fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
+        shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1, body_seed=body_seed)
         file = None if camera is None else read_camera(camera)
         if file is not None and not (file.width and file.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
@@ -149,16 +145,13 @@ def _lens(
     distance_mm: float,
     camera: Path | None,
 ) -> "ThinLens | None":
-    """The thin lens of the options, or none; without ``focal_mm`` that of a sensor of the usual width."""
     from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import SENSOR_WIDTH_MM
 
     if f_number is None:
         for name, value in {"--focus-mm": focus_mm, "--focal-mm": focal_mm}.items():
             if value is not None:
-                raise InputError(
-                    "E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number, or leave {name} out"
-                )
+                raise InputError("E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number")
         return None
     if focal_mm is None and camera is not None:
         raise InputError(
@@ -179,7 +172,6 @@ def _scene(
     camera: Path | None,
     fisheye: float | None,
 ) -> "Scene":
-    """Returns a scene of the files' designs, or the second ones, before the camera of a file or the options."""
     from stcal.boards.board_designs import CornerBoard
     from stcal.boards.board_file import board_of
     from stcal.boards.target_file import target_of
@@ -201,9 +193,7 @@ def _scene(
     if camera is None:
         return scene.make_scene(replace(options, fisheye_deg=fisheye), *designs, poses)
     if fisheye is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them"
-        )
+        raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
     return scene.make_scene(options, *designs, poses, read_camera(camera))
 
 

@@ -15,17 +15,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
-from stcal.cli.terminal import (
-    STANDARD_OUTPUT,
-    StageProgress,
-    print_each,
-    printed_last,
-    say,
-    verbose,
-    write,
-    write_if,
-    write_out,
-)
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, printed_last, say, verbose, write, write_if
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -64,9 +54,7 @@ def plan(
 
     design = target_of(target)
     if noise is not None and run is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
-        )
+        raise InputError("E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both state σ; give one of them")
     if noise is not None:
         centre_noise = CentreNoise(0.0, floor_px=noise, corner_px=noise)
         source = "--noise, whatever the size of a circle"
@@ -148,7 +136,7 @@ def calibrate_camera(
     from stcal.design import BoardDesign
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.read import save_camera
-    from stcal.io.video import images_or_frames
+    from stcal.io.device import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.camera_report import calibration_file, calibration_report
     from stcal.workflows.board_views import calibrate_camera_by_corners
@@ -178,8 +166,6 @@ def calibrate_camera(
 
 
 SAY_EVERY_S = 1.0  # shortest time between two lines of --live, s
-
-
 TABLE = Path("poses.csv")
 
 
@@ -227,9 +213,7 @@ def measure(
     ellipses = shared.ellipse_options(min_diameter, max_diameter)
     target = _design_beside(faces) if target is None else target
     if serve or live:
-        mode, source = (
-            ("--live", "from a camera, as it takes them") if live else ("--serve", "over HTTP, one answer each")
-        )
+        mode, source = ("--live", "from a camera, as taken") if live else ("--serve", "over HTTP, one answer each")
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--out": out != TABLE}
         alone |= {
             "IMAGES": images if serve else None,
@@ -239,9 +223,7 @@ def measure(
         alone |= {"--send-images": send_images, "--strict": strict, "--workers": workers}
         if conflict := next((name for name, value in alone.items() if value), None):
             lines = ", or give --json -, a line each" if live and conflict in ("--json", "--out") else ""
-            raise InputError(
-                "E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave {conflict} out{lines}"
-            )
+            raise InputError("E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave it out{lines}")
     elif images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     else:
@@ -300,7 +282,6 @@ def measure(
 
 
 def _design_beside(faces: Path) -> Path | None:
-    """Returns the target.toml that a run wrote beside its faces.json, if there is one, and says that it is used."""
     from stcal.io.files import RUN_MARKER, TARGET
 
     own = faces.parent / TARGET
@@ -311,7 +292,7 @@ def _design_beside(faces: Path) -> Path | None:
 
 
 def _serve(setting: tuple, source: int | str | None, host: str, port: int, limits: dict, as_json: bool) -> None:
-    """Answers images until Ctrl-C, or shows the pictures of a source as long as there are any."""
+    from stcal.cli.terminal import write_out
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
     from stcal.sfm.measurement.measure_images import Tracker

@@ -19,8 +19,15 @@ from stcal.geometry.rigid import Order
 from stcal.handeye.data.record import EVERY_FRAME, Known, PoseContent, PoseSide, Said, require_each_once
 from stcal.handeye.data.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
-from stcal.io.poses.columns import find_column, places_of, read_rotations
-from stcal.io.poses.rotations import of_quaternions, require_finite, said_convention, turned_values
+from stcal.io.rotations import (
+    find_column,
+    of_quaternions,
+    places_of,
+    read_rotations,
+    require_finite,
+    said_convention,
+    turned_values,
+)
 from stcal.io.table import LENGTHS, Table, is_comment, read_table, separator_stated
 from stcal.io.toml import load_documents
 

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.handeye.data.pose_pairs import Setup
-from stcal.io.poses.rotations import proper, require_finite
+from stcal.io.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
 Role = Literal["robot", "camera"]
@@ -89,7 +89,7 @@ class PoseContent:
 class Said:
     """The user's statements about files that do not state these themselves.
 
-    ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
+    ``rotation`` : a name of :data:`stcal.io.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
     :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup``;
     ``own`` : rotation and unit of one role's poses, where they differ.
     """

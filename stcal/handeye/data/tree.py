@@ -19,7 +19,7 @@ from stcal.handeye.data.record import (
     require_each_once,
     role_of,
 )
-from stcal.io.poses.rotations import of_quaternions, proper, require_finite
+from stcal.io.rotations import of_quaternions, proper, require_finite
 
 WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
 """Keys that may hold a pose in an object that also has its name."""

@@ -20,8 +20,8 @@ from stcal.handeye.data.record import FRAMES
 from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
-from stcal.io.poses.rotations import INVERTED as CONJUGATED
-from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
+from stcal.io.rotations import INVERTED as CONJUGATED
+from stcal.io.rotations import LAST, ORDERS, ROTATION_VECTOR
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """Factors by which a refused reading exceeds a variant in the product of both median residuals, and in translation."""

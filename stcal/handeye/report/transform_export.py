@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pose_pairs import FRAMES, Setup
 from stcal.handeye.handeye_result import HandEye
-from stcal.io.poses.programs import (
+from stcal.io.static_transforms import (
     Static,
     fixed_joint,
     metres,

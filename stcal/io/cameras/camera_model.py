@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote, named
-from stcal.geometry.arrays import ByValue, require_fields
+from stcal.geometry.arrays import ByValue, Rows, require_covariance, require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
     FISHEYE,
+    MAX_SIDE_PX,
     PARAMETER_NAMES,
     Camera,
     intrinsic_basis,
@@ -26,24 +27,18 @@ from stcal.io.files import save
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
-
-SQUARE_WITHIN = 1e-6
-"""Largest deviation from 1 of the correlation of a parameter with itself."""
-
+SQUARE_WITHIN = 1e-6  # largest deviation from 1 of the correlation of a parameter with itself
 EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
-
-
 OF_IMAGES = "the images"
 """Source of a camera that is found from the images themselves, of which some may show a part of the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel(ByValue):
-    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states none.
-
-    ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's parameters.
-    """
+    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states
+    none. ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's
+    parameters."""
 
     focal: np.ndarray
     centre: np.ndarray
@@ -116,14 +111,11 @@ class CameraPrior(ByValue):
 
 WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 PRIOR_FOCAL = 1e-3
-"""Relative σ of the focal lengths if the camera file states none; as for the three constants below, a calibration of
-some weeks ago, or of another copy of the lens, is about as accurate."""
-PRIOR_CENTRE = 2e-3
-"""σ of the principal point if the camera file states none, in image widths."""
+"""Relative σ of the focal lengths if the camera file states none; these four are as of a calibration of weeks ago."""
+PRIOR_CENTRE = 2e-3  # σ of the principal point if the camera file states none, in image widths
 PRIOR_RADIAL = 0.01
 """σ of k1 … k6 if the camera file states none; a tenth of the coefficient if that is larger."""
-PRIOR_TANGENTIAL = 1e-3
-"""σ of p1, p2, s1 … s4 if the camera file states none."""
+PRIOR_TANGENTIAL = 1e-3  # σ of p1, p2, s1 … s4 if the camera file states none
 
 
 def camera_prior(camera: Camera) -> CameraPrior:
@@ -168,9 +160,32 @@ def cameras_txt(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
+def stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
+    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
+    lines, count = text.splitlines(), len(names)
+    sigmas, rows = ([line.split()[2:] for line in lines if line.startswith(key)] for key in (SIGMA, CORRELATION))
+    if not sigmas and not rows:
+        return None
+    try:
+        if list(map(len, sigmas)) != [count] or list(map(len, rows)) != [count] * count:
+            raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
+        sigma, correlation = np.array(sigmas[0], float), np.array(rows, float)
+        for name, of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
+            # the covariance hides such errors
+            if not 0 < of_name <= MAX_SIDE_PX or not abs(with_itself - 1) <= SQUARE_WITHIN:
+                measured = f"σ of {name} is {of_name:g}, its correlation with itself {with_itself:g}"
+                needed = f"a positive number up to {MAX_SIDE_PX}, and 1 needed"
+                raise InputError("E-CAMERA-COVARIANCE", f"{measured}; {needed}")
+        covariance = correlation * np.outer(sigma, sigma)
+        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
+    except (InputError, ValueError) as error:
+        none = f"SIGMA and CORRELATION state no covariance of its parameters: {error}"
+        raise InputError("E-CAMERA-COVARIANCE", f"{none}; write it again, or remove these comments") from error
+    return covariance
+
+
 LEAST_FOCAL = {False: 0.1, True: 0.05}
-"""Smallest focal length over the longer side, by whether the lens is a fisheye: an image of 157° from edge to edge, and
-a circle of 280° on a third of the side. Lengths in mm are shorter."""
+"""Smallest focal length over the longer side, by whether the lens is a fisheye; lengths in mm are shorter."""
 LEAST_FOCAL_PX = 5.0
 """Smallest focal length, px: shares of a side, which files without a size have, are shorter."""
 AT_CORNER = 0.02
@@ -184,11 +199,8 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraMo
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
         size = f" of an image of {width:g}×{height:g} px" if width and height else ""
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; "
-            "pixels needed; check that they are not mm, or shares of a side",
-        )
+        fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
+        raise InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         raise InputError(
             "E-CAMERA-CENTRE",
@@ -208,7 +220,7 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
         layout = COLMAP_LAYOUT[colmap_model]
         if len(params) != len(layout):
             raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters for {colmap_model}, {len(layout)} needed"
+                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters of {colmap_model}, {len(layout)} needed"
             )
         flat = np.zeros(len(PARAMETER_NAMES))
         for place, value in zip(layout, params, strict=True):
@@ -220,7 +232,6 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
 def camera_from_opencv(
     lens, given: np.ndarray, fisheye: bool, width: float, height: float, tangential: bool = False
 ) -> CameraModel:
-    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,) as of :func:`opencv_lens`; sides of 0 px
-    if the file states none."""
+    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,); 0 for sides that are not stated."""
     distortion, kind = opencv_lens(given, fisheye, tangential)
     return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -12,16 +13,12 @@ from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, 
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
-from stcal.io.cameras.read import read_lens, sized_camera
+from stcal.io.cameras.read import camera_of_photograph, is_photograph, read_lens, sized_camera
 
-CELLS = 24
-"""Number of grid points along the shorter side of the image."""
+CELLS = 24  # number of grid points along the shorter side of the image
 STEPS, STEP_RAD = 10, 1e-6
-LONGEST_RAD = 0.1
-"""Longest step of Newton's method for a ray."""
-MET_PX = 1e-6
-"""Largest distance between a pixel and the projection of its ray."""
+LONGEST_RAD = 0.1  # longest step of Newton's method for a ray
+MET_PX = 1e-6  # largest distance between a pixel and the projection of its ray
 LEAST_POINTS = 10
 
 
@@ -41,8 +38,7 @@ class CameraDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizedLens:
-    """A lens of an unsupported model over an image, by its own projection; ``near`` : the model that was fitted to it,
-    from which its rays are sought."""
+    """A lens of an unsupported model over an image; ``near`` : the fitted model, from which rays are sought."""
 
     lens: ForeignLens
     width: int
@@ -88,10 +84,8 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     Raises DegenerateError: too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
-        raise InputError(
-            "E-CAMERA-SIZES-DIFFER",
-            f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px; files of one image size needed",
-        )
+        fault = f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px"
+        raise InputError("E-CAMERA-SIZES-DIFFER", f"{fault}; files of one image size needed")
     pixels = image_grid(one)
     flat = pixels.reshape(-1, 2)
     first, second = (each.rays(flat) if isinstance(each, SizedLens) else rays(each, flat) for each in (one, two))
@@ -144,15 +138,12 @@ AZIMUTHS, RADII, FIT_STEPS = 72, 40, 1000
 """Numbers of azimuths of the rays, of radii along each, and of steps in the search for the edge of the image."""
 BEYOND = 0.01
 """Share of the image's size by which rays extend beyond the edge, so that they enclose the whole image."""
-FAR_PX = 1e6
-"""Residual, in px, where the fitted lens projects a ray to no pixel."""
+FAR_PX = 1e6  # residual, in px, where the fitted lens projects a ray to no pixel
 MOST_STEPS, SETTLED = 200, 1e-14
 GOOD_PX = 0.05
 """Largest residual, px, of a fit that needs no turn: a turned camera has other axes, which its user must know of."""
-TURN_HELPS = 0.5
-"""Share of the RMS residual to which a turn of the camera must bring it down."""
-HALF = 0.5
-"""Largest share by which a focal length may shrink in the fit."""
+TURN_HELPS = 0.5  # share of the RMS residual to which a turn of the camera must bring it down
+HALF = 0.5  # largest share by which a focal length may shrink in the fit
 SMALL = 1e-6
 """Step about the axis, in normalised coordinates, from which the initial focal lengths are computed."""
 
@@ -160,10 +151,8 @@ SMALL = 1e-6
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLens:
     """The camera that was fitted to a lens, and its RMS and largest residual where the lens was determined.
-
     ``share`` : of the azimuths in which that ends within 89° of the axis; ``camera_from_lens`` : the rotation of the
-    camera's axes, the identity unless it helps much.
-    """
+    camera's axes, the identity unless it helps much."""
 
     camera: Camera
     rms_px: float
@@ -174,8 +163,7 @@ class FittedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedLens:
-    """The lens of a file: the camera, or another model's lens over its image; ``told`` : what a photograph's EXIF says
-    of it."""
+    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
 
     lens: Camera | SizedLens
     told: str = ""
@@ -231,7 +219,6 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
 def _best(
     lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
 ) -> FittedLens:
-    """Return the fit of the model that is nearest; ``turn`` : whether the camera's axes are free."""
     best = None
     for model in CANDIDATES:
         camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)
@@ -252,15 +239,12 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
     around = np.concatenate([np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False), np.arctan2(*corners.T[::-1])])
     rays, pixels, ends = [], [], 0
     for azimuth in around:
-        rays_of_azimuth = np.column_stack(
-            [np.cos(azimuth) * np.tan(angle), np.sin(azimuth) * np.tan(angle), np.ones(FIT_STEPS)]
-        )
+        x, y = np.cos(azimuth) * np.tan(angle), np.sin(azimuth) * np.tan(angle)
+        rays_of_azimuth = np.column_stack([x, y, np.ones(FIT_STEPS)])
         pixels_of_azimuth = lens.project(rays_of_azimuth)
         radius = np.linalg.norm(pixels_of_azimuth - centre, axis=1)
-        inside = ((pixels_of_azimuth >= -0.5 - far) & (pixels_of_azimuth <= np.array([width, height]) - 0.5 + far)).all(
-            axis=1
-        )
-        inside &= lens.determined(pixels_of_azimuth)
+        off = np.abs(pixels_of_azimuth - (np.array([width, height]) - 1) / 2)
+        inside = (off <= np.array([width, height]) / 2 + far).all(axis=1) & lens.determined(pixels_of_azimuth)
         grows = np.diff(radius, prepend=0) > 0  # beyond this radius the distortion folds over
         good = np.logical_and.accumulate(inside & grows)
         count = int(good.sum())
@@ -270,9 +254,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
             rays.append(rays_of_azimuth[np.unique(np.minimum(at, count - 1))])
             pixels.append(pixels_of_azimuth[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
-        raise InputError(
-            "E-CAMERA-NO-FIELD", f"{lens.called} projects almost no point into {width}×{height} px; check it"
-        )
+        raise InputError("E-CAMERA-NO-FIELD", f"{lens.called} projects hardly any point into {width}×{height} px")
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 
 
@@ -312,15 +294,6 @@ def _fitted(
         return np.nan_to_num((weight[:, :, None] * derivatives).reshape(-1, len(x)), posinf=0, neginf=0)
 
     lowest = np.array([-HALF if name in ("fx", "fy") else -np.inf for name in names] + [-np.inf] * 3 * turn)
-    solution = least_squares(
-        off,
-        np.zeros(len(lowest)),
-        slope,  # pyright: ignore[reportArgumentType]
-        bounds=(lowest, np.inf),
-        x_scale="jac",
-        max_nfev=MOST_STEPS,
-        xtol=SETTLED,
-        ftol=SETTLED,
-        gtol=SETTLED,
-    )
+    how: dict[str, Any] = {"jac": slope, "max_nfev": MOST_STEPS, **dict.fromkeys(("xtol", "ftol", "gtol"), SETTLED)}
+    solution = least_squares(off, np.zeros(len(lowest)), bounds=(lowest, np.inf), x_scale="jac", **how)
     return Camera.of(camera_at(solution.x), model), turned(solution.x)

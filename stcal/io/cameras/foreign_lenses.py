@@ -39,20 +39,15 @@ NUMBERS = {
 """The names of COLMAP's models by their numbers in binary files and databases."""
 WRITE_AHEAD = b"\2\2"
 """Bytes 18 and 19 of a database in SQLite's mode of a write-ahead log (sqlite.org/fileformat.html, 1.3)."""
-SQUARE = 1e-9
-"""Largest ratio of skew to focal length that counts as no skew."""
-MARGIN = {2: 1, 3: 2}
-"""Number of intervals beyond the stated field of view, by the order of the spline."""
+SQUARE = 1e-9  # largest ratio of skew to focal length that counts as no skew
+MARGIN = {2: 1, 3: 2}  # number of intervals beyond the stated field of view, by the order of the spline
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignLens:
-    """A lens that is known by its projection only, of a model that is ``called`` so.
-
-    ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``,
-    ``height`` : px, or None if the file states none; ``region`` : polygon (n, 2), px, within which it was determined,
-    or None.
-    """
+    """A lens that is known by its projection only, of a model that is ``called`` so. ``project`` : returns pixels
+    (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``, ``height`` : px, or None if the
+    file states none; ``region`` : polygon (n, 2), px, within which it was determined, or None."""
 
     called: str
     project: Callable[[np.ndarray], np.ndarray]
@@ -67,10 +62,8 @@ class ForeignLens:
 
 def of_colmap(model: str, width: float, height: float, params) -> CameraModel | ForeignLens:
     """Return the camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
-
     COLMAP 4, ``sensor/models.h``. A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens
-    distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE).
-    """
+    distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE)."""
     numbers = [float(value) for value in params]
     if model not in COLMAP_FOREIGN:
         return camera_from_colmap(model, width, height, numbers)
@@ -158,9 +151,7 @@ def one_of(names: list[str], choice: str) -> str:
     if choice not in names and (choice or len(names) > 1):
         asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
-        raise InputError(
-            "E-CAMERA-SEVERAL", f"{asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name"
-        )
+        raise InputError("E-CAMERA-SEVERAL", f"{asked}; choose of {shown} with --camera-name, or `stcal camera` --name")
     others = [name for name in names if name != (choice or names[0])]
     pass_over(others, "the other cameras, " if len(others) > 1 else "the other camera, ")
     return choice or names[0]
@@ -196,11 +187,8 @@ def of_parts(
     lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, xi: float = 0.0
 ) -> ForeignLens:
     """Return a lens of a projection, OpenCV's distortion (k,), and a matrix of fx, fy, cx, cy with skew as of
-    :func:`of_opencv`.
-
-    ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of OpenCV's omnidir,
-    Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none.
-    """
+    :func:`of_opencv`. ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of
+    OpenCV's omnidir, Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none."""
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height)
     if not abs(skew) < abs(camera.focal[0]):
         raise InputError("E-CAMERA-SKEW", f"skew {skew:g} px, less than fx needed; correct it")
@@ -221,24 +209,17 @@ def of_parts(
 
 def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size) -> ForeignLens:
     """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
-
-    C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B. Khomutenko
-    et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera Model", 3DV 2018.
-    F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13, 2001.
-    """
+    C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B.
+    Khomutenko et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera
+    Model", 3DV 2018. F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications
+    13, 2001."""
     first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
     coefficients = given if count else np.zeros(0)
-    if (
-        numbers.shape != (first + 4,)
-        or coefficients.shape != (count,)
-        or not np.isfinite([*numbers, *coefficients]).all()
-    ):
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
-            f"finite numbers; {numbers.size} and {coefficients.size} found",
-        )
+    of_model = numbers.shape == (first + 4,) and coefficients.shape == (count,)
+    if not of_model or not np.isfinite([*numbers, *coefficients]).all():
+        fault = f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, finite numbers"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}; {numbers.size} and {coefficients.size} found")
     shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
     if (focal <= 0).any():
         raise InputError("E-CAMERA-FOCAL", f"focal length {focal.tolist()}; positive numbers needed")
@@ -281,15 +262,12 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2)."""
     match = SPLINED.fullmatch(name)
     if match is None:
-        raise InputError(
-            "E-CAMERA-MODEL", f"{name[:80]} does not have mrcal's form of a splined model; write it again with mrcal"
-        )
+        raise InputError("E-CAMERA-MODEL", f"{name[:80]} is no splined model of mrcal's form; write it again")
     order, columns, rows, wide = (int(word) for word in match.groups())
-    if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(numbers)} intrinsics of {columns}×{rows} points; {4 + 2 * columns * rows} needed",
-        )
+    needed = 4 + 2 * columns * rows
+    if columns <= MARGIN[order] + 1 or len(numbers) != needed or not 0 < wide < 360:
+        size = f"{len(numbers)} intrinsics of {columns}×{rows} points; {needed} needed"
+        raise InputError("E-CAMERA-COEFFICIENTS", size)
     focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
     per_u = (columns - 1 - MARGIN[order]) / (4 * np.tan(np.radians(wide) / 4))
@@ -298,9 +276,8 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     def project(rays: np.ndarray) -> np.ndarray:
         u = 2 * rays[:, :2] / (np.linalg.norm(rays, axis=1) + rays[:, 2])[:, None]
         at = (u * per_u + middle).T[::-1]
-        moved = [
-            map_coordinates(c, at, order=order, prefilter=False, mode="nearest") for c in np.moveaxis(control, 2, 0)
-        ]
+        settings = {"order": order, "prefilter": False, "mode": "nearest"}
+        moved = [map_coordinates(c, at, **settings) for c in np.moveaxis(control, 2, 0)]
         return centre + focal * (u + np.column_stack(moved))
 
     called = f"mrcal's splines of {columns}×{rows} points"
@@ -313,12 +290,10 @@ def refused(camera: Camera, form: str, why: str) -> InputError:
 
 
 def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens:
-    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; a
-    supported model if both angles are zero.
-
-    A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery,
-    "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006).
-    """
+    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1,
+    r2; a supported model if both angles are zero. A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ²
+    − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68,
+    2006)."""
     if len(numbers) != 9:
         raise InputError("E-CAMERA-COEFFICIENTS", f"{len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")
     (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]

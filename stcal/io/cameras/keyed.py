@@ -1,4 +1,4 @@
-"""Camera files of keys and values: OpenCV, ROS, ROS-Industrial, Kalibr, EuRoC, camodocal, and MATLAB's JSON.
+"""Camera files of keys and values: OpenCV, ROS, Kalibr, EuRoC, camodocal, and MATLAB's JSON.
 
 :data:`FORMATS` has a row for each. A reader takes the keys of its format; all others go through
 :func:`stcal.io.cameras.keys.require_known`.
@@ -12,19 +12,17 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.camera_model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
+from stcal.io.cameras.camera_model import EQUIDISTANT, CameraModel, camera_from_opencv
 from stcal.io.cameras.foreign_lenses import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
 from stcal.io.cameras.keys import Keys, is_neutral, note, numbers_of, plain, require_known
 from stcal.io.cameras.matlab import MARKS, from_structure
 from stcal.io.toml import load_documents
 
-TAB = 4
-"""Spaces in place of a tab, which YAML does not allow."""
+TAB = 4  # spaces in place of a tab, which YAML does not allow
 
 
 def values_of(text: str) -> dict:
-    """Return the keys and values of a text in JSON, XML or YAML; raise ValueError, YAMLError or ParseError if it is
-    none of these, or holds several documents that differ."""
+    """Return the keys and values of JSON, XML or YAML; ValueError, YAMLError or ParseError if it is none of them."""
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
     try:
@@ -39,12 +37,10 @@ def values_of(text: str) -> dict:
 
 
 def _once(pairs: list) -> dict:
-    """Return an object of JSON; refuse a repeated key, as readers silently take the last one."""
-    made = dict(pairs)
-    if len(made) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)[:40]} twice")
-    return made
+    keys = [key for key, _ in pairs]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise ValueError(f"the key {twice[0][:40]} twice")
+    return dict(pairs)
 
 
 def _without_header(document: object) -> object:
@@ -79,8 +75,7 @@ def is_ini(text: str) -> bool:
 
 
 def ini_cameras(text: str) -> dict[str, dict]:
-    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``. A key
-    has a line of its own; the lines of its numbers follow."""
+    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``."""
     sections: dict[str, dict] = {}
     section, numbers = {}, []
     for line in (line.split("#")[0].strip() for line in text.splitlines()):
@@ -116,7 +111,6 @@ MOST_TANGENTIAL = 0.02
 """Largest tangential coefficient of real lenses: 0.02 is a sensor tilted by 2° behind the lens."""
 NEAR = 0.25
 """Share of the image's size within which the principal point is from the middle of the image."""
-
 Lens = CameraModel | ForeignLens
 
 
@@ -148,27 +142,22 @@ def of_matrix(keys: Keys) -> Lens:
         del keys.left["F"]
     require_known(keys.left, undistorted=given is None)
     given = np.zeros(0) if given is None else given
-    kind = _kind(said, xi, given, keys)
-    lens, skew = _lens_of(matrix, keys)
+    kind = _kind(said, xi, given)
+    lens, skew = _lens_of(matrix)
     if kind == "perspective" and not said and given.size == 4:
-        _say_no_model(given, keys)
-    return _camera(keys, lens, given, kind, (width, height, listed), skew, xi)
+        _say_no_model(given)
+    return _camera(lens, given, kind, (width, height, listed), skew, xi)
 
 
-def _camera(
-    keys: Keys, lens: list[float], given: np.ndarray, kind: str, size: tuple, skew: float = 0.0, xi: float = 0.0
-) -> Lens:
-    """Return the camera of fx, fy, cx, cy, coefficients, the kind of lens, and a size as :meth:`Keys.size` has it."""
+def _camera(lens: list[float], given: np.ndarray, kind: str, size: tuple, skew: float = 0.0, xi: float = 0.0) -> Lens:
     width, height, listed = size
     last = 4 if kind == "equidistant" else 5
     given = given[:last] if last < len(given) < 8 and not given[last:].any() else given  # zeros beyond the model's
     if kind == "equidistant" and len(given) not in (0, 4):
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant; k1 to k4 needed",
-        )
+        fault = f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}; k1 to k4 needed")
     if listed:
-        _require_order(lens, width, height, keys)
+        _require_order(lens, width, height)
     if kind == "unified" or (kind == "equidistant" and not abs(skew) <= SQUARE * abs(lens[0])):
         return of_parts(lens, skew, given, kind, width, height, xi)
     if kind == "equidistant":
@@ -184,7 +173,7 @@ SAYS_LENS = {
 """Keys that say which lens it is, with their other names."""
 
 
-def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) -> str:
+def _kind(said: Mapping[str, object], xi: float, given: np.ndarray) -> str:
     """Return the kind of lens: perspective, equidistant, or unified; refuse others, and keys that disagree."""
     kinds = {"xi": "unified"} if xi else {}
     for name, value in said.items():
@@ -195,11 +184,8 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) 
             kinds[name] = LENSES[word]
         elif word not in UNDISTORTED and not (word in INVERSE and not given.any()):
             why = "its coefficients are those of another formula; " if word in INVERSE else ""
-            raise InputError(
-                "E-CAMERA-MODEL",
-                f"{name} {' '.join(str(value).split())[:60]!r} is not supported; {why}calibrate anew with plumb_bob or "
-                "equidistant",
-            )
+            fault = f"{name} {' '.join(str(value).split())[:60]!r} is not supported"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; {why}calibrate anew with plumb_bob or equidistant")
     both = set(kinds.values()) - ({"perspective"} if "unified" in kinds.values() else set())
     if len(both) > 1:
         words = ", ".join(f"{name} says {kind}" for name, kind in kinds.items())
@@ -210,7 +196,6 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) 
 
 
 def _require_whole_image(keys: Keys, width: float, height: float) -> None:
-    """Refuse ROS's binning and a region of interest, whose image is not the one that the intrinsics are for."""
     stated = {key: keys.take(key) for key in ("binning_x", "binning_y")}
     if isinstance(keys.left.get("roi"), Mapping):
         stated |= {f"roi.{key}": value for key, value in keys.left.pop("roi").items()}  # type: ignore[attr-defined]
@@ -224,8 +209,7 @@ def _require_whole_image(keys: Keys, width: float, height: float) -> None:
             )
 
 
-def _lens_of(matrix: np.ndarray | None, keys: Keys) -> tuple[list[float], float]:
-    """Return fx, fy, cx, cy and the skew, px, of a matrix by rows."""
+def _lens_of(matrix: np.ndarray | None) -> tuple[list[float], float]:
     if matrix is None or matrix.size != 9:
         count = 0 if matrix is None else matrix.size
         raise InputError("E-CAMERA-COEFFICIENTS", f"camera_matrix of {count} numbers; 3×3 needed")
@@ -248,7 +232,7 @@ def _lens_of(matrix: np.ndarray | None, keys: Keys) -> tuple[list[float], float]
     return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float(matrix[0, 1])
 
 
-def _say_no_model(given: np.ndarray, keys: Keys) -> None:
+def _say_no_model(given: np.ndarray) -> None:
     """Name four coefficients without a model, as OpenCV's fisheye has; refuse those that must be a fisheye's."""
     model = "distortion_model: equidistant"
     if np.abs(given[2:]).max() > MOST_TANGENTIAL:
@@ -262,8 +246,7 @@ def _say_no_model(given: np.ndarray, keys: Keys) -> None:
         note(f"4 coefficients without a model, taken as k1, k2, p1, p2; of OpenCV's fisheye, add {model}")
 
 
-def _require_order(lens: list[float], width: float, height: float, keys: Keys) -> None:
-    """Refuse a list of height and width, by the principal point, which is near the middle."""
+def _require_order(lens: list[float], width: float, height: float) -> None:
     size = np.array([width, height])
     near = [(np.abs(np.array(lens[2:]) - each / 2) < NEAR * each).all() for each in (size, size[::-1])]
     if not near[0] and near[1]:
@@ -275,7 +258,6 @@ def _require_order(lens: list[float], width: float, height: float, keys: Keys) -
 
 
 def _of_kalibr(keys: Keys) -> Lens:
-    """Return the camera of Kalibr's and EuRoC's keys: a list of intrinsics, and the names of lens and distortion."""
     numbers, given = keys.numbers("intrinsics"), keys.numbers("distortion_coeffs", "distortion_coefficients")
     lens = plain(keys.take("camera_model", "type") or "pinhole")
     word = plain(keys.take("distortion_model") or "none")
@@ -297,7 +279,7 @@ def _of_kalibr(keys: Keys) -> Lens:
         raise InputError("E-CAMERA-COEFFICIENTS", f"intrinsics of {numbers.size} numbers; 4 needed")
     if distortion == "none" and given.any():
         raise InputError("E-CAMERA-MODEL", "distortion_coeffs without a distortion model; add distortion_model")
-    return _camera(keys, numbers.tolist(), np.zeros(0) if distortion == "none" else given, kind, size)
+    return _camera(numbers.tolist(), np.zeros(0) if distortion == "none" else given, kind, size)
 
 
 CAMODOCAL = {
@@ -310,7 +292,6 @@ CAMODOCAL = {
 
 
 def _of_camodocal(keys: Keys) -> Lens:
-    """Return the camera of camodocal's keys, which VINS has, too."""
     named = keys.take("model_type", "type")
     if plain(named) not in CAMODOCAL:
         raise InputError("E-CAMERA-MODEL", f"model_type {str(named)[:40]!r}; PINHOLE, MEI, KANNALA_BRANDT are read")
@@ -324,19 +305,9 @@ def _of_camodocal(keys: Keys) -> Lens:
         keys.left.update(stated)
     lens = [keys.number(name) for name in lens_keys.split()]
     given = np.array([keys.number(name, 0.0) for name in names.split()])
-    xi = keys.number("xi") if kind == "unified" else 0.0
-    size = keys.size()
+    xi, size = keys.number("xi") if kind == "unified" else 0.0, keys.size()
     require_known(keys.left)
-    return _camera(keys, lens, given, kind, size, xi=xi)
-
-
-def _of_industrial(keys: Keys) -> CameraModel:
-    """Return the camera of ROS-Industrial; its lens may have distortion, though the form has none."""
-    own = Keys(dict(keys.left.pop("intrinsics")))  # type: ignore[call-overload]
-    lens = [own.number(name) for name in ("fx", "fy", "cx", "cy")]
-    width, height, _ = keys.size()
-    require_known(keys.left | own.left, undistorted=True)
-    return camera_model(np.array([*lens, *[0.0] * 8]), "OPENCV", width or None, height or None)
+    return _camera(lens, given, kind, size, xi=xi)
 
 
 def _matrix_cameras(values: dict) -> dict[str, dict]:
@@ -369,10 +340,6 @@ FORMATS: tuple[tuple[Callable[[dict], dict[str, dict]], Callable[[Keys], Lens]],
     (_if(lambda values: not values.keys().isdisjoint(MARKS)), lambda keys: from_structure(keys.left)),
     (_if(lambda values: "model_type" in values), _of_camodocal),
     (_kalibr_cameras, _of_kalibr),
-    (
-        _if(lambda values: isinstance(values.get("intrinsics"), Mapping) and "fx" in values["intrinsics"]),
-        _of_industrial,
-    ),
     (_matrix_cameras, of_matrix),
 )
 """For each format a function that finds its cameras by name, a single one without a name, and the reader of one."""

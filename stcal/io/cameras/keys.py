@@ -42,14 +42,10 @@ SUSPECT_PART = re.compile(
 """Parts of names of keys that may change the projection."""
 DISTORTION = re.compile(r"dist(?!anc)|coef|^kc")
 """Parts of names of lists of distortion coefficients, also of keys that begin harmlessly, as ``calib_dist`` does."""
-COUNTS = (4, 5, 8, 12, 14)
-"""Numbers of OpenCV's distortion coefficients."""
-MOST_COEFFICIENT = 100.0
-"""Largest distortion coefficient; lists with larger values are pixels or times."""
-UNIT_WITHIN = 1e-3
-"""Largest deviation of a quaternion's length from 1."""
-SHOWN = 6
-"""Largest number of keys that a message names."""
+COUNTS = (4, 5, 8, 12, 14)  # numbers of OpenCV's distortion coefficients
+MOST_COEFFICIENT = 100.0  # largest distortion coefficient; lists with larger values are pixels or times
+UNIT_WITHIN = 1e-3  # largest deviation of a quaternion's length from 1
+SHOWN = 6  # largest number of keys that a message names
 _passed_over: ContextVar[list[str] | None] = ContextVar("_passed_over", default=None)
 _file: ContextVar[str] = ContextVar("_file", default="")
 """The camera file that is read, as messages name it."""
@@ -117,21 +113,12 @@ def numbers_of(value: object) -> np.ndarray:
 
 def is_neutral(value: object) -> bool:
     """Return True for a value that says nothing: 0, a list of zeros, false, an empty text, or none."""
-    if isinstance(value, Mapping):
-        return all(is_neutral(each) for each in value.values())
-    if isinstance(value, list | tuple):
-        return all(is_neutral(each) for each in value)
+    if isinstance(value, Mapping | list | tuple):
+        return all(map(is_neutral, value.values() if isinstance(value, Mapping) else value))
     if isinstance(value, str):
-        words = value.lower().split()
-        return all(word in ("none", "null", "false", "no") or _is_zero(word) for word in words)
+        words = [word for word in value.lower().split() if word not in ("none", "null", "false", "no")]
+        return len(numbers_of(words)) == len(words) and not numbers_of(words).any()
     return value is None or not value
-
-
-def _is_zero(word: str) -> bool:
-    try:
-        return float(word) == 0
-    except ValueError:
-        return False
 
 
 def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], object]]:
@@ -145,12 +132,10 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
 
 
 def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: bool = False) -> None:
-    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an :class:`InputNote`;
-    one that may change the projection is refused unless its value is 0 or empty.
-
-    ``harmless`` : further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in
-    ``*``; ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
-    """
+    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an
+    :class:`InputNote`; one that may change the projection is refused unless its value is 0 or empty. ``harmless`` :
+    further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in ``*``;
+    ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it."""
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
     pass_over(_with_numbers(unread))
@@ -205,11 +190,8 @@ class Keys:
     def take(self, *names: str) -> object:
         """Return the value of the key that has one of these names; None if there is none."""
         wanted = [*map(plain, names)]
-        found = {
-            key: value for key, value in self.left.items() if plain(key) in wanted and not isinstance(value, Mapping)
-        }
-        for key in found:
-            del self.left[key]
+        keys = [key for key, value in self.left.items() if plain(key) in wanted and not isinstance(value, Mapping)]
+        found = {key: self.left.pop(key) for key in keys}
         if len({repr(value) for value in found.values()}) > 1:
             raise InputError("E-CAMERA-REPEATED", f"{' and '.join(found)} mean the same and differ; leave one in")
         return next(iter(found.values()), None)
@@ -244,9 +226,6 @@ class Keys:
         if both.size != 2:
             raise InputError("E-CAMERA-SIZE", f"size of {both.size} numbers; width and height needed")
         if width and height and (width, height) != tuple(both):
-            raise InputError(
-                "E-CAMERA-SIZE",
-                f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px; correct "
-                "one of them",
-            )
+            fault = f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px"
+            raise InputError("E-CAMERA-SIZE", f"{fault}; correct one of them")
         return float(both[0]), float(both[1]), True

@@ -12,6 +12,7 @@ import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.io import loadmat, savemat
@@ -30,8 +31,7 @@ MARKS = (STRUCTURE, "MappingCoefficients")
 """Fields that tell a structure that ``toStruct`` makes of a camera, of a fisheye the second."""
 BOUGUET = ("fc", "cc", "kc")
 BOUGUET_SIGMAS = 3.0
-"""Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
-parameters")."""
+"""Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of …")."""
 TAKEN = {
     *("K", "IntrinsicMatrix", "FocalLength", "PrincipalPoint", "Skew", "ImageSize", "RadialDistortion"),
     *("TangentialDistortion", "MappingCoefficients"),
@@ -57,10 +57,8 @@ SPARSE = 5
 """Classes of arrays that hold further arrays: cells, structures, objects, functions (table 1-3); and of sparse ones."""
 FLAGS, INT32, DIMENSION_BYTES = [6, 8], 5, 128
 """Type and size of the first element of an array, its flags; type of the second, its size, and the longest of NumPy."""
-MOST_BYTES = 1 << 26
-"""Largest size of a variable when its compression is undone."""
-HEAD_BYTES = 116
-"""Length of the text at the beginning of a file; scipy writes the time into it."""
+MOST_BYTES = 1 << 26  # largest size of a variable when its compression is undone
+HEAD_BYTES = 116  # length of the text at the beginning of a file; scipy writes the time into it
 
 
 def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
@@ -79,19 +77,15 @@ def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
         return _from_bouguet(values)
     structures = dict(_structures({key: value for key, value in values.items() if not key.startswith("__")}, ""))
     if not structures:
-        raise InputError(
-            "E-CAMERA-CONTENT",
-            "no structure of a camera; save toStruct(cameraParams), since only MATLAB can read its objects",
-        )
+        fault = "no structure of a camera"
+        raise InputError("E-CAMERA-CONTENT", f"{fault}; save toStruct(cameraParams), not MATLAB's object")
     return from_structure(structures[one_of(list(structures), choice)])
 
 
 def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
     """Return the number of elements in a row, each of which must have a type that exists and a size that is there.
-
-    SciPy follows any other type into foreign memory, which ends the process. ``order`` : ``<`` or ``>`` for the order
-    of bytes; ``arrays`` : whether arrays may be among them.
-    """
+    SciPy follows any other type into foreign memory, which ends the process. ``order`` : ``<`` or ``>`` for the
+    order of bytes; ``arrays`` : whether arrays may be among them."""
     at = count = 0
     while at < len(data):
         count += 1
@@ -116,7 +110,6 @@ def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
 
 
 def _require_array(data: bytes, order: str) -> None:
-    """Require that an array has the parts that its class needs, and no more values than bytes."""
     *head, flags, _, dims_kind, dims_bytes = struct.unpack_from(f"{order}6I", data)
     array_class, is_complex = flags & 0xFF, flags >> 11 & 1
     parts = _require_elements(data, order, array_class in WITH_ARRAYS)
@@ -165,7 +158,6 @@ def _plain_value(value: object) -> object:
 
 
 def _structures(values: Mapping, where: str):
-    """Yield name and structure of every camera, at any depth."""
     if not values.keys().isdisjoint(MARKS):
         yield where or "camera", values
         return
@@ -174,8 +166,10 @@ def _structures(values: Mapping, where: str):
             yield from _structures(value, f"{where}.{key}" if where else str(key))
 
 
-def _numbers(values: Mapping, key: str, count: int = 0) -> np.ndarray | None:
+def _numbers(values: Mapping, key: str, count: int = 0, needed: bool = False) -> Any:
     if values.get(key) is None:
+        if needed:
+            raise InputError("E-CAMERA-CONTENT", f"{key} is empty; {count} numbers needed")
         return None
     try:
         numbers = np.asarray(values[key], float)
@@ -186,18 +180,10 @@ def _numbers(values: Mapping, key: str, count: int = 0) -> np.ndarray | None:
     return numbers.ravel() if key not in ("K", "IntrinsicMatrix") else numbers
 
 
-def _known(values: Mapping, key: str, count: int) -> np.ndarray:
-    numbers = _numbers(values, key, count)
-    if numbers is None:
-        raise InputError("E-CAMERA-CONTENT", f"{key} is empty; {count} numbers needed")
-    return numbers
-
-
 def _from_bouguet(values: Mapping) -> CameraModel | ForeignLens:
-    own = {key: value for key, value in values.items() if not key.startswith("__")}
-    unread = {key: _plain_value(value) for key, value in own.items() if key not in BOUGUET_TAKEN}
-    require_known(unread, BOUGUET_HARMLESS)
-    focal, centre, k = (_known(values, key, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
+    others = {key: value for key, value in values.items() if key not in BOUGUET_TAKEN and not key.startswith("__")}
+    require_known({key: _plain_value(value) for key, value in others.items()}, BOUGUET_HARMLESS)
+    focal, centre, k = (_numbers(values, key, n, True) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
     lens = of_opencv([*focal, *centre], k, width, height, skew)
@@ -205,7 +191,7 @@ def _from_bouguet(values: Mapping) -> CameraModel | ForeignLens:
         return lens
     if not all(f"{key}_error" in values for key in BOUGUET):
         return lens
-    errors = [_known(values, f"{key}_error", n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
+    errors = [_numbers(values, f"{key}_error", n, True) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
     sigma = np.concatenate(errors)[:8] / BOUGUET_SIGMAS
     return replace(lens, covariance=np.diag(sigma**2)) if (sigma > 0).all() and np.isfinite(sigma).all() else lens
 

@@ -12,23 +12,21 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Rows, require_covariance
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv
 from stcal.io.cameras.foreign_lenses import ForeignLens, one_of, refused, require_finite
 from stcal.io.cameras.keys import pass_over, require_known
-from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 MORE_NAMES = ("p3", "p4")
 """Parameters of Metashape up to version 1.8, and of PhotoScan, that later ones have not."""
 OTHER_KEYS = ("projection", "width", "height", "resolution")
 HARMLESS = ("date", "class", "type", "filmcamera", "sensorid")
-ROOTS = ("document", "chunk", "sensors", "sensor")
-"""Root elements of files with sensors."""
+ROOTS = ("document", "chunk", "sensors", "sensor")  # root elements of files with sensors
 KINDS = ("frame", "fisheye", "equidistant_fisheye")
 HELD_PX = 1e-3
-"""σ of a parameter that was held fixed, as its effect at the corner of the image in px; without it a covariance would
-be singular."""
+"""σ of a parameter that was held fixed, as its effect at the image's corner, px; 0 would be singular."""
 OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy", "k1", "k2", "k3", "k4")}
 """OpenCV's names of Metashape's parameters; ``b1`` and ``f`` together are fx."""
 
@@ -39,8 +37,7 @@ def is_metashape(text: str) -> bool:
 
 
 def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
-    """Return the camera of a ``<calibration>``; a foreign lens with ``b2``, ``p3``, ``p4``, or a frame camera with
-    ``k4``."""
+    """Return the camera of a ``<calibration>``; a foreign lens with b2, p3, p4, or of a frame camera with k4."""
     texts: dict[str, str] = {}
     for child in root:
         if child.tag in texts:
@@ -50,9 +47,8 @@ def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
     if kind not in KINDS:
         raise InputError("E-CAMERA-MODEL", f"projection {kind}; frame and fisheye are read")
     names = (*NAMES, *MORE_NAMES)
-    require_known(
-        {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, HARMLESS
-    )
+    unread = {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}
+    require_known(unread, HARMLESS)
     v = {name: float(texts.get(name, 0) or 0) for name in names}
     size = root.find("resolution")
     stated = texts if size is None else size.attrib
@@ -88,8 +84,7 @@ def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: floa
 
 
 def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
-    """Return the lens of a ``<calibration>``, or a sensor of exported cameras, or of a project's ``doc.xml``, as
-    adjusted, with its covariance."""
+    """Return the lens of a ``<calibration>``, or a sensor of exported cameras or ``doc.xml``, with covariance."""
     root, sensors = ElementTree.fromstring(text), {}
     if root.tag == "calibration":
         return from_calibration(root)
@@ -138,12 +133,12 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> Camera
 
 
 def _model(colmap_model: str, names: list[str]) -> str:
+    adjusted = set(names)
     if FISHEYE in colmap_model:
-        return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
-    if "k3" in names or "k4" in names:
+        return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & adjusted else colmap_model
+    if {"k3", "k4"} & adjusted:
         return "FULL_OPENCV"
-    distorted = {"k1", "k2", "p1", "p2"} & set(names)
-    return "OPENCV" if distorted and colmap_model != "FULL_OPENCV" else colmap_model
+    return "OPENCV" if {"k1", "k2", "p1", "p2"} & adjusted and colmap_model != "FULL_OPENCV" else colmap_model
 
 
 def _theirs_by_ours() -> np.ndarray:
@@ -196,22 +191,16 @@ def cameras(camera: Camera, name: str) -> str:
     for tag, value in values.items():
         ElementTree.SubElement(element, tag).text = repr(float(value))
     if camera.covariance is not None:
-        names, matrix = _covariance(camera, camera.covariance)
+        rows = _theirs_by_ours()
+        if not camera.fisheye:
+            rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
+        by_model = rows @ intrinsic_basis(camera.colmap_model)
+        present = np.flatnonzero(by_model.any(axis=1))
+        matrix = by_model[present] @ camera.covariance @ by_model[present].T
         stated = ElementTree.SubElement(sensor, "covariance")
-        ElementTree.SubElement(stated, "params").text = " ".join(names)
+        ElementTree.SubElement(stated, "params").text = " ".join(NAMES[i] for i in present)
         ElementTree.SubElement(stated, "coeffs").text = " ".join(map(repr, matrix.ravel().tolist()))
     return _text(root)
-
-
-def _covariance(camera: Camera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
-    basis = intrinsic_basis(camera.colmap_model)
-    rows = _theirs_by_ours()
-    if not camera.fisheye:
-        rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
-    by_model = rows @ basis
-    present = np.flatnonzero(by_model.any(axis=1))
-    matrix = by_model[present] @ covariance @ by_model[present].T
-    return [NAMES[i] for i in present], matrix
 
 
 def without_sigma(camera: Camera) -> list[str]:

@@ -1,35 +1,337 @@
-"""Reading of camera files of any kind, recognised by the content; and saving, where each file is read again."""
+"""Camera files of any kind, recognised by their content; the camera that a photograph's EXIF describes; and writers.
 
+Pixel origins: the centre of the first pixel is at (0, 0) in OpenCV, ROS, Kalibr and mrcal, at (0.5, 0.5) in COLMAP and
+Metashape; Metashape's principal point is relative to the middle of the image.
+"""
+
+import ast
 import re
+import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 import numpy as np
 import yaml
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
-from stcal.io.cameras import forms, matlab, metashape
-from stcal.io.cameras.camera_model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
+from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
+from stcal.io.cameras import foreign_lenses as foreign
+from stcal.io.cameras import matlab, metashape
+from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv, cameras_txt, model_of, stated_covariance
 from stcal.io.cameras.foreign_lenses import ForeignLens, numbered, of_colmap, of_database, one_of
-from stcal.io.cameras.forms import SUFFIXES, WRITERS, CameraForm, name_to_write, written
 from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
-from stcal.io.cameras.keys import reading
-from stcal.io.cameras.photograph import is_photograph
-from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written, save, text_of
+from stcal.io.cameras.keys import pass_over, reading, require_known
+from stcal.io.cameras.matlab import mat
+from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
+from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
-SQLITE = b"SQLite format 3\0"
-"""First bytes of an SQLite database."""
+HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
+FILM_DIAGONAL_MM = 43.2666
+"""Diagonal of 36 × 24 mm, by which CIPA DCG-001 states focal lengths; widths would differ by 4 % at 4 : 3."""
+UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Lengths, in mm, of the values of ``FocalPlaneResolutionUnit``."""
+SIGMA_FOCAL, SIGMA_SQUARE = 0.05, 1e-3
+"""Relative σ of the focal length, which EXIF states nominally and at infinity, and of the ratio of fx to fy."""
+SIGMA_CENTRE = 0.02  # σ of the principal point, in image widths
+SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
+"""σ of radial and tangential distortion, which EXIF does not state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photograph:
+    """The camera of a photograph, OPENCV without distortion and with a covariance for what EXIF leaves open, and
+    ``told``, the EXIF entries that were used, in words."""
+
+    camera: Camera
+    told: str
+
+
+def is_photograph(path: str | Path) -> bool:
+    """Return True if a file begins with the bytes of an image."""
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(12)
+            return head.startswith(HEADS) or is_heic(head)
+    except (OSError, ValueError):
+        return False
+
+
+def camera_of_photograph(path: str | Path) -> Photograph:
+    """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes."""
+    try:
+        data = read_bytes(path, IMAGE_BYTES)
+        if is_heic(data):
+            let_pillow_read_heic(f"camera file {path}")
+        with Image.open(BytesIO(data)) as image:
+            (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
+        if is_heic(data) and heic_turns(data) % 2:
+            width, height = height, width
+    except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        reason = " ".join(str(error).split())[:100]
+        fault = f"camera file {path}: no photograph that can be read ({reason})"
+        raise InputError("E-CAMERA-UNREADABLE", f"{fault}; give another") from error
+    focal, source = _focal_px(exif, width, height)
+    if focal is None:
+        focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
+        what = f"{focal_mm:g} mm, but no size of its pixels" if focal_mm else "no focal length"
+        fault = f"camera file {path}: a photograph whose EXIF states {what}"
+        raise InputError("E-CAMERA-EXIF", f"{fault}; give a camera file, or `stcal-sfm calibrate-camera`")
+    zoom = _positive(exif.get(ExifTags.Base.DigitalZoomRatio)) or 1.0
+    if zoom != 1:
+        raise InputError(
+            "E-CAMERA-EXIF",
+            f"camera file {path}: a photograph with a digital zoom of {zoom:g}; makers differ in whether the focal "
+            f"length includes it, so that it is {focal:.0f} or {zoom * focal:.0f} px; take one without zoom",
+        )
+    if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
+        source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
+    centre = [(width - 1) / 2, (height - 1) / 2]
+    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height).sized(width, height)
+    sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
+    covariance = np.diag(sigma**2)
+    covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
+    return Photograph(Camera.of(camera, "OPENCV", covariance), source)
+
+
+def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
+    """Return the focal length in px of this image, None if unknown, and the EXIF entries used, in words."""
+    full = _positive(exif.get(ExifTags.Base.ExifImageWidth)) or max(width, height)
+    scale = max(width, height) / max(full, _positive(exif.get(ExifTags.Base.ExifImageHeight)) or 0)
+    focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
+    per_unit = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
+    unit_mm = UNIT_MM.get(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    if focal_mm and per_unit and unit_mm:
+        pitch_um = 1e3 * unit_mm / per_unit / scale
+        sensor = "×".join(f"{1e-3 * pitch_um * side:.3g}" for side in (width, height))
+        told = f"focal length {focal_mm:g} mm, pixels of {pitch_um:.3g} µm, so a sensor of {sensor} mm (check it)"
+        return focal_mm / pitch_um * 1e3, told
+    film_mm = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    if film_mm:
+        return film_mm / FILM_DIAGONAL_MM * float(np.hypot(width, height)), f"{film_mm:g} mm in 35 mm film"
+    return None, ""
+
+
+def _positive(value) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < np.inf else None
+
+
+CameraForm = Literal[
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"
+]
+"""Forms in which cameras are written."""
+SUFFIXES = {
+    ".txt": "colmap",
+    ".bin": "colmap-bin",
+    ".yaml": "opencv",
+    ".yml": "opencv",
+    ".cameramodel": "mrcal",
+    ".xml": "metashape",
+    ".mat": "matlab",
+}
+"""The form of a file by its suffix."""
+MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
+"""Numbers of coefficients of those models of mrcal that are OpenCV's."""
+MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
+"""Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
+LEAST_CAMERA_BYTES = 48  # bytes of a camera of `cameras.bin` with three parameters
+SIGMA_FORMS = ("colmap", "metashape-cameras")  # the forms that have a place for σ and correlations
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The ``content`` of a file, and ``lost`` : properties of the camera that the file has no place for."""
+
+    content: str | bytes
+    lost: tuple[str, ...]
+
+
+def is_mrcal(text: str) -> bool:
+    """Return True if a text has the keys of a ``.cameramodel``; PhotonVision names mrcal's lens models, too."""
+    return "lensmodel" in text and "imagersize" in text
+
+
+def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
+    """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined."""
+    try:
+        values = ast.literal_eval(text.strip())
+        lens, numbers = values["lensmodel"], [float(v) for v in values["intrinsics"]]
+        width, height = (float(v) for v in values["imagersize"])
+    except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError("E-CAMERA-UNREADABLE", f"not mrcal's form ({reason}); write it anew with mrcal") from error
+    region = _region(values.get("valid_intrinsics_region"))
+    taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
+    require_known({key: value for key, value in values.items() if key not in taken}, MRCAL_HARMLESS)
+    if str(lens).startswith("LENSMODEL_SPLINED"):
+        made = foreign.of_splines(lens, numbers, width, height)
+    elif lens == "LENSMODEL_CAHVOR":
+        made = foreign.of_cahvor(numbers, width, height)
+    elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
+        made = foreign.of_opencv(numbers[:4], np.array(numbers[4:]), width, height)
+    else:
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"{lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
+            "ones are read: mrcal-convert-lensmodel makes one of another",
+        )
+    if isinstance(made, foreign.ForeignLens):
+        return replace(made, region=region)
+    pass_over([] if region is None else ["valid_intrinsics_region"])
+    return made
+
+
+def _region(stated: object) -> np.ndarray | None:
+    try:
+        region = np.array([] if stated is None else stated, float)
+    except (TypeError, ValueError):
+        region = np.full(1, np.nan)  # refused below
+    if region.size and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
+        raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
+    return region if region.size else None
+
+
+def is_colmap_binary(content: bytes) -> bool:
+    """Return True if a file begins with a number of cameras that it is long enough for; a text states a huge one."""
+    count = int.from_bytes(content[:8], "little")
+    return len(content) >= 8 and count <= (len(content) - 8) // LEAST_CAMERA_BYTES
+
+
+def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.ForeignLens:
+    """Return the camera of ``cameras.bin``, or the one of number ``choice``."""
+    try:
+        (count,) = struct.unpack_from("<Q", content, 0)
+        at, cameras = 8, {}
+        for _ in range(min(count, len(content) // 24)):
+            number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
+            model = foreign.NUMBERS[kind]
+            _, length = foreign.COLMAP_FOREIGN.get(model) or (0, len(parameter_names(model)))
+            cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
+            at += 24 + 8 * length
+    except (struct.error, KeyError) as error:
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor a cameras.bin of known models; check it") from error
+    if at != len(content) or not cameras:
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor COLMAP's cameras.bin; check it")
+    model, width, height, params = cameras[foreign.one_of(list(cameras), foreign.numbered(cameras, choice))]
+    return foreign.of_colmap(model, width, height, params)
+
+
+def name_to_write(name: str) -> str:
+    """Return a name that every form can hold: ``Cam_B_35mm`` of ``Cam B (35mm)``, ``cam1`` of 1, ``cam0`` of none."""
+    word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "cam0"
+    return word if word[0].isalpha() else f"cam{word}"
+
+
+def written(camera: Camera, form: str, name: str) -> Written:
+    """Return the file of a camera in one of :data:`WRITERS`, named by a word; refuse a lens that it cannot hold."""
+    lost = ["σ and correlations of the parameters"] * (form not in SIGMA_FORMS)
+    lost += metashape.without_sigma(camera) if form == "metashape-cameras" else []
+    return Written(WRITERS[form](camera, name), tuple(lost) if camera.covariance is not None else ())
+
+
+def _colmap_binary(camera: Camera, _: str) -> bytes:
+    params = camera.colmap_params()
+    number = next(number for number, name in foreign.NUMBERS.items() if name == camera.colmap_model)
+    head = struct.pack("<QIiQQ", 1, 1, number, camera.width, camera.height)
+    return head + struct.pack(f"<{len(params)}d", *params)
+
+
+def _fisheye_four(camera: Camera, form: str) -> list[float]:
+    """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
+    if camera.distortion[2:4].any() or camera.distortion[8:].any():
+        raise foreign.refused(camera, form, "p1, p2 and prisms")
+    return camera.distortion[[0, 1, 4, 5]].tolist()
+
+
+def _coefficients(camera: Camera) -> list[float]:
+    """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
+    return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
+
+
+def _matrix(camera: Camera) -> list[float]:
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
+def _opencv(camera: Camera, _: str) -> str:
+    values = _fisheye_four(camera, "opencv") if camera.fisheye else _coefficients(camera)
+    node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
+    kind = "distortion_model: equidistant\n" if camera.fisheye else ""
+    return (
+        f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
+        f"camera_matrix: {node.format(3, 3, _matrix(camera))}{kind}"
+        f"distortion_coefficients: {node.format(1, len(values), values)}"
+    )
+
+
+def _ros(camera: Camera, name: str) -> str:
+    values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
+    kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
+    k, eye = _matrix(camera), np.eye(3).ravel().tolist()
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+
+    def node(rows: int, data: list[float]) -> str:
+        return f"\n  rows: {rows}\n  cols: {len(data) // rows}\n  data: {data}\n"
+
+    return (
+        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: {name}\n"
+        f"camera_matrix:{node(3, k)}distortion_model: {kind}\ndistortion_coefficients:{node(1, values)}"
+        f"rectification_matrix:{node(3, eye)}projection_matrix:{node(3, p)}"
+    )
+
+
+def _kalibr(camera: Camera, name: str) -> str:
+    if camera.fisheye:
+        kind, values = "equidistant", _fisheye_four(camera, "kalibr")
+    else:
+        kind, values = "radtan", camera.distortion[:4].tolist()
+        if camera.distortion[4:].any():
+            raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
+    return (
+        f"{name}:\n  camera_model: pinhole\n  intrinsics: {camera.parameters()[:4].tolist()}\n"
+        f"  distortion_model: {kind}\n"
+        f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
+    )
+
+
+def _mrcal(camera: Camera, _: str) -> str:
+    if camera.fisheye:
+        raise foreign.refused(camera, "mrcal", "the equidistant projection")
+    values = _coefficients(camera) if camera.distortion.any() else []
+    values = values[:4] if len(values) == 5 and not values[4] else values
+    lens = next(name for name, count in MRCAL.items() if count == len(values))
+    return (
+        f"{{\n    'lensmodel': '{lens}',\n    'intrinsics': {[*camera.parameters()[:4].tolist(), *values]},\n"
+        f"    'extrinsics': [0, 0, 0, 0, 0, 0],\n    'imagersize': [{camera.width}, {camera.height}]\n}}\n"
+    )
+
+
+WRITERS: Mapping[str, Callable[[Camera, str], str | bytes]] = {
+    "colmap": lambda camera, _: cameras_txt(camera),
+    "colmap-bin": _colmap_binary,
+    "opencv": _opencv,
+    "ros": _ros,
+    "kalibr": _kalibr,
+    "mrcal": _mrcal,
+    "metashape": lambda camera, _: metashape.calibration(camera),
+    "metashape-cameras": metashape.cameras,
+    "matlab": mat,
+}
+"""Writers by form: each returns the file of a camera and its name."""
+SQLITE = b"SQLite format 3\0"  # first bytes of an SQLite database
 COLMAP_LINE = re.compile(r"\A(?:[ \t]*(?:#[^\r\n]*)?[\r\n])*[ \t]*[^\s{<]+[ \t]+[A-Z][A-Z0-9_]+(?:[ \t]+\S+){3}")
 """First line of COLMAP's ``cameras.txt`` : a number, a model, and at least three numbers."""
-
 _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
 
@@ -91,43 +393,10 @@ def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple
     """Return the camera of a file; ``size`` is taken where the file states none."""
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):
-        raise InputError(
-            "E-CAMERA-SIZE", f"camera file {path}: states no image size; give it (--size), width and height in px"
-        )
+        raise InputError("E-CAMERA-SIZE", f"camera file {path}: states no image size; give it (--size), px")
     if isinstance(model, ForeignLens):
         raise unsupported(model, path)
     return model.calibrated(width, height)
-
-
-def _stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
-    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
-    stated = {
-        key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
-    }
-    if not any(stated.values()):
-        return None
-    count = len(names)
-    try:
-        if list(map(len, stated[SIGMA])) != [count] or list(map(len, stated[CORRELATION])) != [count] * count:
-            raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
-        sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
-        for name, sigma_of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
-            # the covariance hides such errors
-            if not 0 < sigma_of_name <= MAX_SIDE_PX or not abs(with_itself - 1) <= SQUARE_WITHIN:
-                raise InputError(
-                    "E-CAMERA-COVARIANCE",
-                    f"σ of {name} is {sigma_of_name:g}, its correlation with itself {with_itself:g}; a positive number "
-                    f"up to {MAX_SIDE_PX}, and 1 needed",
-                )
-        covariance = correlation * np.outer(sigma, sigma)
-        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
-    except (InputError, ValueError) as error:
-        raise InputError(
-            "E-CAMERA-COVARIANCE",
-            f"SIGMA and CORRELATION state no covariance of its parameters: {error}; write it again, or remove these "
-            "comments",
-        ) from error
-    return covariance
 
 
 def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
@@ -143,7 +412,7 @@ def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
     lens = of_colmap(model, width, height, params)
     if isinstance(lens, ForeignLens):
         return lens
-    return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model)))
+    return replace(lens, covariance=stated_covariance(text, parameter_names(lens.colmap_model)))
 
 
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
@@ -177,31 +446,26 @@ def _read(path: Path, name: str) -> CameraModel | ForeignLens:
         raise InputError("E-CAMERA-UNREADABLE", reason) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"no camera of {READ} ({reason}); check its form, or convert it"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", f"no camera of {READ} ({reason}); check it, or convert it") from error
 
 
 BINARY_FORMATS = (
     (lambda content: content.startswith(matlab.HEADS), matlab.from_mat),
-    (forms.is_colmap_binary, forms.from_colmap_binary),
+    (is_colmap_binary, from_colmap_binary),
 )
 """For each binary format a test of the content and a reader, which is given the content and a name."""
 TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraModel | ForeignLens]], ...] = (
     (lambda text: COLMAP_LINE.search(text) is not None, _from_colmap),
     (metashape.is_metashape, metashape.from_metashape),
-    (forms.is_mrcal, forms.from_mrcal),
+    (is_mrcal, from_mrcal),
     (matlab.is_script, matlab.from_script),
     (is_ini, from_ini),
     (lambda text: True, lambda text, name: from_keys(values_of(text), name)),
 )
 """For each text format the same; what no other test recognises has keys and values."""
-
-
 WRITTEN_PX = 1e-6
 """Largest difference of a projected point, px. Forms with few decimals, such as OpenCV's, round by 1e-8 px."""
-ACROSS = 9
-"""Number of points across the image, and down it, by which cameras are compared."""
+ACROSS = 9  # number of points across the image, and down it, by which cameras are compared
 
 
 @require_arguments

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import TWIST
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.io.covariance import TWIST
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
     carried_poses,

@@ -13,7 +13,7 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
-from stcal.io.poses.rotations import EXPLAINS
+from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import State, observed, residuals, tips_of
 from stcal.robot.identification.problem import USELESS_MM

@@ -126,7 +126,7 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
     Raises InputError: the columns of a rotation are incomplete, ``rotation`` is given without such columns, or the
     convention is missing or given although the columns state it.
     """
-    from stcal.io.poses.columns import read_rotations
+    from stcal.io.rotations import read_rotations
 
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
     if rotation is not None and (turned is None or turned.stated):

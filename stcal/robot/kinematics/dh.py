@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.rotations import EXPLAINS, READINGS
+from stcal.io.rotations import EXPLAINS, READINGS
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.robot_model import (
     Chain,

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
-from stcal.io.poses.rotations import EXPLAINS, READINGS
+from stcal.io.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.observability import over_ranges

@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
+from stcal.geometry.arrays import Rows, require_covariance
 from stcal.geometry.rigid import Rigid
-from stcal.io.covariance import Rows, require_covariance
 from stcal.io.json import (
     ByFace,
     ByLabel,

@@ -14,13 +14,12 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from stcal.boards.on_faces import shift_by_curves
+from stcal.boards.finders import shift_by_curves
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, keep_packed, kept, made_by, packed
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
     ImageFile,
@@ -31,6 +30,7 @@ from stcal.io.images import (
     grey_of,
     name_fault,
     require_common_size,
+    run_on_images,
     same_photograph,
     size_fault,
     thumbnail,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.board_designs import CornerBoard
-from stcal.boards.on_faces import find_on_faces
+from stcal.boards.finders import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography

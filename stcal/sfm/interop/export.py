@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import require_same, save
-from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, ros2_launch
+from stcal.io.static_transforms import Static, fixed_joint, messages, ros1_launch, ros2_launch
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.sfm.interop import gltf

@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import Part
-from stcal.io.poses.programs import Static
+from stcal.io.static_transforms import Static
 from stcal.labels import CircleLabel, parse_label
 from stcal.report.text import number
 from stcal.sfm.runs.report_file import ReportCamera, Space

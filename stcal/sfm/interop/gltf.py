@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.programs import metres, xyzw
+from stcal.io.static_transforms import metres, xyzw
 from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content
 
 EDGES = 48  # number of edges of a disc. Its triangles leave out 0.3 % of its area.

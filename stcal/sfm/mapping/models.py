@@ -16,7 +16,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.camera_model import camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
-from stcal.io.poses.programs import image_lines
+from stcal.io.static_transforms import image_lines
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, M, MetricModel, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap

@@ -11,10 +11,9 @@ from scipy.linalg import block_diag
 from stcal.boards.target_file import load_target
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments
+from stcal.geometry.arrays import Brief, Rows, freeze, frozen, require_arguments, require_covariance
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.covariance import Rows, require_covariance
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget

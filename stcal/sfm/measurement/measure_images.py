@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 from threadpoolctl import ThreadpoolController
 
-from stcal.boards.on_faces import why_unseen
+from stcal.boards.finders import why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
@@ -20,8 +20,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
-from stcal.io.image_jobs import run_on_images
-from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey
+from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey, run_on_images
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.data.group_model import ImageObservations, by_group

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry import least_squares
-from stcal.geometry.arrays import Brief, freeze, frozen, require_fields, rms
+from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, freeze, frozen, require_fields, rms
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import (
@@ -28,7 +28,6 @@ from stcal.geometry.plane import (
 )
 from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles

@@ -12,12 +12,11 @@ from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
 from stcal.design import scale_reference
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_arguments
+from stcal.geometry.arrays import OF_PIXEL, first_fault, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
-from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.files import (
     BOARD,
     CAMERA,

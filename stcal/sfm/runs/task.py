@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.board_designs import CornerBoard
-from stcal.boards.on_faces import why_unseen
+from stcal.boards.finders import why_unseen
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import DegenerateError, DetectionError, InputError
 from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import CameraModel, model_of
-from stcal.io.cameras.photograph import camera_of_photograph
+from stcal.io.cameras.read import camera_of_photograph
 from stcal.io.images import ImageFile, ImageFiles, require_common_size
 from stcal.parallel import Progress, counted
 from stcal.sfm.camera.calibrate import camera_of_dots

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from stcal.io import decoding
-from stcal.io.cameras.photograph import camera_of_photograph
+from stcal.io.cameras.read import camera_of_photograph
 from stcal.io.images import decode, find_images
 from tests.outcome import fails_with
 

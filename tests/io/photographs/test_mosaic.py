@@ -9,8 +9,7 @@ from stcal.io.images import find_images
 from tests.outcome import fails_with
 
 Y, X = np.mgrid[:240, :320]
-GAIN = {"R": 0.55, "G": 1.0, "B": 0.7}
-"""Sensitivities of a sensor without white balance."""
+GAIN = {"R": 0.55, "G": 1.0, "B": 0.7}  # sensitivities of a sensor without white balance
 
 
 def scene(seed: int = 0) -> np.ndarray:

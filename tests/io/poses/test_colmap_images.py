@@ -2,7 +2,7 @@
 
 import pytest
 
-from stcal.io.poses.programs import image_lines
+from stcal.io.static_transforms import image_lines
 from tests.outcome import refuses
 
 A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.poses.columns import read_rotations
+from stcal.io.rotations import read_rotations
 from stcal.io.table import Table
 from tests.outcome import fails_with
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from stcal.io.image_jobs import run_on_images, spread
-from stcal.io.images import ImageFile
+from stcal.io.images import ImageFile, run_on_images, spread
 from stcal.parallel import hand_over
 from stcal.sfm import run
 from stcal.workflows import cluster

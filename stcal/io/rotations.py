@@ -1,4 +1,4 @@
-"""Conventions and units of the numbers that state a rotation, and mistakes in the order of quaternions."""
+"""Rotations as numbers and columns of tables: names, conventions, units, mistakes in the order of quaternions."""
 
 import re
 from collections.abc import Sequence
@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
-from stcal.io.table import ANGLES, require_unit
+from stcal.io.table import ANGLES, Table, require_unit
 
 ROTATION_VECTOR = "rotvec"
 MOST_RADIANS = 4 * np.pi
@@ -46,8 +47,7 @@ _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """A convention for rotations: :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; and the
-    unit of the angles, empty if it is open."""
+    """A convention for rotations: rotation vector, quaternion or order of axes; and the unit, empty if open."""
 
     order: str
     unit: str = ""
@@ -91,10 +91,8 @@ def said_convention(rotation: str | None, what: str, where: str, count: int = 3)
         raise InputError("E-ROTATION-AMBIGUOUS", f"{where}: {what} may be {form}; give --rotation, like {likely}")
     convention = convention_of(rotation)
     if convention.count != count:
-        raise InputError(
-            "E-OPTION-CONTRADICTS",
-            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {convention.count}; correct the option",
-        )
+        fault = f"{where}: {what} are {count} numbers, --rotation {rotation} is of {convention.count}"
+        raise InputError("E-OPTION-CONTRADICTS", f"{fault}; correct the option")
     return convention
 
 
@@ -172,15 +170,11 @@ def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> Non
     """Refuse values (m, …) that are not finite; the message names the row."""
     bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if len(bad):
-        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(
-            "E-TABLE-NUMBER",
-            f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{suffix}; take it out",
-        )
+        reason = f"a value that is not finite, numbers needed{f' (and {len(bad) - 1} more)' * (len(bad) > 1)}"
+        raise InputError("E-TABLE-NUMBER", f"{where}: {places[bad[0]]}: {reason}; take it out")
 
 
-EXPLAINS = 0.2
-"""A mistake explains a misfit if its correction reduces the misfit below this share."""
+EXPLAINS = 0.2  # a mistake explains a misfit if its correction reduces the misfit below this share
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +200,7 @@ class Reading:
 
 LAST = Reading("x, y, z, w in the order of their columns", "give --quaternions xyzw", (3, 0, 1, 2))
 FIRST = Reading(
-    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or name the columns so", (1, 2, 3, 0)
+    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or rename them", (1, 2, 3, 0)
 )
 ORDERS = (LAST, FIRST)
 INVERTED = Reading("conjugated (the first frame seen from the second)", "change the sign of qw", conjugated=True)
@@ -219,3 +213,106 @@ READINGS = (
         for each in ORDERS
     ),
 )
+TRIPLES = {
+    ("rx", "ry", "rz"): {"rad": "ur-rotvec"},
+    ("a", "b", "c"): {"deg": "kuka-abc"},
+    ("w", "p", "r"): {"deg": "fanuc-wpr"},
+    ("o", "a", "t"): {"deg": "kawasaki-oat"},
+    ("theta_x", "theta_y", "theta_z"): {"deg": "kinova"},
+    ("roll", "pitch", "yaw"): {"deg": "rpy", "rad": "rpy"},
+    ("rpy_roll", "rpy_pitch", "rpy_yaw"): {"deg": "rpy", "rad": "rpy"},
+    ("q1", "q2", "q3", "q4"): {},
+}
+"""Conventions of columns by names and unit; with another unit, or none, the convention is open."""
+NAMED_BY_AXES = [names for names in TRIPLES if names[0] in ("rx", "theta_x", "roll", "rpy_roll")]
+_EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turned:
+    """Rotations (m, 3, 3) of columns, and the convention in words; ``stated`` : without an option."""
+
+    rotation: np.ndarray
+    words: str
+    columns: tuple[str, ...]
+    stated: bool = True
+
+    def __post_init__(self):
+        freeze(self, "rotation", (len(self.rotation), 3, 3), "rotations")
+
+
+def places_of(table: Table) -> tuple[str, ...]:
+    """Return the place of each row, for messages."""
+    return tuple(f"line {line}" for line in table.lines)
+
+
+def find_column(table: Table, prefix: str, name: str) -> str | None:
+    """Return the column of a name, also with capital letters; None if there is none."""
+    wanted = f"{prefix}{name}"
+    return wanted if wanted in table else next((c for c in table.columns if c.lower() == wanted.lower()), None)
+
+
+def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:
+    """Return the rotations of columns with a prefix, None if none; ``rotation`` : the option for open angles."""
+    places, where = places_of(table), table.where
+    if f"{prefix}qw" in table or f"{prefix}qx" in table:
+        table.has_rotation(prefix)
+        columns = [prefix + name for name in table.quaternion_columns(prefix)]
+        by_order = table.quaternions != "wxyz"
+        words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
+        matrices = of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where)
+        return Turned(matrices, words, tuple(columns))
+    for unit in ANGLES:
+        columns = [f"{prefix}rotvec_{axis}_{unit}" for axis in "xyz"]
+        if (values := _all(table, columns)) is not None:
+            return Turned(*rotations(values, Convention(ROTATION_VECTOR, unit), places, where), tuple(columns))
+    for column in table.columns:
+        if column.startswith(prefix) and (euler := _EULER.fullmatch(column.removeprefix(prefix))):
+            columns = [f"{prefix}euler_{euler[1]}_{i}_{euler[2]}" for i in (1, 2, 3)]
+            if (values := _all(table, columns)) is not None:
+                return Turned(*rotations(values, Convention(euler[1], euler[2]), places, where), tuple(columns))
+    matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+    if (values := _all(table, matrix)) is not None:
+        return Turned(proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices", tuple(matrix))
+    return _by_convention(table, prefix, rotation)
+
+
+def _all(table: Table, columns: list[str]) -> np.ndarray | None:
+    """Return the values (m, k) of columns; None if all columns are missing, an error if only some are."""
+    present = [column for column in columns if column in table]
+    if not present:
+        return None
+    if len(present) < len(columns):
+        missing = next(column for column in columns if column not in table)
+        without = f"{table.where}: {', '.join(present)} without {missing}; all {len(columns)} needed"
+        raise InputError("E-TABLE-COLUMN-MISSING", without)
+    return np.column_stack([table.numbers(column) for column in columns])
+
+
+def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | None:
+    for triple, stated in TRIPLES.items():
+        for unit in (*ANGLES, "") if len(triple) == 3 else ("",):
+            wanted = [f"{name}_{unit}" if unit else name for name in triple]
+            names = tuple(column for name in wanted if (column := find_column(table, prefix, name)) is not None)
+            if len(names) < len(wanted):
+                continue
+            what = "".join(triple) if len(triple[0]) == 1 else ", ".join(triple)
+            if rotation is None and unit in stated:
+                convention = convention_of(stated[unit])
+            else:
+                convention = said_convention(rotation, what, table.where, len(triple))
+            says_unit = (rotation or "").endswith(tuple(f"-{name}" for name in ANGLES))  # a robot's name implies one
+            if unit and says_unit and convention.unit not in ("", unit):
+                both = f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one"
+                raise InputError("E-OPTION-CONTRADICTS", both)
+            convention = Convention(convention.order, unit or convention.unit)
+            values = np.column_stack([table.numbers(column) for column in names])
+            turned, words = rotations(values, convention, places_of(table), table.where, triple in NAMED_BY_AXES)
+            return Turned(turned, f"{', '.join(names)} as {words}", names, stated=False)
+    return None
+
+
+def fixed(value: float, digits: int) -> str:
+    """Return a number with a fixed number of digits, and no minus before zero."""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if not text.strip("-0.") else text

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.columns import fixed
+from stcal.io.rotations import fixed
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 """Arguments of ROS 2's ``static_transform_publisher``."""
@@ -41,17 +41,12 @@ def xyzw(pose: Rigid) -> list[float]:
 
 def messages(statics: Iterable[Static]) -> str:
     """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
-    documents = [
-        {
-            "header": {"frame_id": each.parent},
-            "child_frame_id": each.child,
-            "transform": {
-                "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-                "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
-            },
-        }
-        for each in statics
-    ]
+    documents = []
+    for each in statics:
+        parts = ("translation", "xyz", metres(each.pose)), ("rotation", "xyzw", xyzw(each.pose))
+        transform = {part: dict(zip(axes, values, strict=True)) for part, axes, values in parts}
+        head = {"header": {"frame_id": each.parent}, "child_frame_id": each.child}
+        documents.append({**head, "transform": transform})
     return "---\n".join(yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in documents)
 
 
@@ -83,10 +78,8 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     for static in statics:
         names = static.parent, static.child
         if spaced := [name for name in names if name.split() != [name]]:
-            raise InputError(
-                "E-FRAME-NAME",
-                f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name",
-            )
+            split = f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name"
+            raise InputError("E-FRAME-NAME", split)
         words = [*_pose_words(static.pose), *names]
         node = f"{static.child}_broadcaster".replace("/", "_")
         lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
@@ -123,15 +116,12 @@ def plain_numbers(values, digits: int) -> list[str]:
     return [fixed(v, digits) for v in values]
 
 
-METRE_MM = 1000.0
-"""Millimetres per metre, the unit of ROS, URDF and Universal Robots."""
+METRE_MM = 1000.0  # millimetres per metre, the unit of ROS, URDF and Universal Robots
 
 
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
-    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
-
-    Roll is computed from what remains after pitch and yaw, which keeps full precision at a pitch of ±90°.
-    """
+    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order. Roll is computed from what
+    remains after pitch and yaw, which keeps full precision at a pitch of ±90°."""
     r = pose.rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     yaw = np.arctan2(r[1, 0], r[0, 0])
@@ -175,20 +165,15 @@ def image_lines(text: str, where: str) -> list[ImageLine]:
             number, line = next(lines)
             continue
         if not _is_image(line):
-            raise InputError(
-                "E-MODEL-UNREADABLE",
-                f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
-            )
+            no_image = f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew"
+            raise InputError("E-MODEL-UNREADABLE", no_image)
         first, name = number, line.split(maxsplit=CELLS - 1)[-1].strip()
         number, line = next(lines)
         followed = number > 0 and not _is_image(line)
         images.append(ImageLine(first, name, followed))
         if followed and not _are_points(line):
-            raise InputError(
-                "E-MODEL-UNREADABLE",
-                f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
-                "model anew",
-            )
+            cells = f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each"
+            raise InputError("E-MODEL-UNREADABLE", f"{cells}; export the model anew")
         if followed:
             number, line = next(lines)
     return images

@@ -1,1 +1,0 @@
-"""Poses, rotations and tables as other programs, instruments and controllers of robots write them."""
