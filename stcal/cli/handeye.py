@@ -15,7 +15,7 @@ from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.handeye.methods.evolution import Bounds
+    from stcal.handeye.methods.closed_form import Bounds
     from stcal.robot import Robot
     from stcal.workflows.handeye_inputs import Files
     from stcal.workflows.robot_at_images import Timing
@@ -67,7 +67,7 @@ class PoseFiles:
 
     def given(self, timing: "Timing", robot: "Robot | None" = None) -> "Files":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-        from stcal.handeye.data.record import Said
+        from stcal.handeye.data.pose_content import Said
         from stcal.workflows.handeye_inputs import Files, one_source
 
         said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
@@ -160,10 +160,10 @@ def handeye(
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
-    from stcal.handeye.report import transform_export as forms
-    from stcal.handeye.report.handeye_file import HandEyeFile
-    from stcal.handeye.report.handeye_page import outcome_report
-    from stcal.handeye.report.outcome import judged
+    from stcal.handeye import handeye_file as forms
+    from stcal.handeye.handeye_file import HandEyeFile
+    from stcal.handeye.handeye_page import outcome_report
+    from stcal.handeye.handeye_pipeline import judged
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
@@ -281,7 +281,7 @@ def handeye(
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
     """Returns the bounds in a text like ``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
-    from stcal.handeye.methods.evolution import Bounds
+    from stcal.handeye.methods.closed_form import Bounds
 
     if text is None:
         return None

@@ -16,11 +16,9 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.handeye_pipeline import validated
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
-from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.solving import HandEyeProblem
+from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
+from stcal.handeye.problem import HandEye, HandEyeProblem
+from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
 from stcal.io.cameras.camera_model import CameraPrior

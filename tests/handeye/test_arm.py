@@ -9,7 +9,7 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, cross_validate, splits
 from stcal.handeye.data.pose_pairs import SETUPS
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
 from stcal.robot.kinematics.robot_file import save_robot

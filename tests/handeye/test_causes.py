@@ -9,9 +9,9 @@ import stcal.handeye
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
-from stcal.handeye.judge.remarks import Grave, SizeDoubt
-from stcal.handeye.report.outcome import judged
-from stcal.handeye.solving import HandEyeProblem, handeye
+from stcal.handeye.handeye_pipeline import judged
+from stcal.handeye.problem import HandEyeProblem, handeye
+from stcal.handeye.remarks import Grave, SizeDoubt
 from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye, lag_tried
 from tests.outcome import fails_with

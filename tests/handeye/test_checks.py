@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
+from stcal.handeye.conventions import repair
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
-from stcal.handeye.judge.conventions import repair
-from stcal.handeye.judge.observable import Observability
-from stcal.handeye.judge.remarks import of_size
-from stcal.handeye.methods.noise import Noise
-from stcal.handeye.solving import handeye
+from stcal.handeye.methods.pose_adjustment import Noise
+from stcal.handeye.problem import handeye
+from stcal.handeye.remarks import Observability, of_size
 from stcal.io.poses.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
 from tests.levels import FULL

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from tests.outcome import fails_with
 from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed
 

@@ -8,8 +8,8 @@ import pytest
 import stcal
 from stcal import workflows
 from stcal.geometry.camera import Camera
+from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.plan import planned_file
-from stcal.handeye.report.handeye_file import HandEyeFile
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells

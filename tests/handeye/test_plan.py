@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, plan_poses
 from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from tests.outcome import fails_with
 from tests.support.handeye import CAMERA, board_corners, disturbed, simulated, squared
 

@@ -10,7 +10,7 @@ import yaml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, pairs_of_views
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import camera_prior
 
 

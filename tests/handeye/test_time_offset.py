@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import squared

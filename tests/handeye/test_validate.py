@@ -18,7 +18,7 @@ from stcal.handeye import (
     splits,
 )
 from stcal.handeye.data.pose_pairs import Loop, Motions
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.handeye.validate import predicted
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated, simulated_views

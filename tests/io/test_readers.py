@@ -15,8 +15,8 @@ from stcal.boards.board_file import load_board, load_flat_board
 from stcal.boards.several import load_boards
 from stcal.boards.target_file import load_target
 from stcal.errors import InputError, InputNote, StcalError
-from stcal.handeye.data.inputs import read_pairs, require_own
-from stcal.handeye.data.record import Said
+from stcal.handeye.data.pose_content import Said
+from stcal.handeye.data.pose_files import read_pairs, require_own
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan

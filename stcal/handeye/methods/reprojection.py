@@ -18,8 +18,16 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import Views, resect, whitened
 from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
-from stcal.handeye.methods.noise import CAUTION, FARTHEST, UNKNOWNS, Noise
-from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
+from stcal.handeye.methods.pose_adjustment import (
+    CAUTION,
+    FALSE_ALARM,
+    FARTHEST,
+    LEAST_POSES,
+    UNKNOWNS,
+    LoopState,
+    Noise,
+    PoseSolution,
+)
 from stcal.io.cameras.camera_model import CameraPrior
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2

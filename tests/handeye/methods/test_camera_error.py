@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.handeye import HandEyeOptions, Views, pairs_of_views
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from tests.support.handeye import CAMERA, simulated_views, squared
 

@@ -9,9 +9,18 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise
 from stcal.handeye.data.pose_pairs import Loop, Motions, poses_with_log
-from stcal.handeye.methods.closed_form import AX_XB, equations, smallest_largest
-from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish, three_others
-from stcal.handeye.solving import handeye
+from stcal.handeye.methods.closed_form import (
+    AX_XB,
+    Bounds,
+    EvolutionOptions,
+    Objective,
+    equations,
+    evolve,
+    polish,
+    smallest_largest,
+    three_others,
+)
+from stcal.handeye.problem import handeye
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 

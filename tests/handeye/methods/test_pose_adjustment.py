@@ -10,9 +10,8 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise
 from stcal.handeye.data.pose_pairs import Loop
-from stcal.handeye.methods.noise import components
-from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others
-from stcal.handeye.solving import handeye
+from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others, components
+from stcal.handeye.problem import handeye
 from tests.support.handeye import error, normalised, simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")

@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.solving import handeye
+from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import camera_prior
 from tests.outcome import refuses
 from tests.support.handeye import error, normalised, simulated_views

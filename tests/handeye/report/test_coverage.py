@@ -8,9 +8,9 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
-from stcal.handeye.report.handeye_page import by_robot, image_coverage, outcome_report
-from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.solving import handeye
+from stcal.handeye.handeye_page import by_robot, image_coverage, outcome_report
+from stcal.handeye.handeye_pipeline import Outcome
+from stcal.handeye.problem import handeye
 from tests.support.handeye import simulated_views
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.transform_export import FORMS, exported, opencv_yaml, tree, urdf_joint
+from stcal.handeye.handeye_file import FORMS, exported, opencv_yaml, tree, urdf_joint
 from stcal.io.poses.programs import Static, messages
 from tests.outcome import fails_with
 from tests.support.static_transforms import (

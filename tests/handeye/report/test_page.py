@@ -10,10 +10,10 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.handeye_file import HandEyeFile
-from stcal.handeye.report.handeye_page import outcome_report
-from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.solving import FACTORS, handeye
+from stcal.handeye.handeye_file import HandEyeFile
+from stcal.handeye.handeye_page import outcome_report
+from stcal.handeye.handeye_pipeline import Outcome
+from stcal.handeye.problem import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text

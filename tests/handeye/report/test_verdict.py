@@ -7,9 +7,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.report.outcome import Outcome, judged, share_of_variance
-from stcal.handeye.solving import handeye
+from stcal.handeye.handeye_pipeline import Outcome, judged, share_of_variance
+from stcal.handeye.problem import handeye
+from stcal.handeye.remarks import Aside, Grave
 from stcal.handeye.validate import cross_validate, splits
 from tests.support.handeye import simulated
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.handeye.data.record import Said
+from stcal.handeye.data.pose_content import Said
 from stcal.workflows.handeye_inputs import Files, one_source
 from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import FORMATS, REFUSED

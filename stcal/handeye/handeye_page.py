@@ -7,10 +7,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import Aside, spoken
-from stcal.handeye.report.outcome import ArmFound, Outcome, judged
-from stcal.handeye.solving import FACTORS
+from stcal.handeye.handeye_pipeline import ArmFound, Outcome, judged
+from stcal.handeye.problem import FACTORS, HandEye
+from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
 from stcal.report.document import (
     Block,

@@ -15,11 +15,11 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_content import FRAMES
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, carried
-from stcal.handeye.data.record import FRAMES
-from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
+from stcal.handeye.remarks import HALL_MM, Aside, Grave, of_still
 from stcal.io.poses.rotations import INVERTED as CONJUGATED
 from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
 
