@@ -24,7 +24,7 @@ from stcal.handeye.data.corner_views import Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.methods.pose_adjustment import components
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.problem import handeye
+from stcal.handeye.problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
@@ -80,7 +80,8 @@ def trial(case: Case, seed: int) -> tuple[float, float, int]:
     truth = truth_of(case, seed, noise)
     by_poses = case.method.startswith("pose")
     options = HandEyeOptions(noise=noise if case.method.endswith("stated") else Noise())
-    found = handeye(truth.pairs, case.setup, "pose" if by_poses else "reprojection", truth.views, options)
+    problem = HandEyeProblem(truth.pairs, case.setup, truth.views, options)
+    found = problem.solved("pose" if by_poses else "reprojection").result
     off = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
     bound = (pose_bound if by_poses else corner_bound)(truth_of(case, seed, EXACT), noise)
     return (
@@ -99,7 +100,8 @@ def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> t
     camera = CAMERA.with_parameters(CAMERA.parameters() + intrinsic_basis(PRIOR.colmap_model) @ error)
     views = Views(camera, truth.views.views)
     solved_by, options = CAMERAS[method]
-    found = handeye(pairs_of_views(truth.pairs.base_from_flange, views), setup, solved_by, views, options)
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = HandEyeProblem(pairs, setup, views, options).solved(solved_by).result
     apart = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
     return float(apart @ np.linalg.solve(found.covariance, apart)), float(apart[3:] @ apart[3:])
 

@@ -12,10 +12,10 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, ByValue, freeze, require_fields
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.conventions import Guess, check_conventions, flipped, repair
+from stcal.handeye import remarks
+from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log, rms_of
-from stcal.handeye.judge import remarks
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
 from stcal.handeye.methods.closed_form import (
@@ -40,7 +40,6 @@ from stcal.handeye.methods.reprojection import (
 )
 from stcal.handeye.remarks import Aside, Observability, Verdict, check, in_words, require_scale
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.parallel import one_thread
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -148,7 +147,9 @@ class HandEye(Brief):
 
 
 S = TypeVar("S", PoseSolution, AdjustedCorners)
-METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", "pose", "reprojection")
+SCALED = ("pose", "reprojection")
+"""Methods that weigh errors, and can find the board's size."""
+METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", *SCALED)
 """Names of all methods."""
 UNIT_MM = 1000.0
 """Length that weighs like one radian if no σ are stated, in mm: an error of 1 mm weighs like one of 1 mrad."""
@@ -256,7 +257,8 @@ class HandEyeProblem:
 
     def solved(self, method: str | None = None) -> "Solved":
         """Returns the result of one method, ``reprojection`` with views, else ``pose``, if None, with the state from
-        which solutions without some poses start. Raises StcalError: as :func:`stcal.handeye.handeye`."""
+        which solutions without some poses start. Its σ are estimated from its own residuals. Raises StcalError: as
+        :func:`stcal.handeye.handeye`."""
         method = method or ("pose" if self.views is None else "reprojection")
         options, pairs = self.options, self.pairs
         if method not in METHODS:
@@ -286,43 +288,20 @@ class HandEyeProblem:
         if not self.part:
             doubts = check_conventions(problem.pairs, loop, self.setup, guess, options.with_scale, by_images)
             problem = replace(problem, notes=(*problem.notes, *doubts))
-        task = _Task(problem, loop, guess, seen)
-        if method == "pose":
-            return _by_poses(task)
-        if method == "reprojection" and problem.views is not None:
-            return _by_views(task, problem.views)
-        return Solved(task, _by_equations(task, method))
-
-
-@one_thread()
-def handeye(
-    pairs: HandEyePoses,
-    setup: Setup = "eye-in-hand",
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-) -> HandEye:
-    """Returns the result of one method, with σ estimated from its own residuals. Parameters and errors as for
-    :func:`stcal.handeye.handeye`, which chooses a method and widens σ."""
-    return HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).solved(method).result
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Task:
-    """A ``problem`` after repair, with its ``loop``; ``guess`` : returns first X, Z and scale of a loop and
-    ``with_scale``; ``seen`` : observability."""
-
-    problem: HandEyeProblem
-    loop: Loop
-    guess: Guess
-    seen: Observability
+        task = _Task(problem, loop, seen)
+        if method not in SCALED:
+            return task.by_equations(method)
+        first = guess(loop, options.with_scale)
+        return (
+            task.by_poses(first) if problem.views is None or method == "pose" else task.by_views(first, problem.views)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
     """``result`` of a ``task``, and the ``solution`` behind it where the method adjusts poses or corners."""
 
-    task: _Task
+    task: "_Task"
     result: HandEye
     solution: PoseSolution | AdjustedCorners | None = None
 
@@ -332,7 +311,7 @@ class Solved:
         task, solution, board = self.task, self.solution, None
         if solution is None:
             problem = task.problem.without(out)
-            again = _by_equations(replace(task, problem=problem, loop=problem.loop), self.result.method)
+            again = replace(task, problem=problem, loop=problem.loop).by_equations(self.result.method).result
             x, z = again.mount_from_camera, again.stand_from_board
             return replace(self.result, mount_from_camera=x, stand_from_board=z)
         if isinstance(solution, AdjustedCorners):
@@ -346,202 +325,203 @@ class Solved:
         return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
 
 
-def _by_equations(task: _Task, method: str) -> HandEye:
-    """Solves AX = XB or AX = ZB by the named method."""
-    options, pairs, loop, notes = task.problem.options, task.problem.pairs, task.loop, task.problem.notes
-    if options.four_dof:
-        raise DegenerateError("E-HANDEYE-AXES", f"hand-eye: {method} needs turns about two axes; of four axes use pose")
-    noise, evolution = options.noise, options.evolution
-    unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
-    if method in AX_XB and not (used := poses_with_log(loop)).all():
-        left_out = ", ".join(name for name, u in zip(pairs.names, used, strict=True) if not u)
-        notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
-        loop = loop[used]
-        if len(loop) < 3 or Observability.of(loop).useless:
-            raise DegenerateError(
-                "E-HANDEYE-LARGE-TURNS",
-                f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
-                f"left for {method}; use method pose or shah",
-            )
-    if method in (*AX_XB, *AX_ZB):
-        x, z = solve_closed_form(loop, method, unit_mm)
-    else:
-        motions = Motions.consecutive(loop)
-        if method == "zhao":
-            x = convex(motions, unit_mm)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """A ``problem`` after repair, with its ``loop``, and what its poses determine, ``seen``."""
+
+    problem: HandEyeProblem
+    loop: Loop
+    seen: Observability
+
+    def solved(
+        self,
+        method: str,
+        x: Rigid,
+        z: Rigid,
+        residuals: np.ndarray,
+        notes: tuple[str, ...],
+        covariance: np.ndarray | None = None,
+        solution: PoseSolution | AdjustedCorners | None = None,
+        **more: Any,
+    ) -> Solved:
+        """Returns X and Z as a result, with their ``covariance`` (12, 12) or more; ``more`` : further fields of it."""
+        names = self.problem.pairs.names
+        outliers = np.zeros(len(names), bool)
+        if solution is not None:
+            outliers, notes = solution.outliers, notes if solution.settled else (*notes, UNSETTLED)
+            more["scale"] = solution.state.scale
+        if covariance is not None:
+            more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
+        more |= {"observability": self.seen, "notes": notes}
+        return Solved(self, HandEye(method, self.problem.setup, x, z, residuals, names, outliers, **more), solution)
+
+    def by_equations(self, method: str) -> Solved:
+        """Solves AX = XB or AX = ZB by the named method."""
+        options, pairs, loop, notes = self.problem.options, self.problem.pairs, self.loop, self.problem.notes
+        if options.four_dof:
+            said = f"hand-eye: {method} needs turns about two axes; of four axes use pose"
+            raise DegenerateError("E-HANDEYE-AXES", said)
+        noise, evolution = options.noise, options.evolution
+        unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
+        if method in AX_XB and not (used := poses_with_log(loop)).all():
+            left_out = ", ".join(name for name, u in zip(pairs.names, used, strict=True) if not u)
+            notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
+            loop = loop[used]
+            if len(loop) < 3 or Observability.of(loop).useless:
+                raise DegenerateError(
+                    "E-HANDEYE-LARGE-TURNS",
+                    f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
+                    f"left for {method}; use method pose or shah",
+                )
+        if method in (*AX_XB, *AX_ZB):
+            x, z = solve_closed_form(loop, method, unit_mm)
         else:
-            objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
-            known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if evolution.needs_closed_form() else None
-            farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
-            x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
-            x = polish(objective, x) if method == "de-polished" else x
-        if method == "de":
-            notes = (*notes, Aside(evolution.in_words(unit_mm)))
-        z = closed_form.mean_pose(loop.chain(x))
-    return _result(task, method, (x, z), task.loop.residuals(x, z), notes)
+            motions = Motions.consecutive(loop)
+            if method == "zhao":
+                x = convex(motions, unit_mm)
+            else:
+                objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
+                known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if evolution.needs_closed_form() else None
+                farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
+                x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
+                x = polish(objective, x) if method == "de-polished" else x
+            if method == "de":
+                notes = (*notes, Aside(evolution.in_words(unit_mm)))
+            z = closed_form.mean_pose(loop.chain(x))
+        return self.solved(method, x, z, self.loop.residuals(x, z), notes)
 
+    def by_poses(self, first: tuple[Rigid, Rigid, float]) -> Solved:
+        """Solves by least squares of the poses' errors, from ``first`` X, Z and scale."""
+        problem, options, loop, scaled = self.problem, self.problem.options, self.loop, self.problem.options.with_scale
+        solution, noise, notes = self.by_true_robot(
+            lambda loop, noise: adjust_poses(loop, LoopState(*first), noise, scaled)
+        )
+        state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
+        notes, covariance, common = problem.notes + notes, generalised_inverse(solution.normal), None
+        if not options.four_dof and (clusters := by_places(loop, solution)):
+            covariance, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
+        sigma_scale = float(np.sqrt(covariance[12, 12])) if scaled else None
+        if sigma_scale is not None:
+            require_scale(state.scale, sigma_scale, loop, problem.pairs.where)
+        if options.four_dof:
+            x, z, covariance, notes = self.without_slide(x, z, solution.normal)
+        inverse = covariance
+        notes += self.remarks(x, solution.outliers, solution.residuals, solution.scale_hint)
+        if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
+            notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
+        if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
+            factor, redundancy = solution.variance_factor, solution.redundancy
+            low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
+            if not low <= factor <= high:
+                times = f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect"
+                notes += (f"{times}; correct σ, or look for errors",)
+                covariance = covariance * max(factor, 1)
+        if loop.camera_common is not None:
+            added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
+            common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
+        if problem.views is not None and options.camera is not None:
+            error = of_poses(loop, solution, problem.views, options.camera)
+            covariance = covariance + error.covariance(inverse) - inverse
+        stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
+        sigma = {name: value for name, value in stated.items() if value} | solution.sigma
+        more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
+        more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
+        return self.solved("pose", x, z, solution.residuals, notes, **more)
 
-def _result(
-    task: _Task, method: str, found: tuple[Rigid, Rigid], residuals: np.ndarray, notes: tuple[str, ...], **more: Any
-) -> HandEye:
-    """Returns the result of X and Z ``found``; ``more`` : further fields, with their covariance (12, 12) or more."""
-    covariance, names = more.pop("covariance", None), task.problem.pairs.names
-    outliers = more.pop("outliers", np.zeros(len(names), bool))
-    if covariance is not None:
-        more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
-    more |= {"observability": task.seen, "notes": notes}
-    return HandEye(method, task.problem.setup, *found, residuals, names, outliers, **more)
+    def by_views(self, first: tuple[Rigid, Rigid, float], views: Views) -> Solved:
+        """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
+        options, pairs = self.problem.options, self.problem.pairs
+        more = (options.intrinsics, options.with_scale, options.camera, options.arm)
+        solution, _, notes = self.by_true_robot(
+            lambda loop, noise: adjust_views(loop, pairs.base_from_flange, views, first, noise, *more)
+        )
+        state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
+        if sigma_scale is not None:
+            require_scale(state.scale, sigma_scale, self.loop, pairs.where)
+        x, z = state.mount_from_camera, state.stand_from_board
+        notes, covariance = self.problem.notes + notes, solution.covariance
+        if options.four_dof:
+            x, z, covariance, notes = self.without_slide(x, z, solution.normal())
+        if solution.camera_error is not None:
+            covariance = solution.camera_error.covariance(covariance)
+        adjusted = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
+        residuals, good = adjusted.residuals(x, z), adjusted[~outliers]
+        if not options.four_dof and places(good) is not None:
+            # What the places add to the covariance of the board's poses, they add to that of the corners.
+            by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)
+            if clusters := by_places(good, by_poses):
+                added = clusters.covariance - clusters.independent
+                covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
+                if sigma_scale is not None:
+                    sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
+        notes += self.remarks(x, outliers, residuals, solution.scale_hint)
+        if solution.camera_gain > CAMERA_GAIN:
+            notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
+        doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
+        if doubted:
+            which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+            notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
+        more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
+        more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
+        return self.solved("reprojection", x, z, residuals, notes, **more)
 
+    def by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+        """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
+        contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
+        noise, loop = self.problem.options.noise, self.loop
+        solution, stated = solved(loop, noise), loop.robot_covariance
+        if stated is not None:
+            rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
+        elif noise.robot_rad is not None and noise.robot_mm is not None:
+            rad, mm = noise.robot_rad, noise.robot_mm
+        else:
+            return solution, noise, ()
+        unknown = replace(noise, robot_rad=None, robot_mm=None)
+        free = solved(replace(loop, robot_covariance=None), unknown)
+        estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
+        if rad and mm:
+            dof = max(3 * (len(loop) - LEAST_WITH_SCALE), 3)
+            limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
+            contradicted = estimated[0] > limit * rad or estimated[1] > limit * mm
+        else:  # an exact robot, with which corners or the board's poses fit worse
+            shared = [
+                name for name in ("corner_px", "camera_factor") if solution.sigma.get(name) and free.sigma.get(name)
+            ]
+            worse = max((solution.sigma[name] / free.sigma[name] for name in shared), default=1.0)
+            contradicted = any(estimated) and worse > REST_WORSE
+        if contradicted and isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
+            # σ of a robot far better than the camera hardly show: what is estimated then is no evidence by itself.
+            used = ~free.outliers
+            contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
+        if not contradicted:
+            return solution, noise, ()
+        note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
+        note += (
+            f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
+        )
+        return free, unknown, (note,)
 
-def _adjusted(
-    task: _Task,
-    method: str,
-    solution: PoseSolution | AdjustedCorners,
-    found: tuple[Rigid, Rigid],
-    residuals: np.ndarray,
-    notes: tuple[str, ...],
-    **more: Any,
-) -> Solved:
-    """Returns the result of a method that adjusts poses or corners."""
-    notes = notes if solution.settled else (*notes, UNSETTLED)
-    more |= {"scale": solution.state.scale, "outliers": solution.outliers}
-    return Solved(task, _result(task, method, found, residuals, notes, **more), solution)
+    def remarks(
+        self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
+    ) -> tuple[str, ...]:
+        """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
+        if self.problem.part:
+            return ()
+        pairs, options, loop, good = self.problem.pairs, self.problem.options, self.loop, ~outliers
+        tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
+        notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
+        moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x)[:, :, :12], places(loop) is None)
+        notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
+        if not (options.with_scale or options.four_dof):
+            notes += remarks.of_size(loop[good], hint, options.noise)
+        return notes + remarks.of_distance(loop)
 
-
-def _by_poses(task: _Task) -> Solved:
-    problem, options, loop = task.problem, task.problem.options, task.loop
-    first = LoopState(*task.guess(loop, options.with_scale))
-    solution, noise, contradicted = _by_true_robot(
-        task, lambda loop, noise: adjust_poses(loop, first, noise, options.with_scale)
-    )
-    state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
-    notes, inverse = problem.notes + contradicted, generalised_inverse(solution.normal)
-    if not options.four_dof and (clusters := by_places(loop, solution)):
-        inverse, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
-    sigma_scale = float(np.sqrt(inverse[12, 12])) if options.with_scale else None
-    if sigma_scale is not None:
-        require_scale(state.scale, sigma_scale, loop, problem.pairs.where)
-    if options.four_dof:
-        x, z, inverse, notes = _without_slide(task, x, z, solution.normal)
-    covariance, common = inverse, None
-    notes += _remarks(task, x, solution.outliers, solution.residuals, solution.scale_hint)
-    if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
-        notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
-    if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
-        factor, redundancy = solution.variance_factor, solution.redundancy
-        low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
-        if not low <= factor <= high:
-            times = f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect"
-            notes += (f"{times}; correct σ, or look for errors",)
-            covariance = covariance * max(factor, 1)
-    if loop.camera_common is not None:
-        added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
-        common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
-    if problem.views is not None and options.camera is not None:
-        error = of_poses(loop, solution, problem.views, options.camera)
-        covariance = covariance + error.covariance(inverse) - inverse
-    stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-    sigma = {name: value for name, value in stated.items() if value} | solution.sigma
-    more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma), "common_covariance": common}
-    return _adjusted(task, "pose", solution, (x, z), solution.residuals, notes, covariance=covariance, **more)
-
-
-def _by_views(task: _Task, views: Views) -> Solved:
-    problem, options, pairs = task.problem, task.problem.options, task.problem.pairs
-    first, scaled = task.guess(task.loop, options.with_scale), options.with_scale
-
-    def adjusted_by(loop: Loop, noise: Noise) -> AdjustedCorners:
-        flange, intrinsics = pairs.base_from_flange, options.intrinsics
-        return adjust_views(loop, flange, views, first, noise, intrinsics, scaled, options.camera, options.arm)
-
-    solution, _, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
-    if sigma_scale is not None:
-        require_scale(state.scale, sigma_scale, task.loop, pairs.where)
-    x, z = state.mount_from_camera, state.stand_from_board
-    notes, covariance = problem.notes + contradicted, solution.covariance
-    if options.four_dof:
-        x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
-    if solution.camera_error is not None:
-        covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
-    residuals, good = adjusted.residuals(x, z), adjusted[~outliers]
-    if not options.four_dof and places(good) is not None:
-        # What the places add to the covariance of the board's poses, they add to that of the corners.
-        by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), scaled, False)
-        if clusters := by_places(good, by_poses):
-            added = clusters.covariance - clusters.independent
-            covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
-            if sigma_scale is not None:
-                sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
-    notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
-    if solution.camera_gain > CAMERA_GAIN:
-        notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
-    doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
-    if doubted:
-        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
-        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-    more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
-    more |= {"covariance": covariance, "reprojection": solution.found}
-    return _adjusted(task, "reprojection", solution, (x, z), residuals, notes, **more)
-
-
-def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
-    """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses contradict
-    the stated: errors of a robot held too tightly appear in camera and board instead."""
-    noise, loop = task.problem.options.noise, task.loop
-    solution, stated = solved(loop, noise), loop.robot_covariance
-    if stated is not None:
-        rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
-    elif noise.robot_rad is not None and noise.robot_mm is not None:
-        rad, mm = noise.robot_rad, noise.robot_mm
-    else:
-        return solution, noise, ()
-    unknown = replace(noise, robot_rad=None, robot_mm=None)
-    free = solved(replace(loop, robot_covariance=None), unknown)
-    estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
-    if rad and mm:
-        dof = max(3 * (len(loop) - LEAST_WITH_SCALE), 3)
-        limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
-        contradicted = estimated[0] > limit * rad or estimated[1] > limit * mm
-    else:  # an exact robot, with which corners or the board's poses fit worse
-        given, other = solution.sigma, free.sigma
-        shared = [name for name in ("corner_px", "camera_factor") if given.get(name) and other.get(name)]
-        contradicted = any(estimated) and max((given[name] / other[name] for name in shared), default=1.0) > REST_WORSE
-    if contradicted and isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
-        # σ of a robot that is far better than the camera hardly show: what is estimated then is no evidence by itself.
-        used = ~free.outliers
-        contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
-    if not contradicted:
-        return solution, noise, ()
-    note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
-    note += f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
-    return free, unknown, (note,)
-
-
-def _remarks(
-    task: _Task, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
-) -> tuple[str, ...]:
-    """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
-    problem, loop = task.problem, task.loop
-    if problem.part:
-        return ()
-    pairs, options, good = problem.pairs, problem.options, ~outliers
-    tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
-    notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
-    moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x)[:, :, :12], places(loop) is None)
-    notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
-    if not (options.with_scale or options.four_dof):
-        notes += remarks.of_size(loop[good], hint, options.noise)
-    return notes + remarks.of_distance(loop)
-
-
-def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
-    """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
-    axis, frames = task.seen.mount_axis, FRAMES[task.problem.setup]
-    x, z = closed_form.slid(x, z, axis, task.loop)
-    held = normal.copy()
-    held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
-    note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which the "
-    note += f"flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
-    return x, z, generalised_inverse(held), (*task.problem.notes, note)
+    def without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
+        """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
+        axis, frames = self.seen.mount_axis, FRAMES[self.problem.setup]
+        x, z = closed_form.slid(x, z, axis, self.loop)
+        held = normal.copy()
+        held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
+        note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which "
+        note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along it"
+        return x, z, generalised_inverse(held), (*self.problem.notes, note)

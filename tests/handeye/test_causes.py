@@ -10,12 +10,12 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.handeye_pipeline import judged
-from stcal.handeye.problem import HandEyeProblem, handeye
+from stcal.handeye.problem import HandEyeProblem
 from stcal.handeye.remarks import Grave, SizeDoubt
 from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye, lag_tried
 from tests.outcome import fails_with
-from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, simulated
+from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, handeye, simulated
 from tests.support.handeye_stream import simulated_stream
 
 

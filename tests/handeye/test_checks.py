@@ -15,7 +15,6 @@ from stcal.handeye.conventions import repair
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.pose_adjustment import Noise
-from stcal.handeye.problem import handeye
 from stcal.handeye.remarks import Observability, of_size
 from stcal.io.poses.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
@@ -28,6 +27,7 @@ from tests.support.handeye import (
     FLANGE_FROM_CAMERA,
     board_corners,
     disturbed,
+    handeye,
     simulated,
     simulated_views,
 )

@@ -7,9 +7,8 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, plan_poses
 from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
-from stcal.handeye.problem import handeye
 from tests.outcome import fails_with
-from tests.support.handeye import CAMERA, board_corners, disturbed, simulated, squared
+from tests.support.handeye import CAMERA, board_corners, disturbed, handeye, simulated, squared
 
 ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
 OUTLINE = board_corners(8, 7, 25.0)

@@ -10,8 +10,8 @@ import yaml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, pairs_of_views
-from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import camera_prior
+from tests.support.handeye import handeye
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.handeye.problem import handeye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from tests.outcome import fails_with, refuses
-from tests.support.handeye import squared
+from tests.support.handeye import handeye, squared
 from tests.support.handeye_stream import StreamTruth, simulated_stream
 
 SETUPS = ("eye-in-hand", "eye-to-hand")

@@ -18,10 +18,9 @@ from stcal.handeye import (
     splits,
 )
 from stcal.handeye.data.pose_pairs import Loop, Motions
-from stcal.handeye.problem import handeye
 from stcal.handeye.validate import predicted
 from tests.outcome import fails_with, refuses
-from tests.support.handeye import simulated, simulated_views
+from tests.support.handeye import handeye, simulated, simulated_views
 
 
 def test_every_pose_has_its_turn():

@@ -6,9 +6,8 @@ from scipy.stats import chi2
 
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.handeye import HandEyeOptions, Views, pairs_of_views
-from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
-from tests.support.handeye import CAMERA, simulated_views, squared
+from tests.support.handeye import CAMERA, handeye, simulated_views, squared
 
 PRIOR = camera_prior(Camera.of(CAMERA, "OPENCV"))
 TRIALS = 12

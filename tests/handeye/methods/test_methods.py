@@ -20,9 +20,8 @@ from stcal.handeye.methods.closed_form import (
     smallest_largest,
     three_others,
 )
-from stcal.handeye.problem import handeye
 from tests.outcome import fails_with, refuses
-from tests.support.handeye import simulated
+from tests.support.handeye import handeye, simulated
 
 FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
 EXACT = tuple(m for m in FROM_POSES if m != "de")

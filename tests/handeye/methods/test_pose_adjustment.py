@@ -11,8 +11,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise
 from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others, components
-from stcal.handeye.problem import handeye
-from tests.support.handeye import error, normalised, simulated, simulated_views
+from tests.support.handeye import error, handeye, normalised, simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)

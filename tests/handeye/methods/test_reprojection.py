@@ -10,10 +10,9 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.problem import handeye
 from stcal.io.cameras.camera_model import camera_prior
 from tests.outcome import refuses
-from tests.support.handeye import error, normalised, simulated_views
+from tests.support.handeye import error, handeye, normalised, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 

@@ -10,8 +10,7 @@ from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.handeye_page import by_robot, image_coverage, outcome_report
 from stcal.handeye.handeye_pipeline import Outcome
-from stcal.handeye.problem import handeye
-from tests.support.handeye import simulated_views
+from tests.support.handeye import handeye, simulated_views
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from stcal.handeye import HandEyeOptions
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import outcome_report
 from stcal.handeye.handeye_pipeline import Outcome
-from stcal.handeye.problem import FACTORS, handeye
+from stcal.handeye.problem import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
-from tests.support.handeye import simulated, simulated_views
+from tests.support.handeye import handeye, simulated, simulated_views
 
 
 @pytest.fixture(scope="module")

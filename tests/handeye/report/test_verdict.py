@@ -8,10 +8,9 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.handeye_pipeline import Outcome, judged, share_of_variance
-from stcal.handeye.problem import handeye
 from stcal.handeye.remarks import Aside, Grave
 from stcal.handeye.validate import cross_validate, splits
-from tests.support.handeye import simulated
+from tests.support.handeye import handeye, simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 
