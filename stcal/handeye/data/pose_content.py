@@ -8,19 +8,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
-from stcal.handeye.data.pose_pairs import Setup
+from stcal.geometry.rigid import Poses
+from stcal.handeye.data.pose_pairs import SIDES, Setup
 from stcal.io.poses.rotations import of_quaternions, proper, require_finite
 from stcal.io.table import LENGTHS
 
 Role = Literal["robot", "camera"]
 ROLES: tuple[Role, ...] = get_args(Role)
-FRAMES: dict[Role, tuple[str, str]] = {
-    "robot": ("base_from_flange", "flange_from_base"),
-    "camera": ("camera_from_board", "board_from_camera"),
-}
+FRAMES: dict[Role, tuple[str, str]] = dict(zip(ROLES, SIDES, strict=True))
 """The transform that is needed for each side, and its inverse."""
-EVERY_FRAME = tuple(name for names in FRAMES.values() for name in names)
+EVERY_FRAME = tuple(name for names in SIDES for name in names)
+BY_DEFAULT = "by default"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +38,16 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSide:
-    """Poses of the robot or of the camera.
+    """Poses of the robot or of the camera, as a file has them, or in the direction that is needed and mm.
 
-    ``rotation``, ``translation`` : (m, 3, 3), (m, 3), lengths in ``unit``; ``places`` : place of each pose in its file,
-    like ``line 7``; ``turned`` : how rotations are written, in words; ``unit``, ``frames`` : None where the file does
-    not say; ``names`` : image or timestamp of each pose, if any; ``trajectory`` : whether poses are those of a moving
-    body in a world; ``covariance`` : (m, 6, 6) of the transforms of ``frames``, mm and rad; ``common`` : (m, 6, k)
-    errors that these have in common, contained in their covariances.
+    ``poses`` : m, lengths in ``unit``; ``places`` : place of each pose in its file, like ``line 7``; ``turned`` : how
+    rotations are written; ``unit``, ``frames`` : None where the file does not say; ``names`` : image or timestamp of
+    each pose, if any; ``trajectory`` : whether poses are those of a moving body in a world; ``covariance`` : (m, 6, 6),
+    mm and rad; ``common`` : (m, 6, k) errors that the poses have in common, contained in their covariances; ``where``,
+    ``understood`` : the file, and how it was read; ``guessed`` : the unit that was guessed from the size of lengths.
     """
 
-    rotation: np.ndarray
-    translation: np.ndarray
+    poses: Poses
     places: tuple[str, ...]
     turned: str
     unit: Known | None = None
@@ -59,19 +56,28 @@ class PoseSide:
     trajectory: bool = False
     covariance: np.ndarray | None = None
     common: np.ndarray | None = None
-
-    def __post_init__(self):
-        m = len(self.places)
-        freeze(self, "rotation", (m, 3, 3), "rotations")
-        freeze(self, "translation", (m, 3), "translations")
+    where: str = ""
+    understood: str = ""
+    guessed: str = ""
 
     def __len__(self) -> int:
         return len(self.places)
 
+    def __getitem__(self, rows: Sequence[int]) -> "PoseSide":
+        """Returns these rows alone."""
+        at = list(rows)
+        names, places = (tuple(every[i] for i in at) if every else () for every in (self.names, self.places))
+        covariance, common = (None if each is None else each[at] for each in (self.covariance, self.common))
+        return replace(self, poses=self.poses[at], names=names, places=places, covariance=covariance, common=common)
+
+    def called(self) -> tuple[str, ...]:
+        """Returns the names of the rows, or their places."""
+        return self.names or self.places
+
 
 @dataclass(frozen=True, slots=True)
 class PoseContent:
-    """PoseContent of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
+    """Content of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
     known, or one side of each role; ``setup`` : setup that the file states, if any; ``passed_over`` : other content of
     the file that is not used."""
 
@@ -146,8 +152,8 @@ class Said:
         return next((name for name in self.frames if name in FRAMES[role]), None)
 
 
-def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations and translations of homogeneous matrices (m, 4, 4)."""
+def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> Poses:
+    """Returns the poses of homogeneous matrices (m, 4, 4)."""
     require_finite(matrices, places, where)
     bad = np.flatnonzero(np.abs(matrices[:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2)) > 0)
     if len(bad):
@@ -155,7 +161,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""
         row = " ".join(f"{v:g}" for v in matrices[i, 3])
         raise InputError("E-MATRIX-LAST-ROW", f"{where}: {places[i]}: last row {row}, 0 0 0 1 needed{turned}; mend it")
-    return proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3]
+    return Poses(proper(matrices[:, :3, :3], places, where), matrices[:, :3, 3])
 
 
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
@@ -176,8 +182,7 @@ _WORDS = {
     "board": "board|target|marker|tag|object|pattern|checkerboard|chessboard|charuco|aruco",
 }
 """Words that name each frame."""
-_ANY = "|".join(f"(?P<{{0}}_{frame}>{words})" for frame, words in _WORDS.items())
-_LEFT, _RIGHT = _ANY.replace("{0}", "a"), _ANY.replace("{0}", "b")
+_LEFT, _RIGHT = ("|".join(f"(?P<{side}_{frame}>{words})" for frame, words in _WORDS.items()) for side in "ab")
 _FORMS = (
     (re.compile(rf"(?:{_LEFT})_from_(?:{_RIGHT})"), "ab", True),
     (re.compile(rf"(?:{_LEFT})2(?:{_RIGHT})"), "ba", True),
@@ -188,18 +193,18 @@ _FORMS = (
 """Forms of names of transforms; which frame is the first of ``a_from_b``; whether no other reading is possible."""
 _PART = re.compile(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
 """Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
+_ENDING = r"(_?(pose|transform|matri(x|ce))s?)?"
 ROLES_BY_NAME: dict[Role, re.Pattern] = {
-    "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)(_?(pose|transform|matri(x|ce))s?)?"),
-    "camera": re.compile(
-        r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern)(_?(pose|transform|matri(x|ce))s?)?"
-    ),
+    "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)" + _ENDING),
+    "camera": re.compile(r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern)" + _ENDING),
 }
 """Names that tell whether poses are the robot's or the camera's, but not in which direction."""
 
 
-def frames_of(key: str) -> Known | None:
-    """Returns the transform that a name means; None where it means none."""
-    name = _plain(key)
+def frames_of(key: object) -> Known | None:
+    """Returns the transform that a name means, or, not stated, the one by default of the side that it names; None where
+    it means none."""
+    name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
         return Known(name, f"by its name {key}")
     for form, order, only in _FORMS:
@@ -208,26 +213,8 @@ def frames_of(key: str) -> Known | None:
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
                 return Known(frames, f"by its name {key}", only)
-    return None
-
-
-def _plain(key: object) -> str:
-    return re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
-
-
-def inverse_name(key: str) -> str:
-    """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
-    for between in ("_from_", "_wrt_", "_in_", "2"):
-        head, separator, tail = key.partition(between)
-        if separator:
-            prefix = next(iter(re.findall(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rthRTH])_", head)), "")
-            return f"{prefix}{tail}{separator}{head.removeprefix(prefix)}"
-    return ""
-
-
-def role_of(key: str) -> Role | None:
-    """Returns the side whose poses a name means, where the name has no direction."""
-    return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(_plain(key))), None)
+    role = next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)
+    return role and Known(FRAMES[role][0], BY_DEFAULT, False)
 
 
 WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
@@ -253,24 +240,22 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
             said = "the result of an easy_handeye calibration; give its samples, NAME.samples"
             raise InputError("E-POSES-NOT-FOUND", f"{where}: {said}")
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
-        if content is not None:
-            return content
-        if (side := _side_of(value, where)) is not None:
-            return PoseContent(form, (side,))
-        for key in HOLDERS:
-            if isinstance(value.get(key), Mapping | list | np.ndarray):
-                content = read_tree(value[key], form, statements, where)
-                if content is not None:
-                    others = tuple(str(unused_key) for unused_key in value if unused_key != key)
-                    return replace(content, passed_over=(*content.passed_over, *others))
+    elif not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if not isinstance(value, list | np.ndarray) or not len(value):
-        return None
-    listed = isinstance(value, list) and isinstance(value[0], Mapping)
-    if (content := _of_pairs(list(value), form, where) if listed else None) is not None:
+    else:
+        listed = isinstance(value, list) and isinstance(value[0], Mapping)
+        content = _of_pairs(value, form, where) if listed else None
+    if content is None and (side := _side_of(value, where)) is not None:
+        content = PoseContent(form, (side,))
+    if content is not None or not isinstance(value, Mapping):
         return content
-    side = _side_of(value, where)
-    return None if side is None else PoseContent(form, (side,))
+    for key in HOLDERS:
+        if isinstance(value.get(key), Mapping | list | np.ndarray):
+            content = read_tree(value[key], form, statements, where)
+            if content is not None:
+                others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+                return replace(content, passed_over=(*content.passed_over, *others))
+    return None
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -346,8 +331,7 @@ def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | 
     matrices, named = zip(*filter(None, found), strict=True)
     names = names or (named if all(named) else ())
     require_each_once(names, places[: len(names)], where)
-    rotation, translation = of_matrices(np.array(matrices), places, where)
-    return PoseSide(rotation, translation, places, "4×4 matrices", None, frames, names)
+    return PoseSide(of_matrices(np.array(matrices), places, where), places, "4×4 matrices", None, frames, names)
 
 
 def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent | None:
@@ -396,8 +380,8 @@ def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
             raise InputError("E-POSE-VALUE", f"{where}: {place}: {said}")
         rows.append(row)
     require_finite(np.array(rows), places, where)
-    rotation = of_quaternions(np.array(rows)[:, 3:], places, where)
-    return PoseSide(rotation, np.array(rows)[:, :3], places, "quaternions x, y, z, w by name", ROS, frames)
+    poses = Poses(of_quaternions(np.array(rows)[:, 3:], places, where), np.array(rows)[:, :3])
+    return PoseSide(poses, places, "quaternions x, y, z, w by name", ROS, frames)
 
 
 def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
@@ -409,13 +393,10 @@ def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
         if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
             names = tuple(str(name) for name in item)
             continue
-        frames = frames_of(key)
-        role = role_of(key) if frames is None else frames.role
-        shaped = isinstance(item, list | Mapping | np.ndarray)
-        if role is None or not shaped or (frames is None and _side_of(item, where) is None):
+        frames, shaped = frames_of(key), isinstance(item, list | Mapping | np.ndarray)
+        if frames is None or not shaped or (frames.by == BY_DEFAULT and _side_of(item, where) is None):
             others.append(str(key))
             continue
-        frames = frames or Known(FRAMES[role][0], "by default", False)
         parts.setdefault(frames.name, {})[str(key)] = item
         named[frames.name] = frames
     if not parts:
@@ -458,7 +439,8 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     places = tuple(f"pose {i}" for i in range(1, count + 1))
     at = at.reshape(count, 3)
     require_finite(at, places, where)
-    return PoseSide(proper(turn.reshape(-1, 3, 3), places, where), at, places, "3×3 matrices", frames=frames)
+    poses = Poses(proper(turn.reshape(-1, 3, 3), places, where), at)
+    return PoseSide(poses, places, "3×3 matrices", frames=frames)
 
 
 def _flat(value: Any) -> Any:
@@ -470,7 +452,7 @@ def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | 
     """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
     stacks: dict[str, Any] = {}
     for key, entry in value[0].items():
-        if (frames_of(key) is None and role_of(key) is None) or _matrix(entry) is None:
+        if frames_of(key) is None or _matrix(entry) is None:
             continue
         if without := [i for i, other in enumerate(value, 1) if key not in other]:
             said = f"pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out"

@@ -25,7 +25,6 @@ from stcal.handeye.data.pose_content import (
     PoseSide,
     Role,
     Said,
-    inverse_name,
     read_tree,
     require_each_once,
 )
@@ -96,8 +95,8 @@ def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...
     covariance = table.pose_covariances(prefix)
     common = table.common_errors(covariance, prefix)
     at, unit = place
-    side = PoseSide(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
-    return replace(side, covariance=covariance, common=common)
+    poses, more = Poses(turned.rotation, at), {"covariance": covariance, "common": common}
+    return PoseSide(poses, places_of(table), turned.words, unit, frames, names, **more)
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
@@ -219,7 +218,7 @@ def _of_universal(file: File) -> PoseContent:
 
     values, places = _table_of(file, inside, 6)
     rotation, words = turned_values(values[:, 3:], file.said.rotation, "the numbers after x, y, z", places, file.where)
-    return PoseContent("rows of numbers", (PoseSide(rotation, values[:, :3], places, words),))
+    return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
 
 
 def _of_tum(file: File) -> PoseContent:
@@ -236,8 +235,8 @@ def _of_tum(file: File) -> PoseContent:
     require_each_once(names, places, file.where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
     turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
-    rotation = of_quaternions(wxyz, places, file.where)
-    side = PoseSide(rotation, values[:, 1:4], places, turned, unit, names=names, trajectory=True)
+    poses = Poses(of_quaternions(wxyz, places, file.where), values[:, 1:4])
+    side = PoseSide(poses, places, turned, unit, names=names, trajectory=True)
     return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
 
 
@@ -362,39 +361,6 @@ SHOWN = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posed:
-    """Poses of one side in the direction that is needed, mm.
-
-    ``names`` : image or timestamp of each pose, or none; ``places`` : place of each pose in its file; ``understood`` :
-    how the file was read; ``guessed`` : the unit that was guessed from the size of lengths, empty where it is known;
-    ``common`` : (m, 6, k) errors that the poses have in common.
-    """
-
-    poses: Poses
-    names: tuple[str, ...]
-    places: tuple[str, ...]
-    covariance: np.ndarray | None
-    where: str
-    understood: str
-    guessed: str = ""
-    common: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-    def __getitem__(self, rows: Sequence[int]) -> "Posed":
-        """Returns these rows alone."""
-        at = list(rows)
-        names, places = (tuple(every[i] for i in at) if every else () for every in (self.names, self.places))
-        covariance, common = (None if each is None else each[at] for each in (self.covariance, self.common))
-        return replace(self, poses=self.poses[at], names=names, places=places, covariance=covariance, common=common)
-
-    def called(self) -> tuple[str, ...]:
-        """Returns the names of the rows, or their places."""
-        return self.names or self.places
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ToldPairs:
     """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
     (name, why); ``timed`` : where the robot's poses were taken by time."""
@@ -406,7 +372,7 @@ class ToldPairs:
     timed: Timed | None = None
 
     @classmethod
-    def of(cls, robot: Posed, camera: Posed, names: Sequence[str], where: str, **more: Any) -> "ToldPairs":
+    def of(cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, **more: Any) -> "ToldPairs":
         """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
         covariances = robot.covariance, camera.covariance
         pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
@@ -488,7 +454,7 @@ def read_two(
     return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, **more)
 
 
-def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
+def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseSide | None:
     """Returns the robot's poses of a file; None where it is one of the package's own tables."""
     content = read_content(path, statements.of("robot"), key, quaternions)
     return None if content is None else settled(content, "robot", path, statements)
@@ -524,8 +490,8 @@ def _no_poses(table: Table) -> InputError:
 
 
 def _by_time(
-    robot: Posed,
-    camera: Posed,
+    robot: PoseSide,
+    camera: PoseSide,
     times: Sequence[Decimal],
     wanted: Sequence[Decimal],
     setup: Setup | None,
@@ -548,7 +514,7 @@ def _by_time(
     return ToldPairs.of(at_images, seen, seen.names, where, **more)
 
 
-def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> Posed:
+def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
     """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
     with a line on how they were read."""
     wanted, first, statements = FRAMES[role][0], content.sides[0], statements.of(role)
@@ -556,52 +522,47 @@ def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> P
     if side is None:
         held = first.frames.name if first.frames else "poses"
         raise InputError("E-POSES-MIXED", f"{path}: {content.form} of {held}, {wanted} needed here; give another file")
-    far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
+    lengths = side.poses.translation
+    far = np.flatnonzero(np.abs(lengths).max(axis=1) > FARTHEST)
     if len(far):
-        measured = np.abs(side.translation[far[0]]).max()
-        raise InputError(
-            "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: length {measured:.3g}, at most {FARTHEST:g}"
-        )
+        said = f"length {np.abs(lengths[far[0]]).max():.3g}, at most {FARTHEST:g}"
+        raise InputError("E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: {said}")
     frames = _direction(side, role, path, statements)
-    factor, unit, guessed = _unit(side, frames.name, path, statements)
-    poses = Poses(side.rotation, factor * side.translation)
-    covariance, common = side.covariance, side.common
+    unit, guessed = _unit(side, frames.name, path, statements)
+    poses, covariance, common = Poses(side.poses.rotation, LENGTHS[unit.name] * lengths), side.covariance, side.common
     if frames.name != wanted:
         poses, covariance, common = inverted(poses, covariance, common)
-    parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
+    parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned]
+    parts.append(f"{unit.name} {unit.by}")
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""
         parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
-    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), guessed, common)
+    read = {"where": str(path), "understood": "; ".join(parts), "guessed": guessed}
+    return replace(side, poses=poses, covariance=covariance, common=common, **read)
 
 
 def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Known:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
-    option = statements.frames_of(role)
+    option, frames = statements.frames_of(role), side.frames
+    if option is not None and frames is not None and frames.stated and frames.name != option:
+        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}"
+        remedy = "if the name is wrong, change it in the file; else leave the option out"
+        raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
     if option is not None:
-        if side.frames is not None and side.frames.stated and side.frames.name != option:
-            name = inverse_name(side.frames.by.rpartition(" ")[2])
-            raise InputError(
-                "E-OPTION-CONTRADICTS",
-                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; if the name is wrong, change it "
-                f"in the file{f', to {name}' if name else ''}; else leave the option out",
-            )
         return Known(option, "as you say")
-    if side.frames is not None:
-        return side.frames
-    if side.trajectory and role == "camera":
+    if frames is None and side.trajectory and role == "camera":
         return Known("board_from_camera", "by default, the camera's trajectory")
-    return Known(FRAMES[role][0], "by default")
+    return frames or Known(FRAMES[role][0], "by default")
 
 
-def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
-    """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
-    unit, option = side.unit, statements.length_unit
-    if option is not None and not (unit is not None and unit.stated):
-        unit = Known(option, "as you say", False)
-    if unit is not None:
-        return LENGTHS[unit.name], f"{unit.name} {unit.by}", ""
-    distances = np.linalg.norm(side.translation, axis=1)
+def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Known, str]:
+    """Returns the unit, and its name again if it was guessed from the size of lengths."""
+    option = statements.length_unit
+    if side.unit is not None and (option is None or side.unit.stated):
+        return side.unit, ""
+    if option is not None:
+        return Known(option, "as you say", False), ""
+    distances = np.linalg.norm(side.poses.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
         near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
@@ -614,14 +575,12 @@ def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[floa
             f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
         )
     guess = "m" if farthest <= METRES_UP_TO else "mm"
-    return LENGTHS[guess], f"{guess} by their size, up to {farthest:.4g}", guess
+    return Known(guess, f"by their size, up to {farthest:.4g}", False), guess
 
 
-def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]], str]:
-    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched.
-
-    The description of the match is empty where the names are the same.
-    """
+def matched(robot: PoseSide, camera: PoseSide, key: str) -> tuple[list[tuple[int, int]], str]:
+    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched;
+    empty where the names are the same."""
     if not robot.names and not camera.names:
         if len(robot) == len(camera):
             return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
@@ -639,11 +598,8 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
 
 
 def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
-    """Returns the places of names in both lists that mean the same, and how they were matched.
-
-    The result is None where no names match. Names are compared as they are, then as times, then without folder and
-    ending, then by the number at their ends, where no number occurs twice.
-    """
+    """Returns the places of names in both lists that mean the same, and how they were matched: as they are, as times,
+    without folder and ending, or by the number at their ends, where no number occurs twice. None where none match."""
     ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
         (str, ""),
         (time_of, "by their times as numbers"),
@@ -651,12 +607,12 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
         (trailing_number, "by the number at the end of each name, like"),
     )
     for way, description in ways:
-        keys = [[way(name) for name in names] for names in (first, second)]
-        known = [[key for key in own if key is not None] for own in keys]
-        if not all(own and len(set(own)) == len(own) for own in known):
+        one, other = ([way(name) for name in names] for names in (first, second))
+        known = [[key for key in keys if key is not None] for keys in (one, other)]
+        if not all(keys and len(set(keys)) == len(keys) for keys in known):
             continue
-        place = {key: j for j, key in enumerate(keys[1])}
-        rows = [(i, place[key]) for i, key in enumerate(keys[0]) if key is not None and key in place]
+        place = {key: j for j, key in enumerate(other)}
+        rows = [(i, place[key]) for i, key in enumerate(one) if key is not None and key in place]
         if rows:
             i, j = rows[0]
             return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
