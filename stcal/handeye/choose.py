@@ -137,7 +137,7 @@ def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried | S
     except StcalError as error:
         return error
     unseen, share = (problem[out] for out in rows), 1 - rows.shape[1] / len(problem)
-    errors = [deciding_error(part, own.pairs, own.views) for part, own in zip(partial, unseen, strict=True)]
+    errors = [deciding_error(part, own) for part, own in zip(partial, unseen, strict=True)]
     shown_without = tuple(_shown(part, problem, share) for part in partial)
     shown = _shown(solution.result, problem)
     return Tried(candidate, np.array(errors), "", solution.result, partial, shown, shown_without)

@@ -18,7 +18,8 @@ from stcal.handeye import (
     splits,
 )
 from stcal.handeye.data.pose_pairs import Loop, Motions
-from stcal.handeye.validate import predicted
+from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.validate import ERRORS, errors_of
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import handeye, simulated, simulated_views
 
@@ -56,13 +57,12 @@ def test_errors_at_the_board():
     """A chain 1 mm off across the line of sight is 1 mm off at the board by both measures; along it, by one only."""
     truth = simulated_views(np.random.default_rng(2), 6, "eye-to-hand")
     exact = handeye(truth.pairs, "eye-to-hand", views=truth.views, options=HandEyeOptions(noise=Noise(board_mm=0)))
-    seen = truth.pairs[:1], truth.views[:1]
-    assert [v.item() < 1e-3 for v in predicted(exact, *seen).values()] == [True] * 4
+    seen = HandEyeProblem(truth.pairs, "eye-to-hand", truth.views)[np.array([0])]
+    assert [errors_of(exact, seen)[name].item() < 1e-3 for name in ERRORS] == [True] * 4
     for shift, on_board in (([1.0, 0, 0], 1.0), ([0, 0, 1.0], 0.0)):
         moved = exact.mount_from_camera @ Rigid(np.eye(3), shift)
-        _, distance, board, pose = (
-            v.item() for v in predicted(replace(exact, mount_from_camera=moved), *seen).values()
-        )
+        errors = errors_of(replace(exact, mount_from_camera=moved), seen)
+        _, distance, board, pose = (errors[name].item() for name in ERRORS)
         assert distance == pytest.approx(1, abs=1e-2)
         assert pose == pytest.approx(1, abs=1e-2)
         # The board is tilted by up to 29° and seen up to 20° off the axis.
