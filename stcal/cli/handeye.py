@@ -309,7 +309,7 @@ def plan(
     json_file: shared.JsonFile = None,
 ) -> None:
     """Name further robot poses that would lower the worst σ of a hand-eye calibration, at the board, most."""
-    from stcal.handeye.plan import planned_csv, planned_file, planned_report
+    from stcal.handeye.plan import HandEyePlanFile, planned_csv, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye_run import plan_handeye
@@ -330,7 +330,7 @@ def plan(
     if out:
         frames = ("base_from_flange", "camera_from_board")
         require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
-    write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))
+    write_if(json_file, lambda: HandEyePlanFile.of(planned.result, planned.poses, planned.joints))
 
 
 app = typer.Typer()

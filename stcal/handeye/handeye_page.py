@@ -83,13 +83,12 @@ def outcome_report(outcome: Outcome) -> Document:
     result, frames, found = outcome.result, FRAMES[outcome.result.setup], judged(outcome)
     turn, shift = result.rms()
     covariances, bad, seen = (result.covariance, result.stand_covariance), outcome.outliers(), result.observability
-    held_out = []
+    means = {}
     if outcome.held_out is not None:
-        held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
-        if bad and (agreeing := outcome.held_out.means(~result.outliers)):
-            held_out.append(f"held out, mean without the {len(bad)} left out above: {means_text(agreeing)}")
+        means[f"held out ({_splits_text(outcome)}), mean"] = outcome.held_out.means()
+        if bad:
+            means[f"held out, mean without the {len(bad)} left out above"] = outcome.held_out.means(~result.outliers)
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
-    asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
     sigmas = []
     for name, value in result.sigma.items():
         text, unit, factor = SIGMA_NAMES[name]
@@ -97,6 +96,10 @@ def outcome_report(outcome: Outcome) -> Document:
         how = "estimated" if name in result.estimated else "stated"
         sigmas.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
     judgements = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    told = (
+        ("To know", [note for note in outcome.all_notes() if isinstance(note, Aside)]),
+        ("What the files were taken for", outcome.understood),
+    )
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *(
@@ -107,7 +110,7 @@ def outcome_report(outcome: Outcome) -> Document:
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
-        *held_out,
+        *(f"{what}: {means_text(each)}" for what, each in means.items() if each),
         outcome.sentence(),
         Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
@@ -116,8 +119,7 @@ def outcome_report(outcome: Outcome) -> Document:
             "Camera, as adjusted (first pixel's centre at 0, 0)",
             Table(["<", "value", "± σ", "<unit"], _adjusted(outcome)),
         ),
-        *([subheading("To know"), bullets(asides)] if asides else []),
-        *([subheading("What the files were taken for"), bullets(outcome.understood)] if outcome.understood else []),
+        *(block for title, lines in told if lines for block in (subheading(title), bullets(lines))),
         fold(
             "What the verdict rests on",
             Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judgements, css="text"),
@@ -320,15 +322,6 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     if result.covariance is not None:
         sigma = np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
         headline.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
-    turn, shift = result.rms()
-    headline.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
-    if (offset := outcome.time_offset) is not None:
-        said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
-        headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
-    if result.sigma_scale is not None:
-        pitch = "" if outcome.true_pitch_mm is None else f": pitch {outcome.true_pitch_mm:.3f} mm"
-        what = f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}"
-        headline.append((f"{result.scale:.4f}", "", what))
     return headline
 
 

@@ -142,8 +142,10 @@ def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
     """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
     the poses, or those from the σ of the result."""
     sigma = result.sigma
-    pairs = ([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")] for side in ("robot", "camera"))
-    robot, camera = (np.diag(np.square(np.repeat(pair, 3))) for pair in pairs)
+    robot, camera = (
+        np.diag(np.square(np.repeat([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")], 3)))
+        for side in ("robot", "camera")
+    )
     if loop.robot_covariance is not None and "robot_rad" not in sigma:
         robot = loop.robot_covariance.mean(0)
     if loop.camera_covariance is not None:
@@ -223,6 +225,20 @@ class HandEyePlanFile(ResultFile):
     turn_rad: Vector = Field(description="of each pose against the nearest pose taken")
     joints: dict[str, Vector] = Field(description="values of the poses by column, deg or mm; empty without a robot")
 
+    @classmethod
+    def of(cls, result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> "HandEyePlanFile":
+        """Returns the file of the planned poses, after those of a result."""
+        return cls(
+            format="stcal handeye plan 1",
+            setup=result.setup,
+            method=result.method,
+            taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
+            sigma_mm=planned.sigma_mm,
+            turn_rad=planned.turn_rad,
+            joints=joints,
+            **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
+        )
+
 
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
     """Returns the report of ``handeye plan``."""
@@ -270,17 +286,3 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
         poses = (cell for each in frames.values() for cell in pose_cells(each[k]))
         rows.append([k + 1, *(repr(float(value)) for value in values), *poses])
     return csv_text(rows)
-
-
-def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
-    """Returns the file of the planned poses, for programs."""
-    return HandEyePlanFile(
-        format="stcal handeye plan 1",
-        setup=result.setup,
-        method=result.method,
-        taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
-        sigma_mm=planned.sigma_mm,
-        turn_rad=planned.turn_rad,
-        joints=joints,
-        **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
-    )

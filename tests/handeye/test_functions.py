@@ -9,7 +9,7 @@ import stcal
 from stcal import workflows
 from stcal.geometry.camera import Camera
 from stcal.handeye.handeye_file import HandEyeFile
-from stcal.handeye.plan import planned_file
+from stcal.handeye.plan import HandEyePlanFile
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells
@@ -56,7 +56,7 @@ def test_two_files_of_poses(written, poses, tmp_path):
 def test_plan_handeye(written, poses):
     answer = written("plan", poses, "--count", 1)
     found = workflows.plan_handeye(workflows.read_handeye(poses), 1)
-    assert json.loads(json_text(planned_file(found.result, found.poses, found.joints))) == answer
+    assert json.loads(json_text(HandEyePlanFile.of(found.result, found.poses, found.joints))) == answer
 
 
 def test_without_flips(poses):
