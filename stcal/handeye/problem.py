@@ -523,5 +523,6 @@ class _Task:
         held = normal.copy()
         held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
         note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which "
-        note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along that axis"
+        note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along "
+        note += "that axis"
         return x, z, generalised_inverse(held), (*self.problem.notes, note)

@@ -37,7 +37,10 @@ def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path,
     assert not (tmp_path / "h.json").exists()
     code, shown, _ = command(poses_file(tmp_path / "poses.csv", truth), "--dry-run")
     assert code == 0
-    assert "poses.csv: table; 12 poses; base_from_flange by its columns; quaternions by name; mm" in shown
+    assert (
+        "poses.csv: table; 12 poses; base_from_flange by the columns base_from_flange_…; quaternions by name; mm"
+        in shown
+    )
 
 
 def test_a_dry_run_says_what_motion_is_missing(command, tmp_path, truth):

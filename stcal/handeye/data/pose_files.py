@@ -8,7 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -56,17 +55,16 @@ def todays(table: Table) -> bool:
 
 def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
     """Returns the poses in the columns of a table; None where it has none."""
-    names = _row_names(table, key)
+    names, sides = _row_names(table, key), []
     prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
-    read = [_side(table, prefix, frames, names, statements) for prefix, frames in prefixes.items()]
-    sides = [side for side in read if side is not None]
-    if not sides and (side := _side(table, "", None, names, statements)) is not None:
-        sides = [side]
+    for prefix, frames in (*prefixes.items(), ("", None)):
+        if (prefix or not sides) and (side := _side(table, prefix, frames, names, statements)) is not None:
+            sides.append(side)
     if not sides:
         return None
-    roles = [side.frames.role for side in sides if side.frames is not None]
-    if len(set(roles)) < len(roles):
-        both = ", ".join(side.frames.name for side in sides if side.frames is not None)
+    known = [side.frames for side in sides if side.frames is not None]
+    if len({frames.role for frames in known}) < len(known):
+        both = ", ".join(frames.name for frames in known)
         raise InputError("E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed; drop the others")
     return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
@@ -75,28 +73,24 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     """Returns image or time of each row, as text: nanoseconds have more digits than a float; empty without a column."""
     lower = {name.lower(): name for name in table.columns}
     column = next((name for name in (key, *NAMES) if name in table), None)
-    column = column or next((lower[name] for name in NAMES if name in lower), None)
-    if column is not None:
+    if column := column or next((lower[name] for name in NAMES if name in lower), None):
         values = tuple(table.text(column))
         require_each_once(values, places_of(table), table.where)
         return values
     number = next((lower[name] for name in NUMBERS if name in lower), None)
-    if number is not None and len(set(table.text(number))) == len(table):
-        return tuple(table.text(number))
-    return ()
+    values = tuple(table.text(number)) if number is not None else ()
+    return values if len(set(values)) == len(table) else ()
 
 
 def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> PoseSide | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
-    place = _place(table, prefix)
-    turned = None if place is None else read_rotations(table, prefix, statements.rotation)
-    if place is None or turned is None:
+    if (place := _place(table, prefix)) is None:
         return None
-    covariance = table.pose_covariances(prefix)
-    common = table.common_errors(covariance, prefix)
-    at, unit = place
-    poses, more = Poses(turned.rotation, at), {"covariance": covariance, "common": common}
-    return PoseSide(poses, places_of(table), turned.words, unit, frames, names, **more)
+    if (turned := read_rotations(table, prefix, statements.rotation)) is None:
+        return None
+    covariance, (at, unit) = table.pose_covariances(prefix), place
+    more = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
+    return PoseSide(Poses(turned.rotation, at), places_of(table), turned.words, unit, frames, names, **more)
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
@@ -305,11 +299,10 @@ def _of_npz(file: File) -> PoseContent:
                     others.append(name)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
         raise _damaged(file.where, error) from error
-    numeric = [array for array in arrays.values() if isinstance(array, np.ndarray)]
-    if not numeric:
+    if not any(isinstance(array, np.ndarray) for array in arrays.values()):
         raise InputError("E-NUMPY-CONTENT", f"{file.where}: no arrays of numbers; save it with np.savez")
-    form = "NumPy arrays"
-    single = read_tree(numeric[0], form, file.said, file.where) if len(arrays) == 1 else None
+    form, [first, *more] = "NumPy arrays", arrays.values()
+    single = None if more else read_tree(first, form, file.said, file.where)
     content = single or _of_values(file, arrays, form)
     return replace(content, passed_over=(*content.passed_over, *others))
 
@@ -372,12 +365,13 @@ class ToldPairs:
     timed: Timed | None = None
 
     @classmethod
-    def of(cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, **more: Any) -> "ToldPairs":
+    def of(
+        cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, lines: Sequence[str] = (), **more: Any
+    ) -> "ToldPairs":
         """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
         covariances = robot.covariance, camera.covariance
         pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
-        lines = (f"robot: {robot.understood}", f"camera: {camera.understood}", *more.pop("lines", ()))
-        return cls(pairs, lines, **more)
+        return cls(pairs, (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines), **more)
 
 
 def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs | None:
@@ -417,15 +411,13 @@ def read_two(
     """
     files = tuple(zip(FRAMES, (first, second), keys_of(key), strict=True))
     contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
-    if contents[0] is None and contents[1] is None:
+    if not any(contents):
         return None
     sides = []
     for (role, path, own), content in zip(files, contents, strict=True):
-        if content is None:
-            table = read_table(path, "table", quaternions)
-            content = read_columns(table, own, statements)
-            if content is None:
-                raise _no_poses(table)
+        table = None if content else read_table(path, "table", quaternions)
+        if table is not None and (content := read_columns(table, own, statements)) is None:
+            raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
     setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
@@ -434,24 +426,25 @@ def read_two(
         untimed = (robot if times is None else camera).where
         raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
-        return _by_time(robot, camera, times, wanted, setup, where, tolerance_s)
+        stream = Stream.of(times, robot.poses, Path(robot.where).name)
+        return _by_time(robot, camera, stream, stream.after_origin(wanted), setup, where, tolerance_s)
     rows, how = matched(robot, camera, key)
-    a, b = [i for i, _ in rows], [j for _, j in rows]
+    a, b = ([row[k] for row in rows] for k in (0, 1))
     stamped = None
     if times is not None and wanted is not None and len(set(times)) >= max(len(times), len(rows) + 1):
         stream = Stream.of(times, robot.poses, first.name)
         if stream.spacing_s() <= LONGEST_S:
             stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
-    alone = [(robot.called(), first, a)] if stamped is None else []  # samples between images are no mistake
+    alone = [(robot, first, a)] if stamped is None else []  # samples between images are no mistake
     left_out = [
         (name, f"in {path.name} alone")
-        for names, path, used in (*alone, (camera.called(), second, b))
-        for i, name in enumerate(names)
+        for side, path, used in (*alone, (camera, second, b))
+        for i, name in enumerate(side.called())
         if i not in used
     ]
+    more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
     lines = (f"rows joined {how}",) if how else ()
-    more = {"lines": lines, "setup": setup, "left_out": tuple(left_out), "timed": stamped}
-    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, **more)
+    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseSide | None:
@@ -463,15 +456,8 @@ def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Or
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
     """Returns lines that describe a table of pose pairs of the package's own."""
     table = read_table(source, "pose file", quaternions)
-    lines = []
-    for role, names in FRAMES.items():
-        frame = next((name for name in names if any(column.startswith(f"{name}_") for column in table.columns)), "")
-        unit = table.unit(f"{frame}_x", LENGTHS)
-        with_covariances = ", with covariances" if f"{frame}_cov_rx_rx" in table else ""
-        turned = "quaternions by name" if quaternions == "wxyz" else "quaternions x, y, z, w by their order"
-        held = f"{len(table)} poses; {frame} by its columns; {turned}; {unit}{with_covariances}"
-        lines.append(f"{role}: {table.where.removeprefix('pose file ')}: table; {held}")
-    return lines
+    content, place = read_columns(table, "image", Said()), Path(table.where.removeprefix("pose file "))
+    return [f"{role}: {settled(content, role, place, Said()).understood}" for role in FRAMES] if content else []
 
 
 def require_own(path: Path, quaternions: Order = "wxyz") -> None:
@@ -492,15 +478,13 @@ def _no_poses(table: Table) -> InputError:
 def _by_time(
     robot: PoseSide,
     camera: PoseSide,
-    times: Sequence[Decimal],
-    wanted: Sequence[Decimal],
+    stream: Stream,
+    seconds: np.ndarray,
     setup: Setup | None,
     where: str,
     tolerance_s: float,
 ) -> ToldPairs:
-    """Returns the robot's poses at the camera's times."""
-    stream = Stream.of(times, robot.poses, Path(robot.where).name)
-    seconds = stream.after_origin(wanted)
+    """Returns the robot's poses of a stream at the camera's times, ``seconds`` after its origin."""
     taken = taken_at(stream, seconds, tolerance_s)
     if not taken.kept.any():
         first = f"{camera.names[0]}, {taken.why[0]}"
@@ -510,8 +494,8 @@ def _by_time(
         lines += ("covariances of the robot's poses are not used: they are of other times",)
     at_images, seen = replace(robot, poses=taken.base_from_flange, covariance=None), camera[rows.tolist()]
     left_out = tuple((name, why) for name, why in zip(camera.names, taken.why, strict=True) if why)
-    more = {"lines": lines, "setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
-    return ToldPairs.of(at_images, seen, seen.names, where, **more)
+    more = {"setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
+    return ToldPairs.of(at_images, seen, seen.names, where, lines, **more)
 
 
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
