@@ -80,8 +80,6 @@ class PoseFiles:
 
 
 POSE_FILES = PoseFiles()
-SCALED = ("pose", "reprojection")
-"""Methods that can find the board's size."""
 SIGMA, MANY = Opt(min=0), Opt(min=1, max=100_000)
 
 
@@ -164,6 +162,7 @@ def handeye(
     from stcal.handeye.handeye_file import HandEyeFile
     from stcal.handeye.handeye_page import outcome_report
     from stcal.handeye.handeye_pipeline import judged
+    from stcal.handeye.problem import SCALED
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
@@ -177,7 +176,6 @@ def handeye(
     timing = Timing(time_tolerance, image_times, time_offset)
     exports = shared.exports_of(export or [], forms.FORMS)
     given, folder = files.given(timing), files.source is not None and files.source.is_dir()
-    by_corners = "only with a folder of images, which show the arm's errors"
     for code, refusals in {
         "E-OPTION-NEEDS": {
             "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given": (
@@ -187,7 +185,6 @@ def handeye(
             "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file": (
                 robot_out and not with_kinematics
             ),
-            f"--with-kinematics: {by_corners}": with_kinematics and not folder,
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name": (
                 (parent or child or camera_frame != "optical") and not (ros or urdf or exports)
             ),
@@ -263,16 +260,14 @@ def handeye(
             write(path, content := text())
             require_same(path, partial(path.read_text, "utf-8"), content)
     write_if(report, document.page)
-    if camera_out:
-        if (adjusted := result.reprojection) is None:
-            by = result.method
-            raise InputError("E-OPTION-METHOD", f"--camera-out: {by} does not adjust the camera; leave --method out")
+    adjusted = result.reprojection  # refused above for methods that adjust nothing
+    if camera_out and adjusted is not None:
         camera_out.parent.mkdir(parents=True, exist_ok=True)
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")
         say(f"written: {camera_out}")
-    if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
-        save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
+    if robot_out and inputs.arm is not None and adjusted is not None and adjusted.arm is not None:
+        save_robot(robot_out, inputs.arm.identified(adjusted.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
     found = judged(outcome)

@@ -1,6 +1,7 @@
 """Files of a hand-eye calibration: its result, and its transform for other programs."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 from xml.sax.saxutils import quoteattr
 
@@ -352,37 +353,24 @@ def urdf_joint(transforms: list[Static]) -> str:
     return "<robot>\n" + "".join(link + joint for link, joint in zip(links, joints, strict=True)) + "</robot>\n"
 
 
-def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
-    """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
-    turn, place, frames = _parts(result, transforms[0])
-    named = {"eye_on_hand": result.setup == "eye-in-hand", **MOVE_GROUP, "namespace": f"/{name}/", **frames}
-    transform = {f"q{axis}": value for axis, value in turn.items()} | place
-    return _commented_yaml(result, transforms, {"parameters": named, "transformation": transform})
-
-
-def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
-    """Returns the file ``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
-    turn, place, frames = _parts(result, transforms[0])
-    kind = "eye_in_hand" if result.setup == "eye-in-hand" else "eye_on_base"
-    named = {"name": name, "calibration_type": kind, **frames, **MOVE_GROUP}
-    content = {"parameters": named, "transform": {"translation": place, "rotation": turn}}
-    return _commented_yaml(result, transforms, content)
-
-
-def _parts(result: HandEye, first: Static) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
-    """Returns quaternion, place, and the names of all frames. The frame of the board, and the robot's frame without the
+def easy_handeye(result: HandEye, transforms: list[Static], name: str, second: bool = False) -> str:
+    """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye, or, of the ``second`` version, for
+    ROS 2, ``~/.ros2/easy_handeye2/calibrations/NAME.calib``. The frame of the board, and the robot's frame without the
     camera, are unused."""
-    frames = FRAMES[result.setup]
+    first, *others = transforms
+    frames, in_hand, lines = FRAMES[result.setup], result.setup == "eye-in-hand", said_of(result)
     carries = {frames.mount: first.parent, frames.stand: frames.stand}
     robot = {"robot_base_frame": carries["base"], "robot_effector_frame": carries["flange"]}
-    tracking = {"tracking_base_frame": first.child, "tracking_marker_frame": "board"}
+    named = {**robot, "tracking_base_frame": first.child, "tracking_marker_frame": "board"}
     turn, place = dict(zip("xyzw", xyzw(first.pose), strict=True)), dict(zip("xyz", metres(first.pose), strict=True))
-    return turn, place, robot | tracking
-
-
-def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:
-    lines = said_of(result)
-    for each in transforms[1:]:
+    if second:
+        kind = "eye_in_hand" if in_hand else "eye_on_base"
+        content = {"parameters": {"name": name, "calibration_type": kind, **named, **MOVE_GROUP}}
+        content["transform"] = {"translation": place, "rotation": turn}
+    else:
+        content = {"parameters": {"eye_on_hand": in_hand, **MOVE_GROUP, "namespace": f"/{name}/", **named}}
+        content["transformation"] = {f"q{axis}": value for axis, value in turn.items()} | place
+    for each in others:
         words = " ".join(plain_numbers(xyzw(each.pose), 3))
         lines.append(f"{each.child} is not in this file: in {each.parent} at 0 0 0, quaternion x y z w {words}")
     return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
@@ -393,7 +381,7 @@ FORMS: dict[str, Callable[[HandEye, list[Static], str], str]] = {
     "moveit": lambda result, transforms, _: ros1_launch(transforms, said_of(result)),
     "moveit2": lambda result, transforms, _: ros2_launch(transforms, said_of(result)),
     "easy-handeye": easy_handeye,
-    "easy-handeye2": easy_handeye2,
+    "easy-handeye2": partial(easy_handeye, second=True),
 }
 """Writers of all formats, by the word of ``--export``."""
 

@@ -168,13 +168,13 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
     away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
-    value = f"{np.degrees(turn):.2g}°, {shift:.3g} mm"
-    said = f"the poses miss one another by {value.replace(',', ' and')} (RMS), {shift / away:.0%} of the board's "
-    said += f"distance of {away:.0f} mm"
+    size = f"{np.degrees(turn):.2g}°", f"{shift:.3g} mm"
+    said = f"the poses miss one another by {' and '.join(size)} (RMS), {shift / away:.0%} of the board's distance of "
+    said += f"{away:.0f} mm"
     limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
     remedy = "pair each pose of the board with that of the flange at that time, and check units, directions and camera"
     remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
-    return Finding("Residuals", BAD, said, value, limit, remedy)
+    return Finding("Residuals", BAD, said, ", ".join(size), limit, remedy)
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
@@ -187,8 +187,7 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     agreeing = good[held.rows]
     if not agreeing.any():
         return None
-    error = float(np.sqrt((held.translation_mm[agreeing] ** 2).mean()))
-    fitted = result.rms()[1]
+    error, fitted = float(np.sqrt((held.translation_mm[agreeing] ** 2).mean())), result.rms()[1]
     camera_covariance = result.reprojection.camera_covariance if result.reprojection else None
     unknowns = 12 + (result.sigma_scale is not None) + (0 if camera_covariance is None else len(camera_covariance))
     unknowns += len(outcome.arm.parameters) if outcome.arm else 0
@@ -209,17 +208,15 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
 def _of_share(outcome: Outcome) -> Finding | None:
     """Judges the share of the transform's σ in a prediction; unknown with an arm, whose errors cancel the
     transform's."""
-    share = share_of_variance(outcome)
-    if share is None or outcome.arm is not None:
+    if (share := share_of_variance(outcome)) is None or outcome.arm is not None:
         return None
     distance, sigma, shift = share
-    share_of_transform = sigma**2 / (sigma**2 + shift**2)
-    word = _word(share_of_transform, HALF, MOST)
+    part = sigma**2 / (sigma**2 + shift**2)
     alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
     said = f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was "
     said += f"({distance:.0f} mm away), the error of a single pose {shift:.2g} mm (RMS)"
-    remedy = "take more poses, and turn the flange more, about two axes"
-    return _graded("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
+    remedy, value = "take more poses, and turn the flange more, about two axes", f"{part:.0%} of the variance"
+    return _graded("σ of the transform", _word(part, HALF, MOST), said, value, f"{HALF:.0%}", remedy)
 
 
 def _of_common_errors(outcome: Outcome) -> Finding | None:
@@ -230,15 +227,13 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
             return None
         said = f"{result.method} gives no σ, and the board's poses state errors that all have in common"
         return Finding(title, CARE, said, remedy="leave --method out: no residual shows these errors, only σ do")
-    share = share_of_variance(outcome, common)
-    if share is None:
+    if (share := share_of_variance(outcome, common)) is None:
         return None
     distance, sigma, shift = share
-    word: Word = CARE if sigma > shift else GOOD
     said = f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
-    said += f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
+    said += f"{FRAMES[result.setup].camera} where the board was ({distance:.0f} mm away)"
     remedy = "calibrate the camera better, or solve from the images: more poses do not help"
-    return _graded(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+    return _graded(title, _word(sigma, shift), said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
 
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
@@ -261,22 +256,19 @@ def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) ->
 
 def _of_motions(outcome: Outcome) -> Finding | None:
     """Judges whether the flange turned enough about two axes."""
-    observability = outcome.result.observability
-    if observability is None:
+    if (seen := outcome.result.observability) is None:
         return None
-    ratio = observability.sigma_mm / COMMON_MM
-    word = _word(ratio, AS_ONE, AS_THREE)
-    first, second, _ = np.degrees(observability.turns_rad)
-    title, value, limit = "Motions of the flange", f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}"
+    ratio, (first, second, _) = seen.sigma_mm / COMMON_MM, np.degrees(seen.turns_rad)
+    title, word, limit = "Motions of the flange", _word(ratio, AS_ONE, AS_THREE), f"{AS_ONE:g} × σ of a pose"
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
-        remedy = f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which "
-        remedy += "a robot with four axes cannot show; or turn the flange about another axis too, without --four-dof"
-        return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
+        remedy = f"measure where the camera is along this axis, {in_words(seen.axes[0])} of the flange, which a robot "
+        remedy += "with four axes cannot show; or turn the flange about another axis too, without --four-dof"
+        return Finding(title, word, said, "one axis", limit, remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
-    return _graded(title, word, said, value, limit, observability.missing())
+    return _graded(title, word, said, f"{ratio:.2f} × σ of a pose", limit, seen.missing())
 
 
 def _of_size(outcome: Outcome) -> Finding | None:
@@ -294,21 +286,20 @@ def _of_outliers(outcome: Outcome) -> Finding:
     result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
     if not bad:
         return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
-    said, flips = [], ()
+    flips: tuple[str, ...] = ()
     if outcome.pairs is not None:
         loop = Loop.of(outcome.pairs, result.setup)
         tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
         flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
-    others = tuple(name for name in bad if name not in flips)
+    others, said, remedies = tuple(name for name in bad if name not in flips), [], []
     if flips:
         tilt = "poses are tilted the other way, as the second pose of a flat target is"
         said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
+        if outcome.views is None:
+            undo = "solve with --undo-flips, which takes the other tilt, or give images, not the board's poses"
+            remedies.append(undo)
     if others:
         said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
-    remedies = []
-    if flips and outcome.views is None:
-        remedies.append("solve with --undo-flips, which takes the other tilt, or give images, not the board's poses")
-    if others:
         which = _few(others) if flips else "these poses"
         remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")
     word = BAD if len(bad) > MANY * count else CARE
@@ -323,7 +314,7 @@ def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: s
     return Finding(title, word, said, value, limit, remedy if word != GOOD else "")
 
 
-def _word(value: float, care: float, bad: float) -> Word:
+def _word(value: float, care: float, bad: float = np.inf) -> Word:
     return BAD if value > bad else CARE if value > care else GOOD
 
 
