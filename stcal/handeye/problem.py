@@ -170,6 +170,7 @@ chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
 AT_ONE_PLACE = Aside("the robot stood several times at one place: its errors there count once in σ")
+OF_EVOLUTION = Aside("differential evolution: what it reaches depends on its bounds; the paper's own are not legible")
 IN_COMMON = Aside("σ contain the errors that the board's poses have in common (columns common…)")
 UNSETTLED = "the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses"
 HELD_MM = 1e-6
@@ -386,7 +387,7 @@ class _Task:
                 x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
                 x = polish(objective, x) if method == "de-polished" else x
             if method == "de":
-                notes = (*notes, Aside(evolution.in_words(unit_mm)))
+                notes = (*notes, OF_EVOLUTION)
             z = closed_form.mean_pose(loop.chain(x))
         return self.solved(method, x, z, self.loop.residuals(x, z), notes)
 

@@ -112,15 +112,12 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
 
 def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
     """Returns the shortest t_X and t_Z (s, 3), and scales (s,), for R_X: R_G t_X + s R_G R_X t_C − t_Z = −t_G."""
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    hand, eye, s = loop.stand_from_mount, loop.camera_from_board, len(subsets)
     rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
     moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
-    right = -hand.translation[subsets]
+    right = -hand.translation[subsets] - (0 if with_scale else moved)
     if with_scale:
         rows = np.concatenate([rows, moved[..., None]], axis=3)
-    else:
-        right = right - moved
-    s = len(subsets)
     solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
     return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
 
@@ -129,13 +126,11 @@ def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
     """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
     infinite for a board of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
-    chain = hand.rotation @ (x[:, None] @ eye.rotation)
-    cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
+    cosine = (np.einsum("smab,sab->sm", hand.rotation @ (x[:, None] @ eye.rotation), z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)
-    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(size < LEAST_SCALE, np.inf, shift.T / size).T
+    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)[:, None]
+    shift = np.where(size < LEAST_SCALE, np.inf, shift / np.maximum(size, LEAST_SCALE))
     return np.arccos(np.clip(cosine, -1, 1)), shift
 
 
@@ -289,13 +284,6 @@ class Bounds:
                 f"{FARTHEST:g} and a positive half width needed",
             )
 
-    def in_words(self, factor: float, unit: str) -> str:
-        """Returns the bounds in words, times ``factor``."""
-        about = "the closed-form solution" if self.centre is None else "zero"
-        if any(self.centre or ()):
-            about = ", ".join(f"{factor * coordinate:g}" for coordinate in self.centre or ()) + unit
-        return f"±{factor * self.half_width:.4g}{unit} about {about}"
-
 
 @dataclass(frozen=True, slots=True)
 class EvolutionOptions:
@@ -324,32 +312,18 @@ class EvolutionOptions:
 
     def __post_init__(self):
         require_fields(self, "differential evolution", seed=0)
-        if not (
-            4 <= self.population <= MOST
-            and 0 <= self.generations <= MOST
-            and 0 < self.weight < np.inf
-            and 0 < self.factor <= 2
-            and 0 <= self.crossover <= 1
-        ):
+        numbers = (self.population, self.generations, self.factor, self.crossover, self.weight)
+        least, most = (4, 0, 1e-300, 0, 1e-300), (MOST, MOST, 2, 1, FARTHEST)
+        if not all(low <= number <= high for low, number, high in zip(least, numbers, most, strict=True)):
             raise InputError(
                 "E-EVOLUTION-OPTIONS",
-                f"differential evolution: population {self.population}, {self.generations} generations, F "
-                f"{self.factor:g}, CR {self.crossover:g}, λ {self.weight:g}; 4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 "
-                "to 1, and a positive number needed",
+                "differential evolution: population {}, {} generations, F {:g}, CR {:g}, λ {:g}; ".format(*numbers)
+                + f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed",
             )
 
     def needs_closed_form(self) -> bool:
         """True if some bounds lie about the closed-form solution."""
         return any(bounds is not None and bounds.centre is None for bounds in (self.bounds_rad, self.bounds_mm))
-
-    def in_words(self, unit_mm: float) -> str:
-        """Returns in words the settings that the paper leaves to choose, or that its copy does not show."""
-        turn = self.bounds_rad.in_words(180 / np.pi, "°")
-        shift = self.bounds_mm.in_words(1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
-        return (
-            f"differential evolution: first population {turn} and {shift}; λ {self.weight:g} with lengths in units of "
-            f"{unit_mm:g} mm; the paper's own bounds are not legible, and what it reaches depends on them"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
