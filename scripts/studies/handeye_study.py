@@ -120,7 +120,7 @@ def print_cameras(pool, trials: int, only: str) -> None:
 def pose_bound(exact: Truth, noise: Noise) -> np.ndarray:
     """Inverse information (6, 6) on X of poses, Z unknown."""
     loop = Loop.of(exact.pairs, exact.setup)
-    slope = loop.jacobian(exact.mount_from_camera)[:, :, :12]
+    slope = loop.jacobian(exact.mount_from_camera)
     spread = components(loop, noise, exact.mount_from_camera).known
     return np.linalg.inv(np.einsum("mai,maj->ij", slope, np.linalg.solve(spread, slope)))[:6, :6]
 

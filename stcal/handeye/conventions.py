@@ -16,7 +16,7 @@ from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_content import FRAMES
-from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, carried
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.handeye.remarks import HALL_MM, Aside, Grave, of_still
@@ -36,7 +36,7 @@ RADIANS_AS_DEGREES = np.radians(11.0)
 MIRROR = np.diag([1.0, -1.0, 1.0])
 SIDES = (("robot", "robot"), ("board", "camera"))
 """What messages and options call the two sides."""
-Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
+Guess = Callable[[Loop, bool], LoopState]
 
 
 def check_conventions(

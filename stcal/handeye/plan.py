@@ -158,7 +158,7 @@ def _information(loop: Loop, errors: tuple[np.ndarray, np.ndarray], result: Hand
     x, scale = result.mount_from_camera, result.scale
     robot, camera = loop.by_robot(x, scale), loop.by_camera(x, scale)
     spread = robot @ errors[0] @ np.swapaxes(robot, 1, 2) + camera @ errors[1] @ np.swapaxes(camera, 1, 2)
-    jacobian = loop.jacobian(x, scale)[:, :, :12]
+    jacobian = loop.jacobian(x, scale)
     return np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(spread, jacobian)
 
 

@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import remarks
 from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log, rms_of
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
 from stcal.handeye.methods.closed_form import (
@@ -28,7 +28,7 @@ from stcal.handeye.methods.closed_form import (
     polish,
     solve_closed_form,
 )
-from stcal.handeye.methods.pose_adjustment import LoopState, Noise, PoseSolution, adjust_poses, by_places, places
+from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
     AdjustedCorners,
@@ -280,7 +280,7 @@ class HandEyeProblem:
             problem.pairs.require_moving_flange()
 
         @cache
-        def guess(loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+        def guess(loop: Loop, with_scale: bool) -> LoopState:
             if options.four_dof:
                 return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
             return closed_form.robust(loop, with_scale)
@@ -391,12 +391,10 @@ class _Task:
             z = closed_form.mean_pose(loop.chain(x))
         return self.solved(method, x, z, self.loop.residuals(x, z), notes)
 
-    def by_poses(self, first: tuple[Rigid, Rigid, float]) -> Solved:
+    def by_poses(self, first: LoopState) -> Solved:
         """Solves by least squares of the poses' errors, from ``first`` X, Z and scale."""
         problem, options, loop, scaled = self.problem, self.problem.options, self.loop, self.problem.options.with_scale
-        solution, noise, notes = self.by_true_robot(
-            lambda loop, noise: adjust_poses(loop, LoopState(*first), noise, scaled)
-        )
+        solution, noise, notes = self.by_true_robot(lambda loop, noise: adjust_poses(loop, first, noise, scaled))
         state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
         notes, covariance, common = problem.notes + notes, generalised_inverse(solution.normal), None
         if not options.four_dof and (clusters := by_places(loop, solution)):
@@ -429,7 +427,7 @@ class _Task:
         more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
         return self.solved("pose", x, z, solution.residuals, notes, **more)
 
-    def by_views(self, first: tuple[Rigid, Rigid, float], views: Views) -> Solved:
+    def by_views(self, first: LoopState, views: Views) -> Solved:
         """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
         options, pairs = self.problem.options, self.problem.pairs
         more = (options.intrinsics, options.with_scale, options.camera, options.arm)
@@ -511,7 +509,7 @@ class _Task:
         pairs, options, loop, good = self.problem.pairs, self.problem.options, self.loop, ~outliers
         tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
         notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
-        moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x)[:, :, :12], places(loop) is None)
+        moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
         notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
         if not (options.with_scale or options.four_dof):
             notes += remarks.of_size(loop[good], hint, options.noise)

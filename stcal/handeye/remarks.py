@@ -12,7 +12,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pose_pairs import FRAMES, STALE, HandEyePoses, Loop, Setup, apart
 from stcal.handeye.methods.closed_form import robust
-from stcal.handeye.methods.pose_adjustment import LoopState, Noise, adjust_poses
+from stcal.handeye.methods.pose_adjustment import Noise, adjust_poses
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.report.document import Answer
 from stcal.row_order import change_along
@@ -400,7 +400,7 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     if not other(*hint, HINTED):
         return ()
     try:  # the hint comes from one large step, so the scale is solved for
-        solution = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
+        solution = adjust_poses(loop, robust(loop, with_scale=True), noise, with_scale=True)
     except StcalError:
         return ()
     scale, sigma = solution.state.scale, float(np.sqrt(generalised_inverse(solution.normal)[12, 12]))

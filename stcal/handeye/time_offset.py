@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.pose_adjustment import UNKNOWNS, LoopState, Noise, adjust_poses
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, adjust_poses
 from stcal.handeye.problem import HandEye
 
 WITHIN_S, SCAN_S = 1.0, 0.05
@@ -114,13 +114,12 @@ def estimate_offset(
             raise InputError("E-TIME-OFFSET-RANGE", said)
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
-        state = state or LoopState(*closed_form.robust(loop, with_scale))
+        state = state or closed_form.robust(loop, with_scale)
         solution = adjust_poses(loop, state, noise, with_scale)
-        state, speed = solution.state, stream.velocity(at)
+        state, speed, count = solution.state, stream.velocity(at), UNKNOWNS + with_scale
         x, scale = state.mount_from_camera, state.scale
-        count = UNKNOWNS + with_scale
         by_time = loop.by_robot(x, scale) @ speed[:, :, None]
-        jacobian = np.concatenate([loop.jacobian(x, scale)[:, :, :count], by_time], axis=2)
+        jacobian = np.concatenate([loop.jacobian(x, scale, count), by_time], axis=2)
         used = np.flatnonzero(~solution.outliers)
         weighted = np.linalg.solve(solution.covariance[used], jacobian[used])
         inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian[used], weighted))

@@ -267,7 +267,7 @@ def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
     residuals = loop.residuals(x, result.stand_from_board, result.scale)
     by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
     columns = 12 + (result.sigma_scale is not None)
-    jacobian = np.concatenate([loop.jacobian(x, result.scale)[:, :, :columns], by_time], axis=2)
+    jacobian = np.concatenate([loop.jacobian(x, result.scale, columns), by_time], axis=2)
     size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
     weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
     flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()

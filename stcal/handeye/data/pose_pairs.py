@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -309,9 +309,9 @@ class Loop:
         stand axes."""
         return self.chain(mount_from_camera, scale).difference(Poses.of([stand_from_board] * len(self)))
 
-    def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
-        """Returns the derivative (m, 6, 13) of :meth:`residuals` by left perturbations of X and Z, and by the scale;
-        that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""
+    def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0, count: int = 12) -> np.ndarray:
+        """Returns the derivative (m, 6, 12 or 13) of :meth:`residuals` by left perturbations of X and Z, and by the
+        scale; that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""
         to_stand = self.stand_from_mount.rotation
         arm = self.camera_from_board.translation @ mount_from_camera.rotation.T
         derivative = np.zeros((len(self), 6, 13))
@@ -319,7 +319,7 @@ class Loop:
         derivative[:, 3:, :3] = -to_stand @ skew(scale * arm)
         derivative[:, :, 6:12] = -np.eye(6)
         derivative[:, 3:, 12] = np.einsum("mij,mj->mi", to_stand, arm)
-        return derivative
+        return derivative[:, :, :count]
 
     def by_camera(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
         """Returns the derivative (m, 6, 6) of :meth:`residuals` by left perturbations of camera_from_board."""
@@ -334,6 +334,19 @@ class Loop:
         arm = self.chain(mount_from_camera, scale).translation - self.stand_from_mount.translation
         derivative[:, 3:, :3] = -skew(arm)
         return derivative @ inverse_jacobian(self.stand_from_mount.inverse()) if self.inverted else derivative
+
+
+class LoopState(NamedTuple):
+    """The unknowns of a loop: X, Z and the board's scale."""
+
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    scale: float = 1.0
+
+    def moved(self, step: np.ndarray) -> "LoopState":
+        """Returns the state after left perturbations of X and Z and a change of the scale, (12,) or (13,)."""
+        x, z = self.mount_from_camera.moved(step[:6]), self.stand_from_board.moved(step[6:12])
+        return LoopState(x, z, self.scale + float(step[12:].sum()))
 
 
 LARGEST_RAD = np.radians(170)

@@ -11,7 +11,7 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, best_rotations, skew
-from stcal.handeye.data.pose_pairs import Loop, Motions
+from stcal.handeye.data.pose_pairs import Loop, LoopState, Motions
 from stcal.io.device import quiet_opencv
 
 SUBSETS = 200
@@ -24,7 +24,7 @@ SEED = 0
 """Seed of the subsets, so that they are the same every time."""
 
 
-def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+def robust(loop: Loop, with_scale: bool = False) -> LoopState:
     """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation.
 
     The product needs no weight between the two units. Translations are in units of the board, since a board shrunk to
@@ -53,10 +53,10 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
         if np.median(new_turn) * np.median(new_shift) < np.median(turn) * np.median(shift):
             parts, best = again, 0
     x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
-    return Rigid(x, t_x), Rigid(z, t_z), float(scale)
+    return LoopState(Rigid(x, t_x), Rigid(z, t_z), float(scale))
 
 
-def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> LoopState:
     """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along it.
     Translations give the angle about it, and the scale."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
@@ -86,7 +86,7 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
     scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
     t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
-    return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
+    return LoopState(*slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale)
 
 
 def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid, Rigid]:

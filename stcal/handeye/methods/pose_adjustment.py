@@ -14,7 +14,7 @@ from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop, LoopState
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""
@@ -159,20 +159,6 @@ SETTLED = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoopState:
-    """The unknowns: X, Z and the board's scale."""
-
-    mount_from_camera: Rigid
-    stand_from_board: Rigid
-    scale: float = 1.0
-
-    def moved(self, step: np.ndarray) -> "LoopState":
-        """Returns the state after left perturbations of X and Z and a change of the scale, (12,) or (13,)."""
-        x, z = (a.moved(s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
-        return LoopState(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
     """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) of the residuals;
     ``outliers`` : (m,); ``sigma`` : the estimated σ, by name; ``variance_factor`` : mean squared residual in units of
@@ -207,9 +193,7 @@ def adjust_poses(
     """Returns the least-squares solution of the loop's residuals over their σ at the board's origin, from a start:
     maximum likelihood for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without the metric's free
     parameter). Raises ConvergenceError: no minimum is reached."""
-    count = 13 if with_scale else 12
-    state = start
-    residuals = _residuals(loop, state)
+    count, state, residuals = 12 + with_scale, start, loop.residuals(*start)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
     variances = first = parts.first(residuals)
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
@@ -217,7 +201,7 @@ def adjust_poses(
         parts = components(loop, noise, state.mount_from_camera, state.scale)
         covariance = parts.total(variances)
         state, normal = _solved(loop[used], state, covariance[used], count)
-        residuals, jacobian = _residuals(loop, state), _jacobian(loop, state, count)
+        residuals, jacobian = loop.residuals(*state), loop.jacobian(state.mount_from_camera, state.scale, count)
         before, settled = used, True
         if parts.names:
             old = variances
@@ -230,21 +214,11 @@ def adjust_poses(
             break
     covariance = parts.total(variances)
     state, normal = _solved(loop[used], state, covariance[used], count)
-    residuals = _residuals(loop, state)
+    residuals, redundancy = loop.residuals(*state), max(6 * int(used.sum()) - count, 1)
     sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
-    redundancy = max(6 * int(used.sum()) - count, 1)
-    return PoseSolution(
-        state=state,
-        normal=normal,
-        residuals=residuals,
-        covariance=covariance,
-        outliers=~used,
-        sigma=sigma,
-        variance_factor=float(_squared(residuals, covariance)[used].sum() / redundancy),
-        redundancy=redundancy,
-        scale_hint=_scale_hint(loop[used], state, residuals[used], covariance[used]),
-        settled=settled,
-    )
+    factor = float(_squared(residuals, covariance)[used].sum() / redundancy)
+    hint = _scale_hint(loop[used], state, residuals[used], covariance[used])
+    return PoseSolution(state, normal, residuals, covariance, ~used, sigma, factor, redundancy, hint, settled)
 
 
 def places(loop: Loop) -> np.ndarray | None:
@@ -267,7 +241,7 @@ def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
     place = places(own)
     if place is None:
         return None
-    jacobian = _jacobian(own, solution.state, len(solution.normal))
+    jacobian = own.jacobian(solution.state.mount_from_camera, solution.state.scale, len(solution.normal))
     weighted, member = np.linalg.solve(solution.covariance[used], jacobian), np.eye(place.max() + 1)[place]
     pull = -np.einsum("mai,ma->mi", weighted, solution.residuals[used])
     information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
@@ -276,19 +250,11 @@ def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
 
 def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """Returns the scale, one step from the solution, if it were solved for, and its σ."""
-    jacobian = _jacobian(loop, state, 13)
+    jacobian = loop.jacobian(state.mount_from_camera, state.scale, 13)
     weighted = np.linalg.solve(covariance, jacobian)
     inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
     step = -inverse[12] @ np.einsum("mai,ma->i", weighted, residuals)
     return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
-
-
-def _residuals(loop: Loop, state: LoopState) -> np.ndarray:
-    return loop.residuals(state.mount_from_camera, state.stand_from_board, state.scale)
-
-
-def _jacobian(loop: Loop, state: LoopState, count: int) -> np.ndarray:
-    return loop.jacobian(state.mount_from_camera, state.scale)[:, :, :count]
 
 
 def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
@@ -296,8 +262,9 @@ def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) ->
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def linearise(state: LoopState) -> NormalEquations:
-        white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
-        return NormalEquations.of(white, (weight @ _jacobian(loop, state, count)).reshape(-1, count))
+        white = np.einsum("mab,mb->ma", weight, loop.residuals(*state)).ravel()
+        jacobian = loop.jacobian(state.mount_from_camera, state.scale, count)
+        return NormalEquations.of(white, (weight @ jacobian).reshape(-1, count))
 
     minimum = minimise(start, linearise, LoopState.moved)
     # Derivatives neglect curvature. With rough poses, steps end where even a damped step gains nothing.

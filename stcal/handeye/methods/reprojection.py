@@ -14,9 +14,9 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses
 from stcal.handeye.data.corner_views import Views, resect, whitened
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop, LoopState
 from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
 from stcal.handeye.methods.pose_adjustment import (
     CAUTION,
@@ -24,7 +24,6 @@ from stcal.handeye.methods.pose_adjustment import (
     FARTHEST,
     LEAST_POSES,
     UNKNOWNS,
-    LoopState,
     Noise,
     PoseSolution,
 )
@@ -273,9 +272,8 @@ def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraE
 def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
     """Returns the derivative (12, q), or (13, q) with the scale, of the gradient, from the board's poses (m, 6, q)."""
     used = np.flatnonzero(~solution.outliers)
-    state: LoopState = solution.state
-    jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, : len(solution.normal)]
-    moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_unknown
+    x, _, scale = solution.state
+    jacobian, moves = loop.jacobian(x, scale, len(solution.normal)), loop.by_camera(x, scale) @ by_unknown
     weighted = np.linalg.solve(solution.covariance[used], moves[used])
     return np.einsum("mai,maj->ij", jacobian[used], weighted)
 
@@ -357,7 +355,7 @@ def adjust_views(
     loop: Loop,
     base_from_flange: Poses,
     views: Views,
-    first: tuple[Rigid, Rigid, float],
+    first: LoopState,
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
@@ -381,7 +379,7 @@ def adjust_views(
         if arm is not None:
             linear, flange = LinearArm(parameters, arm.slope(parameters), arm.angles), arm.poses(parameters)
             loop = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
-        used, good = _near(loop, *first), len(loop)
+        used, good = _near(loop, first), len(loop)
         while True:
             rows = np.flatnonzero(used)
             if len(rows) < 3:
@@ -402,7 +400,10 @@ def adjust_views(
         state = corners.bundle(solution.values)
         if arm is None or linear is None:
             break
-        parameters, first = parameters + state.arm, (state.mount_from_camera, state.stand_from_board, state.scale)
+        parameters, first = (
+            parameters + state.arm,
+            LoopState(state.mount_from_camera, state.stand_from_board, state.scale),
+        )
         sigma = FIRST | _sigma(corners)
         if np.linalg.norm(linear.slope[:, 3:] @ state.arm, axis=1).max() < SETTLED_MM:
             break
@@ -466,8 +467,8 @@ def _scale_hint(corners: Corners, values: dict[str, Any]) -> tuple[float, float]
     return float(values["scale"].array[0, 0]) + step, float(np.sqrt(inverse[at, at]))
 
 
-def _near(loop: Loop, x: Rigid, z: Rigid, scale: float) -> np.ndarray:
+def _near(loop: Loop, first: LoopState) -> np.ndarray:
     """Returns which poses (m,) are not wrong from the start."""
-    miss = loop.residuals(x, z, scale)
+    miss = loop.residuals(*first)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
     return ~(far | (np.linalg.norm(miss[:, :3], axis=1) > GROSS_RAD))
