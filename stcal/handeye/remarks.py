@@ -27,8 +27,8 @@ SCALE_SEEN = 36.0
 look like an information of three per pose; at this limit the scale is too small by that share, a twelfth."""
 COMMON_RAD, COMMON_MM = 1e-3, 0.5
 """σ of the poses of a common camera at half a metre, by which the usefulness of a set of poses is judged."""
-USELESS_RAD, USELESS_MM = np.radians(5), 50.0
-"""σ of a hand-eye transform from such poses, beyond which the transform is not worth having."""
+USELESS_RAD = np.radians(5)
+"""σ of a hand-eye rotation from such poses beyond which the transform, then at least 44 mm off, is not worth having."""
 WANTED_DEG = 30
 """Size of rotations between poses that makes σ of X's translation about that of a pose."""
 LEAST_TURN = np.radians(5)
@@ -66,13 +66,18 @@ class Observability:
         base_from_flange = np.swapaxes(flange, 1, 2) if loop.inverted else flange
         turns, axes = _principal(np.swapaxes(base_from_flange, 1, 2))  # flange_j_from_flange_i
         mount_axis = _principal(base_from_flange)[1][0] if loop.inverted else axes[0]
-        sigma_rad, sigma_mm = _worst(loop)
+        # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations with
+        # the rotation known. It depends on how the robot turned, not on X.
+        m, mean = len(flange), flange.mean(0)
+        information = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
+        size = np.sqrt(information) if information >= 1e-12 * m else 0.0
+        sigma_rad, sigma_mm = (float(sigma / size) if size else np.inf for sigma in (COMMON_RAD, COMMON_MM))
         return cls(turns, axes, mount_axis, sigma_rad, sigma_mm)
 
     @property
     def useless(self) -> bool:
         """True if no estimate of X from these poses is worth having."""
-        return self.sigma_rad > USELESS_RAD or self.sigma_mm > USELESS_MM
+        return self.sigma_rad > USELESS_RAD
 
     @property
     def one_axis(self) -> bool:
@@ -102,23 +107,31 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
             f"own, by {WANTED_DEG}° or more, and take more",
         )
-    observability = Observability.of(loop)
-    if four_dof:
-        fault = ""
-        if observability.turns_rad[0] < LEAST_TURN:
-            fault = f"; rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more"
-        elif not observability.one_axis:
-            fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
-        if fault:
-            turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
-            raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
-    elif observability.useless:
+    seen, fault = Observability.of(loop), ""
+    if not four_dof and seen.useless:
         slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
         slides += f"{FRAMES[setup].camera} along that axis is determined"
-        raise DegenerateError(
-            "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"
-        )
-    return observability
+        said = f"{where}: {seen.missing()}{slides if seen.one_axis else ''}"
+        raise DegenerateError("E-HANDEYE-AXES", said)
+    if four_dof and seen.turns_rad[0] < LEAST_TURN:
+        fault = f"; rotate it about {in_words(seen.axes[0])} by {WANTED_DEG}° or more"
+    elif four_dof and not seen.one_axis:
+        fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
+    if fault:
+        turns = f"{_list(np.degrees(seen.turns_rad))}° (RMS)"
+        raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
+    return seen
+
+
+def motions_missing(base_from_flange: Poses, setup: Setup) -> list[str]:
+    """Returns a line on the motions that are missing, where the poses cannot determine the transform."""
+    inverted = setup == "eye-to-hand"
+    stand_from_mount = base_from_flange.inverse() if inverted else base_from_flange
+    try:
+        check(Loop(stand_from_mount, base_from_flange, inverted), setup, "motions", False)
+    except DegenerateError as error:
+        return [str(error)]
+    return []
 
 
 def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
@@ -164,18 +177,6 @@ def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     turns, axes = np.sqrt(np.maximum(square[::-1], 0)), axes.T[::-1]
     largest = np.abs(axes).argmax(1)
     return turns, axes * np.sign(axes[np.arange(3), largest])[:, None]
-
-
-def _worst(loop: Loop) -> tuple[float, float]:
-    """Returns the largest σ of X's rotation (rad), from rotations alone, and of its translation (mm) with the rotation
-    known, from poses of a common camera. Both depend on how the robot turned, not on X."""
-    turn = loop.stand_from_mount.rotation
-    m, mean = len(turn), turn.mean(0)
-    # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations.
-    information = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
-    if information < 1e-12 * m:
-        return np.inf, np.inf
-    return float(COMMON_RAD / np.sqrt(information)), float(COMMON_MM / np.sqrt(information))
 
 
 def in_words(axis: np.ndarray) -> str:
@@ -303,7 +304,7 @@ def of_outliers(
 ) -> tuple[str, ...]:
     """Returns notes on the poses left out, (m,), by residuals (m, 6); those of ``flips`` agree if tilted the other
     way."""
-    notes = []
+    notes: list[str] = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
         said = f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
@@ -313,10 +314,10 @@ def of_outliers(
         said += "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
         notes.append(Grave(said))
     if flips.any():
+        named = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
         said = f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat "
-        said += "target is, which its image hardly excludes: "
-        said += ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
-        notes.append(Aside(f"{said}; --undo-flips takes that one, or give images"))
+        said += f"target is, which its image hardly excludes: {named}; --undo-flips takes that one, or give images"
+        notes.append(Aside(said))
     return tuple(notes)
 
 
@@ -350,8 +351,7 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
         along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
         order, m = np.argsort(along), len(along)
         first = np.arange(max(3, m // 5), m - max(3, m // 5) + 1)
-        below = np.cumsum(along[order])[first - 1]
-        between = below**2 * (1 / first + 1 / (m - first))
+        between = np.cumsum(along[order])[first - 1] ** 2 * (1 / first + 1 / (m - first))
         if between.max() > APART * (along @ along):
             k = int(first[between.argmax()])
             one, two = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
@@ -374,7 +374,7 @@ def of_order(
         return ()
     white = jacobian / sigma[:, None]
     moves = {"the camera": white[:, :, :6], "the board": white[:, :, 6:]}
-    changes = [(what, change_along(residuals / sigma, white, motions)) for what, motions in moves.items()]
+    changes = ((what, change_along(residuals / sigma, white, motions)) for what, motions in moves.items())
     found = [(what, change) for what, change in changes if change is not None]
     if not found:
         return ()
@@ -448,30 +448,3 @@ def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[st
         "--poses-are" * exchanged
     )
     return (Grave(said) if away > TOO_FAR_MM and not stated else said,)
-
-
-MOST = 2000
-"""Largest number of poses of which all pairs are compared. From more poses, this many are chosen evenly."""
-
-
-def spread_text(base_from_flange: Poses, setup: Setup) -> list[str]:
-    """Returns the flange's axes, its largest rotation, the box of its places, and the motions that are missing."""
-    m = len(base_from_flange)
-    if m < LEAST_POSES:
-        return [f"motions: {m} poses, {LEAST_POSES} needed and 10 wanted"]
-    inverted = setup == "eye-to-hand"
-    stand_from_mount = base_from_flange.inverse() if inverted else base_from_flange
-    observability = Observability.of(Loop(stand_from_mount, base_from_flange, inverted))
-    turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(observability.turns_rad))
-    axes = int((observability.turns_rad > LEAST_TURN).sum())
-    some = base_from_flange.rotation[np.unique(np.linspace(0, m - 1, min(m, MOST)).astype(int))]
-    turned = (some[i + 1 :] @ some[i].T for i in range(len(some) - 1))
-    largest = max(float(Rotation.from_matrix(each).magnitude().max()) for each in turned)
-    box = " × ".join(f"{side:.0f}" for side in np.ptp(base_from_flange.translation, axis=0))
-    lines = [
-        f"motions: the flange turns about {axes} {'axis' if axes == 1 else 'axes'} ({turns} RMS about its principal "
-        f"ones), by up to {np.degrees(largest):.0f}° between two poses; its places lie within {box} mm"
-    ]
-    if observability.useless:
-        lines.append(f"motions: too little to calibrate: {observability.missing()}")
-    return lines

@@ -19,7 +19,7 @@ from stcal.handeye.data.pose_files import ToldPairs, own_told, read_pairs, read_
 from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.problem import HandEyeProblem
-from stcal.handeye.remarks import spread_text
+from stcal.handeye.remarks import motions_missing
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -243,7 +243,7 @@ class Files:
                 lines = own_told(source, self.quaternions)
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
-        lines += [f"setup: {setup}, {origin}", count, *spread_text(flange, setup)]
+        lines += [f"setup: {setup}, {origin}", count, *motions_missing(flange, setup)]
         return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 
