@@ -186,7 +186,11 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     base = rng.integers(len(earlier), size=CANDIDATES)
     facing = earlier.rotation[base, :, 2]
     facing = facing * np.sign(np.einsum("ma,ma->m", facing, places[base]))[:, None]
-    straight = _turned_onto(facing, sight) @ earlier.rotation[base]
+    axis = np.cross(facing, sight)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, np.einsum("ma,ma->m", facing, sight))
+    onto = Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None])
+    straight = onto.as_matrix() @ earlier.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -200,14 +204,6 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     pixels = camera.project(points[front].reshape(-1, 3)).reshape(-1, len(outline), 2)
     inside = ((pixels >= MARGIN * size) & (pixels <= (1 - MARGIN) * size)).all((1, 2))
     return poses[np.flatnonzero(front)[inside]]
-
-
-def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotations (m, 3, 3) that turn the unit vectors ``first`` (m, 3) onto ``second`` (m, 3)."""
-    axis = np.cross(first, second)
-    sine = np.linalg.norm(axis, axis=1)
-    angle = np.arctan2(sine, np.einsum("ma,ma->m", first, second))
-    return Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None]).as_matrix()
 
 
 class HandEyePlanFile(ResultFile):
@@ -243,12 +239,11 @@ class HandEyePlanFile(ResultFile):
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
     """Returns the report of ``handeye plan``."""
     taken = int((~result.outliers).sum())
-    rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
     heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
-    rows = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]]
-    cells = []
+    rows, cells = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]], []
     for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
-        place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
+        flange = planned.base_from_flange[k]
+        place = [f"{value:.2f}" for value in (*flange.translation, *np.degrees(flange.log()[:3]))]
         rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
         cells.append([f"next {k + 1}", *(f"{values[k]:.3f}" for values in joints.values())])
     last = "joint limits and the image" if joints else "the image; give --robot for joint limits"

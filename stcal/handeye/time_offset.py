@@ -59,12 +59,12 @@ class TimeOffset:
 
     def in_words(self) -> str:
         """Returns the offset with its sign, σ, and the speed of the flange as one sentence."""
-        order = "ahead of" if self.seconds >= 0 else "behind"
-        speed = f"{self.speed_mm_s:.3g} mm/s and {np.degrees(self.speed_rad_s):.3g}°/s"
+        order, sign = ("ahead of", "+") if self.seconds >= 0 else ("behind", "-")
         return (
             f"time offset: {1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms, robot's clock minus camera's: the "
-            f"robot's is {order} the camera's, an image stamped t was taken at t {'+' if self.seconds >= 0 else '-'} "
-            f"{1e3 * abs(self.seconds):.2f} ms of the robot's; the flange moves by {speed} at the images (RMS)"
+            f"robot's is {order} the camera's, an image stamped t was taken at t {sign} {1e3 * abs(self.seconds):.2f} "
+            f"ms of the robot's; the flange moves by {self.speed_mm_s:.3g} mm/s and "
+            f"{np.degrees(self.speed_rad_s):.3g}°/s at the images (RMS)"
         )
 
     def carried(self, result: HandEye) -> HandEye:
