@@ -179,10 +179,8 @@ def _tried(choice: ChosenWay | None) -> list[Block]:
     """Returns a table with a row per way of solving that was tried."""
     if choice is None:
         return []
-    rows = []
-    for each in choice.tried:
-        how = "taken" if each.candidate == choice.chosen else each.reason
-        rows.append([each.candidate.name, number(each.mean_mm, 3), str(len(each.error_mm)), how])
+    how = {each.candidate: each.reason for each in choice.tried} | {choice.chosen: "taken"}
+    rows = [[w.candidate.name, number(w.mean_mm, 3), str(len(w.error_mm)), how[w.candidate]] for w in choice.tried]
     return [
         Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
         page_only(
@@ -198,14 +196,14 @@ def _arm(arm: ArmFound | None) -> list[Block]:
     """Returns a table with a row per axis: its deviation from the robot's file, and σ."""
     if arm is None:
         return []
-    cells_of_axis: dict[str, list[str]] = {}
+    axes: dict[str, list[str]] = {}
     for name, value in arm.parameters.items():
         axis, component = name.split()
         unit, factor, digits = ("°", DEGREE, 4) if component.startswith("r") else ("mm", 1.0, 3)
         text = f"{component} {number(value * factor, digits)} ± {number(arm.sigma[name] * factor, digits)} {unit}"
-        cells_of_axis.setdefault(axis, []).append(text)
-    width = max(len(cells) for cells in cells_of_axis.values())
-    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
+        axes.setdefault(axis, []).append(text)
+    width = max(map(len, axes.values()))
+    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in axes.items()]
     return [
         Table([f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], rows, css="text"),
         page_only(
@@ -222,17 +220,15 @@ def _methods(outcome: Outcome) -> list[Block]:
         return []
     means = [each.held_out.means() if each.held_out else {} for each in outcome.compared]
     kinds = [name for name in ERRORS if any(name in own for own in means)]
-    inverse, rows = outcome.result.mount_from_camera.inverse(), []
+    inverse, rows, failed = outcome.result.mount_from_camera.inverse(), [], any(e.reason for e in outcome.compared)
     for each, own in zip(outcome.compared, means, strict=True):
         far = [NONE, NONE]
         if each.result is not None:
             off = inverse @ each.result.mount_from_camera
             far = [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
         cells = [number(own.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
-        rows.append([each.method, *cells, *far, each.reason])
-    heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"]
-    if not any(row[-1] for row in rows):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
+        rows.append([each.method, *cells, *far, *[each.reason] * failed])
+    heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", *["<"] * failed]
     board = (
         " 3-D at the board: the distance from each corner to the point where the camera's ray to it meets the board "
         "as placed by the robot; by pose: distance from the corners by the pose that the image gives alone."
@@ -268,15 +264,18 @@ def _coverage(outcome: Outcome) -> list[Block]:
     else:
         measured = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)])
         residuals = board.residuals_px
-    finite = np.isfinite(residuals).all(1)
-    size, counts = (views.camera.width, views.camera.height), image_coverage(views)
-    by = "the adjustment" if board is not None else "robot and transforms"
-    factor = enlargement(residuals[finite], size[0])
+    finite, size, counts = (
+        np.isfinite(residuals).all(1),
+        (views.camera.width, views.camera.height),
+        image_coverage(views),
+    )
+    measured, residuals = measured[finite], residuals[finite]
+    by, factor = "the adjustment" if board is not None else "robot and transforms", enlargement(residuals, size[0])
     return [
         f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
         plot(
-            lambda: image_figure(size, counts, measured[finite], residuals[finite]),
+            lambda: image_figure(size, counts, measured, residuals),
             "coverage of the image",
             f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
             "",

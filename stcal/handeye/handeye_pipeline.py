@@ -259,12 +259,12 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     if (seen := outcome.result.observability) is None:
         return None
     ratio, (first, second, _) = seen.sigma_mm / COMMON_MM, np.degrees(seen.turns_rad)
-    title, word, limit = "Motions of the flange", _word(ratio, AS_ONE, AS_THREE), f"{AS_ONE:g} × σ of a pose"
+    title, word, limit = "Motions of the flange", _word(ratio, AS_ONE, AS_THREE), f"{AS_ONE:g}"
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
         remedy = f"measure where the camera is along this axis, {in_words(seen.axes[0])} of the flange, which a robot "
         remedy += "with four axes cannot show; or turn the flange about another axis too, without --four-dof"
-        return Finding(title, word, said, "one axis", limit, remedy)
+        return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
