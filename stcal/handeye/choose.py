@@ -104,11 +104,6 @@ class Tried:
         """Mean of all errors, or NaN if there are none."""
         return float(self.error_mm.mean()) if self.error_mm.size else float("nan")
 
-    @property
-    def closed(self) -> bool:
-        """True for a closed form."""
-        return self.candidate in CLOSED_FORMS
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenWay:
@@ -136,11 +131,10 @@ def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried | S
         partial = tuple(solution.without(out) for out in rows)
     except StcalError as error:
         return error
-    unseen, share = (problem[out] for out in rows), 1 - rows.shape[1] / len(problem)
-    errors = [deciding_error(part, own) for part, own in zip(partial, unseen, strict=True)]
+    errors = np.array([deciding_error(part, problem[out]) for part, out in zip(partial, rows, strict=True)])
+    share = 1 - rows.shape[1] / len(problem)
     shown_without = tuple(_shown(part, problem, share) for part in partial)
-    shown = _shown(solution.result, problem)
-    return Tried(candidate, np.array(errors), "", solution.result, partial, shown, shown_without)
+    return Tried(candidate, errors, "", solution.result, partial, _shown(solution.result, problem), shown_without)
 
 
 def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool:
@@ -164,7 +158,7 @@ def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tri
         others = np.where(np.isin(rows, rows[split]), -1, rows)
         rows = rows if (others < 0).all() else others  # a single split: no other poses were held out
     shown = [each for each in tried if (each.shown if split is None else each.shown_without[split])]
-    adjusted, closed = ([each for each in shown if each.closed == kind] for kind in (False, True))
+    adjusted, closed = ([e for e in shown if (e.candidate in CLOSED_FORMS) == kind] for kind in (False, True))
     chosen = _first_of(adjusted or closed, rows)
     rival = _first_of(closed, rows) if adjusted and closed else chosen
     return rival if _behind(chosen, rival, rows) > WITHOUT_WEIGHTS else chosen
@@ -224,15 +218,15 @@ def choose(
         result = _with_sigma(chosen, chosen.candidate.of(problem, prior))
     except StcalError as error:
         finished[chosen.candidate] = error
-        able = [each for each in able if not each.closed]
+        able = [each for each in able if each.candidate not in CLOSED_FORMS]
         chosen = _best(able, rows)
         result = _with_sigma(chosen, problem)
     best_of_splits = (_best(able, rows, k).partial[k] for k in range(len(rows)))
     errors = [errors_of(part, problem[out]) for part, out in zip(best_of_splits, rows, strict=True)]
     held_out = HeldOutPoses.of_splits(rows, errors)
-    every = ((candidate, finished[candidate]) for candidate in candidates)
-    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in every)
-    others = (each for each in able if each is not chosen and not each.closed)
+    ways = ((way, finished[way]) for way in candidates)
+    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in ways)
+    others = (each for each in able if each is not chosen and each.candidate not in CLOSED_FORMS)
     rivals = [each for each in others if _behind(each, chosen, rows) <= AS_GOOD]
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in chosen.partial])
@@ -253,16 +247,15 @@ def _with_sigma(tried: Tried, problem: HandEyeProblem) -> HandEye:
 
 def _widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
     """Widens σ until they cover the rivals, which predict as well. Returns the result, and notes on distant rivals."""
-    factor, notes, pose = 1.0, [], Poses.of([result.mount_from_camera])
+    factor, notes = 1.0, []
     for each in rivals:
         if (rival := each.result) is None or result.covariance is None or rival.covariance is None:
             continue
-        gap = Poses.of([rival.mount_from_camera]).difference(pose)[0]
+        gap = Poses.of([rival.mount_from_camera]).difference(Poses.of([result.mount_from_camera]))[0]
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
         if squared > chi2.ppf(1 - CONTRADICT, 6):
-            ratio = np.sqrt(squared / 6)
+            ratio, turn, shift = np.sqrt(squared / 6), np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             factor = max(factor, ratio)
-            turn, shift = np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             notes.append(
                 f"{each.candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
                 f"{ratio:.2g} times what their σ allow: σ are widened by that"

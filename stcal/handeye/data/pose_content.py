@@ -286,9 +286,8 @@ def _matrix(value: Any) -> tuple[np.ndarray, str] | None:
     """Returns the matrix (4, 4) in a value and its name, empty where it has none; None for any other value."""
     array = numbers(value)
     if array is not None and array.shape == (16,):
-        square = array.reshape(4, 4)  # by rows, or by columns as of Franka and OpenGL: the last row is 0 0 0 1
-        by_columns = not square[:3, 3].any() and square[3, :3].any()
-        return square.T if by_columns else square, ""
+        array = array.reshape(4, 4)  # by rows, or by columns as of Franka and OpenGL: the last row is 0 0 0 1
+        array = array.T if not array[:3, 3].any() and array[3, :3].any() else array
     if array is not None:
         return (array, "") if array.shape == (4, 4) else None
     if not isinstance(value, Mapping):
@@ -308,21 +307,20 @@ def _name_in(value: Mapping) -> str:
 def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | None:
     """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
-    if isinstance(value, Mapping):
-        if _matrix(value) is not None:
-            value, places = [value], ("the pose",)
-        else:
-            names = places = tuple(map(str, value))
-            value = list(value.values())
-            if any(_matrix(item) is None for item in value):
-                return None
+    if isinstance(value, Mapping) and _matrix(value) is not None:
+        values, places = [value], ("the pose",)
+    elif isinstance(value, Mapping):
+        names = places = tuple(map(str, value))
+        values = list(value.values())
+        if any(_matrix(item) is None for item in values):
+            return None
     elif isinstance(value, list | np.ndarray):
         array = numbers(value)
-        value = [array] if array is not None and array.shape in ((4, 4), (16,)) else value
-        places = tuple(f"pose {i}" for i in range(1, len(value) + 1))
+        values = [array] if array is not None and array.shape in ((4, 4), (16,)) else list(value)
+        places = tuple(f"pose {i}" for i in range(1, len(values) + 1))
     else:
         return None
-    found = [_matrix(item) for item in value]
+    found = [_matrix(item) for item in values]
     if not found or found[0] is None:
         return None
     bad = [place for place, each in zip(places, found, strict=True) if each is None]
@@ -424,12 +422,9 @@ def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
 
 def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
-    arrays = {}
-    for key, value in parts.items():
-        array = numbers([_flat(item) for item in value] if isinstance(value, list) else value)
-        if array is None:
-            raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
-        arrays[key] = array
+    arrays = {key: numbers([_flat(v) for v in item] if isinstance(item, list) else item) for key, item in parts.items()}
+    if bad := [key for key, array in arrays.items() if array is None]:
+        raise InputError("E-POSES-COUNT", f"{where}: {bad[0]}: not as many numbers for each pose; correct it")
     turn_key, at_key = sorted(arrays, key=lambda key: -arrays[key].size)
     turn, at = arrays[turn_key], arrays[at_key]
     count = 1 if at.size == len("xyz") else len(at)
