@@ -37,8 +37,6 @@ WITHOUT_WEIGHTS = 2.0
 and they know neither σ nor outliers; an adjustment is left only where its weights are clearly wrong."""
 TINY_MM = 1e-9
 """Least standard error of a difference: differences of exact data are rounding."""
-MANY_PERCENT = 99.5
-"""Change of the board's size from which on a factor is clearer than per cent."""
 CONTRADICT = 0.01
 """Significance level: σ are widened if two answers differ so much that their σ explain it more rarely than this."""
 
@@ -276,8 +274,6 @@ def _sentence(tried: tuple[Tried, ...], chosen: Tried, result: HandEye, where: s
     if way.scale and result.sigma_scale is not None:
         percent = 100 * (result.scale - 1)
         size = f"{abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {'larger' if percent > 0 else 'smaller'} than"
-        if abs(percent) >= MANY_PERCENT:
-            size = f"{result.scale:.3g} ± {result.sigma_scale:.1g} times as large as"
         parts.append(f"the board is {size} stated")
     rad, mm = (result.sigma.get(name) for name in ("robot_rad", "robot_mm"))
     if rad is not None and mm is not None and {"robot_rad", "robot_mm"} & set(result.estimated):

@@ -19,7 +19,7 @@ from stcal.handeye.data.pose_content import FRAMES
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
-from stcal.handeye.remarks import HALL_MM, Aside, Grave, of_still
+from stcal.handeye.remarks import HALL_MM, Aside, Grave
 from stcal.io.poses.rotations import INVERTED as CONJUGATED
 from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
 
@@ -53,9 +53,6 @@ def check_conventions(
     if turn > WELL[0] or shift > WELL[1]:
         size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm"
         contradict = f"{pairs.where}: the poses contradict each other by {size} (median)"
-        for still in of_still(pairs):
-            if isinstance(still, Grave):
-                raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
 
         def misfit(variant: Loop) -> float:
             again = _typical(variant, guess, with_scale)
@@ -96,9 +93,8 @@ def check_conventions(
                 remedy = "as rotations agree, rows and conventions of rotation are right: check units, signs and "
                 remedy += "order of the columns of positions"
             else:
-                remedy += (
-                    ", and check the camera file" if by_images else ", and look for another convention of rotations"
-                )
+                more = "check the camera file" if by_images else "look for another convention of rotations"
+                remedy += f", and {more}"
             what = "positions" if turn <= WELL[0] else "poses"
             raise InputError(
                 "E-HANDEYE-CONVENTION",

@@ -508,7 +508,7 @@ class _Task:
             return ()
         pairs, options, loop, good = self.problem.pairs, self.problem.options, self.loop, ~outliers
         tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
-        notes = remarks.of_still(pairs) + remarks.of_outliers(pairs.names, outliers, residuals, tilted)
+        notes = remarks.of_outliers(pairs.names, outliers, residuals, tilted)
         moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
         notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
         if not (options.with_scale or options.four_dof):

@@ -10,7 +10,7 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pose_pairs import FRAMES, STALE, HandEyePoses, Loop, Setup, apart
+from stcal.handeye.data.pose_pairs import FRAMES, Loop, Setup
 from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.pose_adjustment import Noise, adjust_poses
 from stcal.io.table import LENGTHS, UNIT_WORDS
@@ -284,10 +284,6 @@ MOVED_LEVEL, MOVED_SHARE = 0.01, 0.5
 SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
 """Probability that a move along the order of sound poses is named, and least share of the squares that it explains;
 the same where each pose is at a place of its own, so that errors common to a place are no move."""
-STILL = 0.005
-"""Share of the usual turn and way between two poses, below both of which a side did not move."""
-FEW = 200
-"""Largest number of poses of which all pairs are compared for what is usual."""
 HALL_MM = 5e4
 """Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 NEAR_MM = 20.0
@@ -319,27 +315,6 @@ def of_outliers(
         said += f"target is, which its image hardly excludes: {named}; --undo-flips takes that one, or give images"
         notes.append(Aside(said))
     return tuple(notes)
-
-
-def of_still(pairs: HandEyePoses) -> tuple[str, ...]:
-    """Returns a note if one side hardly moved between rows that follow each other, while the other side did: its pose
-    was not measured anew, or, of a robot at rest, board or camera was moved."""
-    sides = {"flange": pairs.base_from_flange, "board": pairs.camera_from_board}
-    steps = {}
-    for side, poses in sides.items():
-        usual = np.median(apart(poses, np.linspace(0, len(pairs) - 1, min(len(pairs), FEW)).astype(int)), axis=0)
-        between = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
-        steps[side] = np.linalg.norm(between, axis=2) / np.maximum(usual, 1e-12)
-    for side, other in (("flange", "board"), ("board", "flange")):
-        rows = np.flatnonzero((steps[side] < STILL).all(1) & (steps[other] > STALE).all(1))
-        if len(rows):
-            first, many = int(rows[0]), len(rows) > MANY * len(pairs)
-            said = f"the {side} hardly moved between {spoken(pairs.names[first])} and {spoken(pairs.names[first + 1])}"
-            said += f", and {len(rows) - 1} times more," if len(rows) > 1 else ""
-            said += f" while the {other} did: read the {side}'s pose anew with each image"
-            said += " (or was the board moved?)" if side == "flange" else ""
-            return (Grave(said) if many else said,)
-    return ()
 
 
 def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:

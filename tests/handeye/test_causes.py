@@ -72,30 +72,6 @@ def drawn(count: int) -> HandEyePoses:
     return simulated(np.random.default_rng(5), count, robot=(3e-4, 0.1), camera=(4e-4, 0.15)).pairs
 
 
-def nearly_stale(pairs: HandEyePoses, side: str, rows: np.ndarray) -> HandEyePoses:
-    """The pose of the row before in each of these rows, but for the micrometre of an encoder's noise."""
-    poses = getattr(pairs, side)
-    rotation, place = np.array(poses.rotation), np.array(poses.translation)
-    rotation[rows], place[rows] = rotation[rows - 1], place[rows - 1] + 1e-3
-    return replace(pairs, **{side: Poses(rotation, place)})
-
-
-@pytest.mark.parametrize(("side", "name"), [("base_from_flange", "flange"), ("camera_from_board", "board")])
-def test_a_side_that_was_hardly_read_anew_is_named(side, name):
-    pairs = drawn(20)
-    found = handeye(nearly_stale(pairs, side, np.array([7])))
-    (note,) = (note for note in found.notes if "hardly moved" in note)
-    assert f"the {name} hardly moved between pose 7 and pose 8 while" in note
-    assert not isinstance(note, Grave)
-    assert not any("hardly" in note for note in handeye(pairs).notes)
-
-
-def test_half_of_the_flange_hardly_read_anew_is_refused():
-    pairs = nearly_stale(drawn(24), "base_from_flange", np.arange(1, 24, 2))
-    with fails_with("E-POSES-IDENTICAL … the flange hardly moved between pose 1 and pose 2, and 11 times more"):
-        handeye(pairs)
-
-
 @pytest.mark.parametrize(
     ("which", "flange", "board"), [("below", np.r_[:19], np.r_[1:20]), ("above", np.r_[1:20], np.r_[:19])]
 )

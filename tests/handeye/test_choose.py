@@ -62,7 +62,7 @@ def test_a_camera_file_that_is_wrong_is_found_out():
 
 @pytest.mark.parametrize(
     ("scale", "said"),
-    sampled([(1.0, ""), (1.02, "% larger than stated"), (2.7, "2.7 ± … times as large as stated")], kept=(0, 1)),
+    sampled([(1.0, ""), (1.02, "% larger than stated"), (2.7, "% larger than stated")], kept=(0, 1)),
 )
 def test_poses_alone_are_chosen_among_too(scale, said):
     truth, pairs = pairs_of_size(scale, 7, 16)

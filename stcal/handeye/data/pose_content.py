@@ -236,9 +236,6 @@ ROS = Known("m", "as in ROS", False)
 def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
     """Returns the poses in plain values; None where there are none."""
     if isinstance(value, Mapping):
-        if "parameters" in value and "transform" in value:
-            said = "the result of an easy_handeye calibration; give its samples, NAME.samples"
-            raise InputError("E-POSES-NOT-FOUND", f"{where}: {said}")
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
     elif not isinstance(value, list | np.ndarray) or not len(value):
         return None

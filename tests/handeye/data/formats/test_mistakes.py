@@ -164,7 +164,6 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         ("name: cell\n", ["no poses in keys name …"]),
         ("- {image: a, matrix: [1, 2]}\n", ["no poses in YAML"]),
         ('{"a.png": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', ["a.png: the 3×3 part is not a rotation"]),
-        ('{"parameters": {}, "transform": {}}', ["the result of an easy_handeye calibration; give its samples"]),
         ('{"samples": [{"robot": 1, "tracking": 1}]}', ["sample 1: no translation x, y, z and rotation x, y, z, w"]),
     ],
 )
