@@ -430,10 +430,12 @@ class _Task:
     def by_views(self, first: LoopState, views: Views) -> Solved:
         """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
         options, pairs = self.problem.options, self.problem.pairs
-        more = (options.intrinsics, options.with_scale, options.camera, options.arm)
-        solution, _, notes = self.by_true_robot(
-            lambda loop, noise: adjust_views(loop, pairs.base_from_flange, views, first, noise, *more)
-        )
+
+        def adjusted(loop: Loop, noise: Noise) -> AdjustedCorners:
+            prior, scaled, flange = options.intrinsics, options.with_scale, pairs.base_from_flange
+            return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera, options.arm)
+
+        solution, _, notes = self.by_true_robot(adjusted)
         state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
         if sigma_scale is not None:
             require_scale(state.scale, sigma_scale, self.loop, pairs.where)
@@ -443,8 +445,8 @@ class _Task:
             x, z, covariance, notes = self.without_slide(x, z, solution.normal())
         if solution.camera_error is not None:
             covariance = solution.camera_error.covariance(covariance)
-        adjusted = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
-        residuals, good = adjusted.residuals(x, z), adjusted[~outliers]
+        closed = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
+        residuals, good = closed.residuals(x, z), closed[~outliers]
         if not options.four_dof and places(good) is not None:
             # What the places add to the covariance of the board's poses, they add to that of the corners.
             by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)

@@ -213,8 +213,10 @@ def frames_of(key: object) -> Known | None:
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
                 return Known(frames, f"by its name {key}", only)
-    role = next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)
-    return role and Known(FRAMES[role][0], BY_DEFAULT, False)
+    for role in ROLES:
+        if ROLES_BY_NAME[role].fullmatch(name):
+            return Known(FRAMES[role][0], BY_DEFAULT, False)
+    return None
 
 
 WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
@@ -240,8 +242,7 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
     elif not isinstance(value, list | np.ndarray) or not len(value):
         return None
     else:
-        listed = isinstance(value, list) and isinstance(value[0], Mapping)
-        content = _of_pairs(value, form, where) if listed else None
+        content = _of_pairs(value, form, where) if isinstance(value, list) and isinstance(value[0], Mapping) else None
     if content is None and (side := _side_of(value, where)) is not None:
         content = PoseContent(form, (side,))
     if content is not None or not isinstance(value, Mapping):
@@ -419,9 +420,11 @@ def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
 
 def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
-    arrays = {key: numbers([_flat(v) for v in item] if isinstance(item, list) else item) for key, item in parts.items()}
-    if bad := [key for key, array in arrays.items() if array is None]:
-        raise InputError("E-POSES-COUNT", f"{where}: {bad[0]}: not as many numbers for each pose; correct it")
+    arrays: dict[str, np.ndarray] = {}
+    for key, item in parts.items():
+        if (array := numbers([_flat(value) for value in item] if isinstance(item, list) else item)) is None:
+            raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
+        arrays[key] = array
     turn_key, at_key = sorted(arrays, key=lambda key: -arrays[key].size)
     turn, at = arrays[turn_key], arrays[at_key]
     count = 1 if at.size == len("xyz") else len(at)

@@ -89,8 +89,8 @@ def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...
     if (turned := read_rotations(table, prefix, statements.rotation)) is None:
         return None
     covariance, (at, unit) = table.pose_covariances(prefix), place
-    more = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
-    return PoseSide(Poses(turned.rotation, at), places_of(table), turned.words, unit, frames, names, **more)
+    common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
+    return PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common)
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
@@ -415,9 +415,11 @@ def read_two(
         return None
     sides = []
     for (role, path, own), content in zip(files, contents, strict=True):
-        table = None if content else read_table(path, "table", quaternions)
-        if table is not None and (content := read_columns(table, own, statements)) is None:
-            raise _no_poses(table)
+        if content is None:
+            table = read_table(path, "table", quaternions)
+            content = read_columns(table, own, statements)
+            if content is None:
+                raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
     setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
