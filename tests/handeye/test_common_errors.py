@@ -9,12 +9,12 @@ from scipy.stats import chi2
 from stcal.handeye import handeye
 from stcal.handeye.data.pose_pairs import read_poses
 from stcal.handeye.problem import HandEyeOptions, HandEyeProblem
-from stcal.handeye.problem import handeye as handeye_by
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye
+from tests.support.handeye import handeye as handeye_by
 from tests.support.handeye import simulated, squared
 
 COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T
