@@ -98,16 +98,6 @@ def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
     assert found.symmetries == ()
 
 
-def test_dots_carry_a_covariance_like_their_errors(tmp_path):
-    """Mean squared error in units of σ²: 2 per dot for true σ; drawing in steps adds to the noise that σ knows."""
-    board, sheet, first = boards()["dots"]
-    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
-    view = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1).views()["a.png"]
-    off = CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px
-    squared = np.einsum("na,nab,nb->n", off, np.linalg.inv(view.covariance_px2), off)
-    assert 0.5 < squared.mean() < 20
-
-
 def test_images_of_centres_are_exact():
     """Against the conics of circles seen aslant from near: their centres are off by a tenth of a pixel."""
     board = dots(corner=(0, 0))
@@ -150,16 +140,6 @@ def test_a_board_that_looks_the_same_after_half_a_turn_is_numbered_up_to_it(tmp_
     assert min(errors) < CORNER_PX < 20 < max(errors)
 
 
-def test_a_strip_hidden_is_said(tmp_path):
-    """Seven of eight columns of a plain board: which one is hidden cannot be known."""
-    board = dots()
-    image = take(*sheet_of_dots(board.xy_mm()[board.xy_mm()[:, 0] < 139], board.radii_mm()[:42]), SLANTED)
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    found = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1)
-    assert found.views() == {}
-    assert "strip" in found.skipped[0].reason
-
-
 def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
     with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
@@ -167,23 +147,6 @@ def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
-
-
-@pytest.mark.parametrize(
-    ("changed", "reason"),
-    [
-        ({"dictionary": "DICT_4X4_50"}, "no tag of DICT_4X4_50"),
-        ({"rows": 4, "columns": 5}, "of 10 on a board of 4×5"),
-        ({"legacy": True}, "of its tags, as on a board of rows = 6, columns = 8, legacy = false; correct its file"),
-    ],
-)
-def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):
-    design, sheet, first = charuco()
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / "0.png"), take(sheet, first, SLANTED))
-    files, _ = find_images(tmp_path / "images")
-    found = detect_boards(files, MODEL, replace(design, **changed), workers=1)
-    assert reason in found.skipped[0].reason
 
 
 def test_the_radius_of_circles_may_be_unknown(tmp_path):

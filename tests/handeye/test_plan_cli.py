@@ -75,8 +75,3 @@ def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
     code, shown, _ = plan(poses, "--robot", robot_file, "--count", 1)
     assert code == 0
     assert "of the 8 poses taken, not line" in shown
-
-
-def test_the_word_is_a_command_and_not_a_file(plan, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert_error(plan("nowhere.csv"), INPUT, "nowhere.csv: does not exist")

@@ -10,6 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import (
     HandEyeOptions,
     HandEyePoses,
+    HeldOutPoses,
     Noise,
     compare,
     cross_validate,
@@ -85,6 +86,14 @@ def test_solutions_of_parts_scatter_as_sigma_says():
         assert any("solutions of parts of the poses scatter" in note for note in wide.notes)
     assert np.mean(ratios) == pytest.approx(1, abs=0.15)
     assert np.isnan(held_out.scatter(handeye(truth.pairs, truth.setup, "li")))
+
+
+def test_splits_that_hold_out_nothing_but_outliers_have_no_mean():
+    held = HeldOutPoses(np.array([[0], [1]]), np.array([[1.0], [2.0]]), np.array([[3.0], [4.0]]))
+    assert held.means(np.array([False, True]))["translation_mm"] == 4
+    for outliers, agreeing in (([True, True], None), ([False, False], None), ([True, False], {"rotation_rad": 2.0})):
+        found = held.summary(np.array(outliers))["agreeing"]
+        assert found is None if agreeing is None else agreeing.items() <= found.items()
 
 
 def test_a_method_that_fails_says_why():

@@ -92,8 +92,12 @@ def test_a_camera_file_that_is_wrong_is_said_and_mended():
 
 def test_a_view_of_another_board_is_left_out():
     truth = simulated_views(np.random.default_rng(7), 12, corner_px=0.1)
-    view = truth.views.views[4]
-    views, pairs = with_view(truth, 4, View(view.xyz_board, view.xy_px[::-1]))  # numbered from the other end
+    view, bent = truth.views.views[4], truth.views.views[2].xy_px.copy()
+    bent[10] += [30, -20]  # one bad corner does no harm
+    views, _ = with_view(truth, 2, View(view.xyz_board, bent))
+    views, pairs = with_view(
+        replace(truth, views=views), 4, View(view.xyz_board, view.xy_px[::-1])
+    )  # from the other end
     found = handeye(pairs, views=views)
     assert np.flatnonzero(found.outliers).tolist() == [4]
     assert np.isnan(found.reprojection.rms_px(4))
@@ -106,17 +110,6 @@ def with_view(truth, i: int, view: View):
     views = Views(truth.views.camera, tuple(view if k == i else own for k, own in enumerate(truth.views.views)))
     names = tuple(f"{k}.png" for k in range(len(views.views)))
     return views, pairs_of_views(truth.pairs.base_from_flange, views, names)
-
-
-def test_one_bad_corner_does_no_harm():
-    truth = simulated_views(np.random.default_rng(8), 6, corner_px=0.05)
-    view = truth.views.views[2]
-    bent = view.xy_px.copy()
-    bent[10] += [30, -20]
-    views, pairs = with_view(truth, 2, View(view.xyz_board, bent))
-    found = handeye(pairs, views=views)
-    assert not found.outliers.any()
-    assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
 
 def test_views_that_show_too_little_are_named():

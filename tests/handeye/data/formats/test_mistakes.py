@@ -302,8 +302,3 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
     refuses("E-POSES-NOT-FOUND … u", read_robot_poses, path, statements=said)
-
-
-def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):
-    with fails_with("E-POSES-NOT-FOUND … without a header"):
-        Files(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), statements=Said(rotation="ur-rotvec")).read()
