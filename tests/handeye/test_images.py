@@ -1,5 +1,6 @@
 """Boards of every kind in a folder of images."""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -21,9 +22,20 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
-from tests.handeye.photographed import CAMERA, MARGIN_MM, PER_MM, image_from_sheet, sheet_of_dots, take
+from tests.handeye.photographed import (
+    CAMERA,
+    MARGIN_MM,
+    PER_MM,
+    image_from_sheet,
+    looks,
+    photographs,
+    sheet_of_dots,
+    take,
+)
+from tests.handeye.test_cli import CHANCE, EXACT, in_sigmas
 from tests.outcome import fails_with
 from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.handeye import FLANGE_FROM_CAMERA
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
 SLANTED = Rigid(Rotation.from_rotvec([0.5, -0.3, 0.2]).as_matrix(), [-60, -50, 420])
@@ -187,3 +199,45 @@ def test_several_boards_are_one(tmp_path):
     found = detect_boards(find_images(tmp_path)[0], MODEL, both, workers=1)
     assert len(found.views()["a.png"]) <= len(own.xy_mm())
     assert found.unused()[0].startswith("board 2: no tag of the AprilGrid")
+
+
+SET = """type = "boards"
+[[board]]
+type = "charuco"
+rows = 6
+columns = 8
+square_mm = 20.0
+marker_mm = 10.0
+dictionary = "5X5_50"
+[[board]]
+type = "aprilgrid"
+rows = 3
+columns = 4
+tag_mm = 25.0
+spacing = 0.3
+x_mm = -165.0
+y_mm = 105.0
+z_mm = 30.0
+rpy_deg = [0.0, 30.0, 0.0]
+"""
+
+
+@pytest.mark.slow
+def test_several_boards_are_solved_as_one(command, tmp_path):
+    """Eye-in-hand, without errors of the robot: within chance of its σ, and within 0.2 mm; `--dry-run` says what the
+    board is."""
+    seen = looks(np.random.default_rng(21), 8, np.array([10, 60]), 1.0)
+    _, sheet, first = charuco()
+    files, out = photographs(tmp_path, sheet, first, seen, SET), tmp_path / "h.json"
+    for i, pose in enumerate(seen):
+        cv2.imwrite(str(files.images / f"{i}.png"), photograph_of_both(pose))
+    code, shown, _ = command(*files.arguments(), "--dry-run")
+    assert code == 0
+    assert "2 boards" in shown
+    options = ("--workers", 1, "--splits", 0, "--method", "reprojection", "--out", out)
+    code, shown, err = command(*files.arguments(), *options, *EXACT)
+    assert code == 0, err
+    data = json.loads(out.read_text())
+    assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
+    off = Rigid.from_matrix(data["flange_from_camera"]).translation - FLANGE_FROM_CAMERA.translation
+    assert np.linalg.norm(off) < 0.2
