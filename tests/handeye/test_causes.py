@@ -102,6 +102,14 @@ def test_residuals_that_no_arm_leaves_are_not_to_be_used():
     assert any(finding.title == "Residuals" for finding in judged(outcome).reasons())
 
 
+def test_many_outliers_make_the_setup_suspect():
+    pairs = drawn(15)
+    places = pairs.camera_from_board.translation.copy()
+    places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
+    found = handeye(replace(pairs, camera_from_board=Poses(pairs.camera_from_board.rotation, places)))
+    assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
+
+
 def test_a_camera_far_off_the_flange_needs_its_setup_stated():
     """Robot's poses inverted, as of a camera beside the robot: nothing else tells."""
     truth = simulated_stream(np.random.default_rng(23), 20, "eye-to-hand", 0.0)

@@ -204,18 +204,13 @@ def test_metres_on_both_sides_are_said():
     assert "--length-unit m" in found.notes[0]
 
 
-def test_both_sides_inverted_put_the_board_behind_the_camera():
-    """It fits, with X and Z exchanged; only the place of the board can tell."""
+def test_a_board_behind_the_camera_is_said():
+    """Both sides inverted fit, with X and Z exchanged; only the place of the board can tell."""
     truth = simulated(np.random.default_rng(9), 10, **NOISE)
-    pairs = HandEyePoses(truth.pairs.base_from_flange.inverse(), truth.pairs.camera_from_board.inverse())
-    found = handeye(pairs)
+    found = handeye(HandEyePoses(truth.pairs.base_from_flange.inverse(), truth.pairs.camera_from_board.inverse()))
     assert found.flange_from_camera.translation == pytest.approx(truth.stand_from_board.translation, abs=2)
     assert found.notes[0].startswith("the board lies behind the camera in all poses")
     assert all(name in found.notes[0] for name in ("flange_from_base", "board_from_camera"))
-
-
-def test_one_board_behind_the_camera_is_named():
-    truth = simulated(np.random.default_rng(9), 10, **NOISE)
     board = list(truth.pairs.camera_from_board)
     board[6] = Rigid(board[6].rotation, -board[6].translation)
     found = handeye(HandEyePoses(truth.pairs.base_from_flange, Poses.of(board)))
@@ -270,14 +265,6 @@ def test_units_of_one_side_are_named(factor, unit):
     assert any(f"as if {unit}: name the columns so" in note for note in handeye(pairs).notes)
     with fails_with("E-HANDEYE-BOARD-SCALE"):
         handeye(pairs, options=HandEyeOptions(with_scale=True))
-
-
-def test_many_outliers_make_the_setup_suspect():
-    pairs = simulated(np.random.default_rng(21), 15, **NOISE).pairs
-    places = pairs.camera_from_board.translation.copy()
-    places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
-    found = handeye(HandEyePoses(pairs.base_from_flange, Poses(pairs.camera_from_board.rotation, places)))
-    assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
 
 
 @pytest.mark.parametrize("sets", [1, pytest.param(40, marks=FULL)])

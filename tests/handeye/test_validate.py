@@ -109,11 +109,7 @@ def test_a_method_that_fails_says_why():
     assert by["pose"].held_out.means()["translation_mm"] < 1e-3
     assert by["shah"].result is None
     assert "needs turns about two axes" in by["shah"].reason
-
-
-def test_a_split_that_cannot_be_solved_is_named():
-    truth = simulated(np.random.default_rng(5), 12)
-    with fails_with("E-HANDEYE-FEW-POSES … 3"):
+    with fails_with("E-HANDEYE-FEW-POSES … 3"):  # a split that cannot be solved
         cross_validate(truth.pairs, rows=np.arange(2, 12)[None])
 
 
