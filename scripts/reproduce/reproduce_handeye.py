@@ -21,8 +21,8 @@ from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
 from stcal.handeye.data.pose_pairs import Loop, Motions
+from stcal.handeye.handeye_problem import UNIT_MM, HandEyeProblem
 from stcal.handeye.methods.closed_form import Bounds, EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.problem import UNIT_MM, HandEyeProblem
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views

@@ -32,7 +32,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Poses, skew
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
 from stcal.robot.identification.identify import identify

@@ -22,9 +22,9 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
 from stcal.handeye.data.corner_views import Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS, Loop
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.methods.pose_adjustment import components
 from stcal.handeye.methods.reprojection import problem
-from stcal.handeye.problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of

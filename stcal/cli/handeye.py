@@ -162,7 +162,7 @@ def handeye(
     from stcal.handeye.handeye_file import HandEyeFile
     from stcal.handeye.handeye_page import outcome_report
     from stcal.handeye.handeye_pipeline import judged
-    from stcal.handeye.problem import SCALED
+    from stcal.handeye.handeye_problem import SCALED
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages

@@ -5,14 +5,14 @@ from .data.pose_pairs import SETUPS as SETUPS
 from .data.pose_pairs import HandEyePoses as HandEyePoses
 from .data.pose_pairs import read_poses as read_poses
 from .handeye_pipeline import handeye as handeye
+from .handeye_problem import METHODS as METHODS
+from .handeye_problem import HandEye as HandEye
+from .handeye_problem import HandEyeOptions as HandEyeOptions
 from .methods.closed_form import EvolutionOptions as EvolutionOptions
 from .methods.pose_adjustment import Noise as Noise
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
 from .plan import planned_csv as planned_csv
-from .problem import METHODS as METHODS
-from .problem import HandEye as HandEye
-from .problem import HandEyeOptions as HandEyeOptions
 from .remarks import Finding as Finding
 from .remarks import Verdict as Verdict
 from .validate import Compared as Compared

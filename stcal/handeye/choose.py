@@ -10,8 +10,8 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
+from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
-from stcal.handeye.problem import HandEye, HandEyeProblem
 from stcal.handeye.validate import (
     HeldOutPoses,
     deciding_error,

@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Way
 from stcal.handeye.data.pose_pairs import FRAMES, Setup
 from stcal.handeye.handeye_pipeline import Outcome, judged
-from stcal.handeye.problem import HandEye
+from stcal.handeye.handeye_problem import HandEye
 from stcal.handeye.remarks import Finding, Word
 from stcal.handeye.validate import Compared
 from stcal.io.json import Finite, Matrix, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3

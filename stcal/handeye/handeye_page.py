@@ -8,7 +8,7 @@ from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
 from stcal.handeye.handeye_pipeline import ArmFound, Outcome, judged
-from stcal.handeye.problem import FACTORS, HandEye
+from stcal.handeye.handeye_problem import FACTORS, HandEye
 from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
 from stcal.report.document import (

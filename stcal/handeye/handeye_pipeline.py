@@ -15,7 +15,7 @@ from stcal.handeye.choose import ChosenWay, choose
 from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, LengthUnit, Loop, Setup
-from stcal.handeye.problem import HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
 from stcal.handeye.remarks import (
     BAD,
     CARE,

@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
-from stcal.handeye.problem import HandEye
+from stcal.handeye.handeye_problem import HandEye
 from stcal.io.json import Pose, ResultFile, Vector
 from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table

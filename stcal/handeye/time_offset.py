@@ -14,9 +14,9 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
+from stcal.handeye.handeye_problem import HandEye
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, adjust_poses
-from stcal.handeye.problem import HandEye
 
 WITHIN_S, SCAN_S = 1.0, 0.05
 """Range and step of the scan for a first offset, in s. A robot's motion within one step is smooth."""

@@ -15,8 +15,8 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, resect
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Motions, Setup
+from stcal.handeye.handeye_problem import IN_COMMON, METHODS, HandEye, HandEyeOptions, HandEyeProblem
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS
-from stcal.handeye.problem import IN_COMMON, METHODS, HandEye, HandEyeOptions, HandEyeProblem
 from stcal.handeye.remarks import Aside, Grave
 from stcal.parallel import one_thread, run_in_order
 

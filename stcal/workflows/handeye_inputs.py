@@ -18,7 +18,7 @@ from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import ToldPairs, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import motions_missing
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera

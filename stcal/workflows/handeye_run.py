@@ -17,7 +17,7 @@ from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
 from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
-from stcal.handeye.problem import HandEye, HandEyeProblem
+from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits

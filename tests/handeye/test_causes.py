@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.handeye_pipeline import judged
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import Grave, SizeDoubt
 from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye, lag_tried

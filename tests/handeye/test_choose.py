@@ -9,7 +9,7 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions, Noise, Views, pairs_of_views, splits
 from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Way, choose
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
 from tests.levels import sampled
 from tests.support.handeye import CAMERA, error, handeye, simulated, simulated_views

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from stcal.handeye import handeye
 from stcal.handeye.data.pose_pairs import read_poses
-from stcal.handeye.problem import HandEyeOptions, HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeOptions, HandEyeProblem
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells

@@ -6,7 +6,7 @@ import pytest
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views, splits
 from stcal.handeye.data.pose_pairs import HandEyePoses
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.validate import better_setup
 from tests.levels import sampled
 from tests.support.handeye import disturbed, error, handeye, simulated, simulated_views

@@ -19,7 +19,7 @@ from stcal.handeye import (
     splits,
 )
 from stcal.handeye.data.pose_pairs import Loop, Motions
-from stcal.handeye.problem import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.validate import ERRORS, errors_of
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import handeye, simulated, simulated_views

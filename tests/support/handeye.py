@@ -9,7 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import HandEyePoses, Setup
-from stcal.handeye.problem import HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
 
 FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])
 BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])

@@ -15,7 +15,7 @@ from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import by_robot, image_coverage, outcome_report
 from stcal.handeye.handeye_pipeline import Outcome
-from stcal.handeye.problem import FACTORS
+from stcal.handeye.handeye_problem import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
