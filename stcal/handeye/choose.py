@@ -229,7 +229,7 @@ def choose(
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in chosen.partial])
     result = replace(held_out, mount_from_camera=of_splits).widened(result)
-    result, notes = _widened(result, chosen.candidate, rivals)
+    result, notes = widened(result, chosen.candidate, rivals)
     where = "of the board's origin" if problem.views is None else "at the board"
     return ChosenWay(tried, chosen.candidate, result, held_out, _sentence(tried, chosen, result, where), notes)
 
@@ -243,7 +243,7 @@ def _with_sigma(tried: Tried, problem: HandEyeProblem) -> HandEye:
     return with_common_errors(with_jackknife(solution.result, without_one), problem)
 
 
-def _widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
+def widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
     """Widens σ until they cover the rivals, which predict as well. Returns the result, and notes on distant rivals."""
     factor, notes = 1.0, []
     for each in rivals:
