@@ -1,6 +1,6 @@
 """Lengths in mm: how large hardware is, and the refusal of those that are metres or another unit."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from stcal.errors import InputError
@@ -26,11 +26,6 @@ class Length:
     least: float
     most: float
 
-    @property
-    def plausible(self) -> bool:
-        """True if hardware has such a length; True for an exact zero, which is meant."""
-        return not self.value_mm or self.least <= abs(self.value_mm) <= self.most
-
 
 def side(place: str, value_mm: float) -> Length:
     """Returns the side of a tag or a square, or a pitch."""
@@ -42,14 +37,14 @@ def radius(place: str, value_mm: float) -> Length:
     return Length(place, value_mm, LEAST_RADIUS_MM, MOST_RADIUS_MM)
 
 
-def implausible(lengths: Iterable[Length]) -> Iterator[Length]:
-    """Returns the lengths that no hardware has."""
-    return (each for each in lengths if not each.plausible)
+def _unusual(lengths: Iterable[Length]) -> Length | None:
+    """Returns the first length that no hardware has; an exact zero is meant."""
+    return next((each for each in lengths if each.value_mm and not each.least <= abs(each.value_mm) <= each.most), None)
 
 
 def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> None:
     """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right."""
-    wrong = None if stated else next(implausible(lengths), None)
+    wrong = None if stated else _unusual(lengths)
     if wrong is None:
         return
     small = abs(wrong.value_mm) < wrong.least
@@ -63,4 +58,4 @@ def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> 
 
 def stated_unusual(lengths: Iterable[Length]) -> list[str]:
     """Returns the line of a file that states lengths as meant, where they would be refused without it."""
-    return [f"{KEY} = true"] if next(implausible(lengths), None) is not None else []
+    return [f"{KEY} = true"] if _unusual(lengths) else []

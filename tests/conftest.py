@@ -31,8 +31,10 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
-from stcal.sfm.pipeline import RunOptions, RunResult, run
+from stcal.sfm.pipeline import run
 from stcal.sfm.planning.forecast import observe, true_models
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.run_result import RunResult
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.shared import Once, without_rights

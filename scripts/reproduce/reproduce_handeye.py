@@ -21,8 +21,8 @@ from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
 from stcal.handeye.data.pose_pairs import Loop, Motions
-from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.solving import UNIT_MM, handeye
+from stcal.handeye.handeye_problem import UNIT_MM, HandEyeProblem
+from stcal.handeye.methods.closed_form import Bounds, EvolutionOptions, Objective, evolve, polish
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views
@@ -47,7 +47,7 @@ def trial(seed: int) -> dict:
     found = {"ratios": ratios(truth, fitted, seed), "units": by_unit(truth, fitted)}
     for method in METHODS:
         try:
-            x = handeye(kept[0], truth.setup, method, kept[1]).flange_from_camera
+            x = HandEyeProblem(kept[0], truth.setup, kept[1]).solved(method).result.flange_from_camera
         except StcalError as error:
             found[method] = str(error)
             continue
@@ -62,7 +62,7 @@ def ratios(truth: Truth, motions: Motions, seed: int) -> dict[str, float]:
     objective, flange = Objective(motions, UNIT_MM, 1.0), truth.pairs.base_from_flange
     farthest = float(np.linalg.norm(flange.translation, axis=1).max())
     costs = {}
-    closed = handeye(truth.pairs[: FITTED + 1], truth.setup, "park-martin").flange_from_camera
+    closed = HandEyeProblem(truth.pairs[: FITTED + 1], truth.setup).solved("park-martin").result.flange_from_camera
     for name, options in bounds_of(truth, seed).items():
         x = evolve(objective, options, farthest, closed)
         costs[name] = objective.linear(x).cost

@@ -32,7 +32,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Poses, skew
-from stcal.handeye.solving import handeye
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
 from stcal.robot.identification.identify import identify
@@ -199,7 +199,8 @@ def of_use(draws: int) -> None:
         assert given.views is not None
         values = []
         for parts in drawn_halves(len(given.pairs), draws):
-            one, two = (handeye(given.pairs[own], "eye-to-hand", "reprojection", given.views[own]) for own in parts)
+            halves = (HandEyeProblem(given.pairs[own], "eye-to-hand", given.views[own]) for own in parts)
+            one, two = (half.solved("reprojection").result for half in halves)
             (off,) = Poses.of([one.mount_from_camera]).difference(Poses.of([two.mount_from_camera]))
             assert one.covariance is not None
             assert two.covariance is not None

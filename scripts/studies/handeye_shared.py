@@ -17,8 +17,8 @@ import yaml
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.report.handeye_file import HandEyeFile
-from stcal.handeye.report.handeye_page import outcome_report
+from stcal.handeye.handeye_file import HandEyeFile
+from stcal.handeye.handeye_page import outcome_report
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye_inputs import read_handeye

@@ -19,7 +19,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
 from stcal.handeye.data.corner_views import Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS
-from stcal.handeye.solving import handeye
+from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
@@ -52,7 +52,8 @@ def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> t
     camera = CAMERA.with_parameters(CAMERA.parameters() + intrinsic_basis(PRIOR.colmap_model) @ error)
     views = Views(camera, truth.views.views)
     solved_by, options = CAMERAS[method]
-    found = handeye(pairs_of_views(truth.pairs.base_from_flange, views), setup, solved_by, views, options)
+    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
+    found = HandEyeProblem(pairs, setup, views, options).solved(solved_by).result
     apart = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
     return float(apart @ np.linalg.solve(found.covariance, apart)), float(apart[3:] @ apart[3:])
 

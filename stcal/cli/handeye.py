@@ -15,7 +15,7 @@ from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.handeye.methods.evolution import Bounds
+    from stcal.handeye.methods.closed_form import Bounds
     from stcal.robot import Robot
     from stcal.workflows.handeye_inputs import Files
     from stcal.workflows.robot_at_images import Timing
@@ -67,7 +67,7 @@ class PoseFiles:
 
     def given(self, timing: "Timing", robot: "Robot | None" = None) -> "Files":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-        from stcal.handeye.data.record import Said
+        from stcal.handeye.data.pose_content import Said
         from stcal.workflows.handeye_inputs import Files, one_source
 
         said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
@@ -80,8 +80,6 @@ class PoseFiles:
 
 
 POSE_FILES = PoseFiles()
-SCALED = ("pose", "reprojection")
-"""Methods that can find the board's size."""
 SIGMA, MANY = Opt(min=0), Opt(min=1, max=100_000)
 
 
@@ -160,10 +158,11 @@ def handeye(
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
-    from stcal.handeye.report import transform_export as forms
-    from stcal.handeye.report.handeye_file import HandEyeFile
-    from stcal.handeye.report.handeye_page import outcome_report
-    from stcal.handeye.report.outcome import judged
+    from stcal.handeye import handeye_file as forms
+    from stcal.handeye.handeye_file import HandEyeFile
+    from stcal.handeye.handeye_page import outcome_report
+    from stcal.handeye.handeye_pipeline import judged
+    from stcal.handeye.handeye_problem import SCALED
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.static_transforms import messages
@@ -177,7 +176,6 @@ def handeye(
     timing = Timing(time_tolerance, image_times, time_offset)
     exports = shared.exports_of(export or [], forms.FORMS)
     given, folder = files.given(timing), files.source is not None and files.source.is_dir()
-    by_corners = "only with a folder of images, which show the arm's errors"
     for code, refusals in {
         "E-OPTION-NEEDS": {
             "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given": (
@@ -187,7 +185,6 @@ def handeye(
             "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file": (
                 robot_out and not with_kinematics
             ),
-            f"--with-kinematics: {by_corners}": with_kinematics and not folder,
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name": (
                 (parent or child or camera_frame != "optical") and not (ros or urdf or exports)
             ),
@@ -263,16 +260,14 @@ def handeye(
             write(path, content := text())
             require_same(path, partial(path.read_text, "utf-8"), content)
     write_if(report, document.page)
-    if camera_out:
-        if (adjusted := result.reprojection) is None:
-            by = result.method
-            raise InputError("E-OPTION-METHOD", f"--camera-out: {by} does not adjust the camera; leave --method out")
+    adjusted = result.reprojection  # refused above for methods that adjust nothing
+    if camera_out and adjusted is not None:
         camera_out.parent.mkdir(parents=True, exist_ok=True)
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")
         say(f"written: {camera_out}")
-    if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
-        save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
+    if robot_out and inputs.arm is not None and adjusted is not None and adjusted.arm is not None:
+        save_robot(robot_out, inputs.arm.identified(adjusted.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
     found = judged(outcome)
@@ -281,7 +276,7 @@ def handeye(
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
     """Returns the bounds in a text like ``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
-    from stcal.handeye.methods.evolution import Bounds
+    from stcal.handeye.methods.closed_form import Bounds
 
     if text is None:
         return None
@@ -309,7 +304,7 @@ def plan(
     json_file: shared.JsonFile = None,
 ) -> None:
     """Name further robot poses that would lower the worst σ of a hand-eye calibration, at the board, most."""
-    from stcal.handeye.plan import planned_csv, planned_file, planned_report
+    from stcal.handeye.plan import HandEyePlanFile, planned_csv, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye_run import plan_handeye
@@ -330,7 +325,7 @@ def plan(
     if out:
         frames = ("base_from_flange", "camera_from_board")
         require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
-    write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))
+    write_if(json_file, lambda: HandEyePlanFile.of(planned.result, planned.poses, planned.joints))
 
 
 app = typer.Typer()

@@ -166,10 +166,10 @@ def run(
     from stcal.io.cameras.read import read_camera
     from stcal.io.device import images_or_frames
     from stcal.io.table import require_pose_table_written
-    from stcal.locate.base_chain import goal_chain, goals
+    from stcal.locate.base_chain import accepted, goal_chain, goals, uncertain
     from stcal.locate.exposures import find_scenes
     from stcal.locate.layout import load_layout
-    from stcal.locate.located_report import LocatedFile, accepted, poses_csv, run_report, uncertain
+    from stcal.locate.located_report import LocatedFile, poses_csv, run_report
     from stcal.locate.patent import PatentOptions
     from stcal.locate.scenes import LocateOptions
     from stcal.locate.scenes import run as located

@@ -10,9 +10,8 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
-from stcal.handeye.solving import HandEyeProblem
 from stcal.handeye.validate import (
     HeldOutPoses,
     deciding_error,
@@ -38,8 +37,6 @@ WITHOUT_WEIGHTS = 2.0
 and they know neither σ nor outliers; an adjustment is left only where its weights are clearly wrong."""
 TINY_MM = 1e-9
 """Least standard error of a difference: differences of exact data are rounding."""
-MANY_PERCENT = 99.5
-"""Change of the board's size from which on a factor is clearer than per cent."""
 CONTRADICT = 0.01
 """Significance level: σ are widened if two answers differ so much that their σ explain it more rarely than this."""
 
@@ -105,11 +102,6 @@ class Tried:
         """Mean of all errors, or NaN if there are none."""
         return float(self.error_mm.mean()) if self.error_mm.size else float("nan")
 
-    @property
-    def closed(self) -> bool:
-        """True for a closed form."""
-        return self.candidate in CLOSED_FORMS
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenWay:
@@ -137,11 +129,10 @@ def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried | S
         partial = tuple(solution.without(out) for out in rows)
     except StcalError as error:
         return error
-    unseen, share = (problem[out] for out in rows), 1 - rows.shape[1] / len(problem)
-    errors = [deciding_error(part, own.pairs, own.views) for part, own in zip(partial, unseen, strict=True)]
+    errors = np.array([deciding_error(part, problem[out]) for part, out in zip(partial, rows, strict=True)])
+    share = 1 - rows.shape[1] / len(problem)
     shown_without = tuple(_shown(part, problem, share) for part in partial)
-    shown = _shown(solution.result, problem)
-    return Tried(candidate, np.array(errors), "", solution.result, partial, shown, shown_without)
+    return Tried(candidate, errors, "", solution.result, partial, _shown(solution.result, problem), shown_without)
 
 
 def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool:
@@ -165,7 +156,7 @@ def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tri
         others = np.where(np.isin(rows, rows[split]), -1, rows)
         rows = rows if (others < 0).all() else others  # a single split: no other poses were held out
     shown = [each for each in tried if (each.shown if split is None else each.shown_without[split])]
-    adjusted, closed = ([each for each in shown if each.closed == kind] for kind in (False, True))
+    adjusted, closed = ([e for e in shown if (e.candidate in CLOSED_FORMS) == kind] for kind in (False, True))
     chosen = _first_of(adjusted or closed, rows)
     rival = _first_of(closed, rows) if adjusted and closed else chosen
     return rival if _behind(chosen, rival, rows) > WITHOUT_WEIGHTS else chosen
@@ -225,20 +216,20 @@ def choose(
         result = _with_sigma(chosen, chosen.candidate.of(problem, prior))
     except StcalError as error:
         finished[chosen.candidate] = error
-        able = [each for each in able if not each.closed]
+        able = [each for each in able if each.candidate not in CLOSED_FORMS]
         chosen = _best(able, rows)
         result = _with_sigma(chosen, problem)
     best_of_splits = (_best(able, rows, k).partial[k] for k in range(len(rows)))
     errors = [errors_of(part, problem[out]) for part, out in zip(best_of_splits, rows, strict=True)]
     held_out = HeldOutPoses.of_splits(rows, errors)
-    every = ((candidate, finished[candidate]) for candidate in candidates)
-    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in every)
-    others = (each for each in able if each is not chosen and not each.closed)
+    ways = ((way, finished[way]) for way in candidates)
+    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in ways)
+    others = (each for each in able if each is not chosen and each.candidate not in CLOSED_FORMS)
     rivals = [each for each in others if _behind(each, chosen, rows) <= AS_GOOD]
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in chosen.partial])
     result = replace(held_out, mount_from_camera=of_splits).widened(result)
-    result, notes = _widened(result, chosen.candidate, rivals)
+    result, notes = widened(result, chosen.candidate, rivals)
     where = "of the board's origin" if problem.views is None else "at the board"
     return ChosenWay(tried, chosen.candidate, result, held_out, _sentence(tried, chosen, result, where), notes)
 
@@ -252,18 +243,17 @@ def _with_sigma(tried: Tried, problem: HandEyeProblem) -> HandEye:
     return with_common_errors(with_jackknife(solution.result, without_one), problem)
 
 
-def _widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
+def widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye, tuple[str, ...]]:
     """Widens σ until they cover the rivals, which predict as well. Returns the result, and notes on distant rivals."""
-    factor, notes, pose = 1.0, [], Poses.of([result.mount_from_camera])
+    factor, notes = 1.0, []
     for each in rivals:
         if (rival := each.result) is None or result.covariance is None or rival.covariance is None:
             continue
-        gap = Poses.of([rival.mount_from_camera]).difference(pose)[0]
+        gap = Poses.of([rival.mount_from_camera]).difference(Poses.of([result.mount_from_camera]))[0]
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
         if squared > chi2.ppf(1 - CONTRADICT, 6):
-            ratio = np.sqrt(squared / 6)
+            ratio, turn, shift = np.sqrt(squared / 6), np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             factor = max(factor, ratio)
-            turn, shift = np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             notes.append(
                 f"{each.candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
                 f"{ratio:.2g} times what their σ allow: σ are widened by that"
@@ -284,8 +274,6 @@ def _sentence(tried: tuple[Tried, ...], chosen: Tried, result: HandEye, where: s
     if way.scale and result.sigma_scale is not None:
         percent = 100 * (result.scale - 1)
         size = f"{abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {'larger' if percent > 0 else 'smaller'} than"
-        if abs(percent) >= MANY_PERCENT:
-            size = f"{result.scale:.3g} ± {result.sigma_scale:.1g} times as large as"
         parts.append(f"the board is {size} stated")
     rad, mm = (result.sigma.get(name) for name in ("robot_rad", "robot_mm"))
     if rad is not None and mm is not None and {"robot_rad", "robot_mm"} & set(result.estimated):

@@ -1,23 +1,321 @@
-"""Hand-eye calibration as a whole: a way of solving, and σ that hold for poses that it has not seen."""
+"""Hand-eye calibration as a whole: a way of solving, σ that hold for poses that it has not seen, and the verdict."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import f
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.handeye.choose import choose
+from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
+from stcal.geometry.rigid import skew
+from stcal.handeye.choose import ChosenWay, choose
+from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_pairs import HandEyePoses, LengthUnit, Setup
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import of_setup
-from stcal.handeye.report.outcome import Outcome, judged
-from stcal.handeye.solving import HandEyeOptions, HandEyeProblem
-from stcal.handeye.validate import LEAST_LEFT, refitted, splits
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, LengthUnit, Loop, Setup
+from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.remarks import (
+    BAD,
+    CARE,
+    COMMON_MM,
+    GOOD,
+    MANY,
+    Aside,
+    Finding,
+    Grave,
+    SizeDoubt,
+    Verdict,
+    Word,
+    in_words,
+    of_setup,
+    spoken,
+)
+from stcal.handeye.time_offset import TimeOffset
+from stcal.handeye.validate import LEAST_LEFT, Compared, HeldOutMotions, HeldOutPoses, refitted, splits
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmFound:
+    """The arm's parameters, if they were solved for.
+
+    ``robot`` : name of the robot; ``parameters``, ``sigma`` : by name, such as J2 ry in rad, J2 x in mm, small motions
+    of the axes about the robot's file, and their σ; ``plain`` : errors on the same held-out poses without them.
+    """
+
+    robot: str
+    parameters: dict[str, float]
+    sigma: dict[str, float]
+    plain: HeldOutPoses | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A calibration with everything that its report shows.
+
+    ``where`` : names of the files that were solved; ``result`` : HandEye; ``held_out`` : errors of the result's method
+    on held-out poses; ``compared`` : results of every method, if a comparison was asked for; ``options`` : by which the
+    result was solved; ``pitch_mm`` : pitch of dots or squares, as the board's file states it; ``left_out`` : images and
+    rows that did not take part, and why; ``notes`` : notes in addition to those of the result; ``motions`` : errors of
+    the last motions, held out; ``choice`` : the candidates that were tried, if no method was named; ``pairs``,
+    ``views`` : the poses that were solved, and their corners if there were images; a symmetric board's as numbered;
+    ``understood`` : how files of other programs were interpreted; ``arm`` : the arm's parameters, if they were solved
+    for; ``time_offset`` : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain
+    its σ.
+    """
+
+    where: str
+    result: HandEye
+    held_out: HeldOutPoses | None = None
+    compared: tuple[Compared, ...] = ()
+    options: HandEyeOptions = field(default_factory=HandEyeOptions)
+    pitch_mm: float | None = None
+    left_out: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    motions: HeldOutMotions | None = None
+    choice: ChosenWay | None = None
+    pairs: HandEyePoses | None = None
+    views: Views | None = None
+    understood: tuple[str, ...] = ()
+    arm: ArmFound | None = None
+    time_offset: TimeOffset | None = None
+
+    @property
+    def colmap_model(self) -> str:
+        """Model of the camera whose intrinsics were solved for."""
+        return self.options.intrinsics.colmap_model if self.options.intrinsics else ""
+
+    @property
+    def own_sigmas(self) -> bool:
+        """Whether corners came with covariances. The result's ``corner_px`` is then their factor."""
+        return self.views is not None and all(view.covariance is not None for view in self.views.views)
+
+    def sentence(self) -> str:
+        """Returns what was solved for and what that gains; empty if the user chose what to solve for."""
+        if self.arm is None:
+            return self.choice.sentence if self.choice else ""
+        if self.arm.plain is None or self.held_out is None:
+            return f"solved for the parameters of {self.arm.robot} too"
+        with_arm, without_arm = self.held_out.means(), self.arm.plain.means()
+        return (
+            f"with the parameters of {self.arm.robot} solved for, poses held out are missed by "
+            f"{with_arm['board_mm']:.3g} mm at the board, {without_arm['board_mm']:.3g} mm without"
+        )
+
+    def all_notes(self) -> tuple[str, ...]:
+        """Returns the notes of the result, then those of the choice, then the others."""
+        return (*self.result.notes, *(self.choice.notes if self.choice else ()), *self.notes)
+
+    def outliers(self) -> tuple[str, ...]:
+        """Returns the names of the poses that contradict the others."""
+        return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
+
+    @property
+    def true_pitch_mm(self) -> float | None:
+        """Pitch of dots or squares in the board's true size."""
+        return None if self.pitch_mm is None else self.pitch_mm * self.result.scale
+
+    @property
+    def camera(self) -> dict | None:
+        """COLMAP ``model``, ``parameters`` and their ``sigma`` by name, of intrinsics that were solved for."""
+        found = self.result.reprojection
+        if found is None or found.camera_covariance is None:
+            return None
+        parameters, sigma = found.camera.parameters(), np.sqrt(np.diag(found.camera_covariance))
+        values = dict(zip(PARAMETER_NAMES, parameters, strict=True))
+        sigmas = dict(zip(parameter_names(self.colmap_model), sigma, strict=True))
+        return {"model": self.colmap_model, "parameters": values, "sigma": sigmas}
+
+
+SUSPICIOUS, FAILED = 1e-3, 1e-5
+"""Significance levels of ``use with care`` and of ``do not use``."""
+SHOWN = 3
+"""Number of poses that a sentence names."""
+HALF, MOST = 0.5, 0.9
+"""Limits of the transform's share in the variance of a prediction. Beyond half, more poses help more than a better
+robot or camera would; beyond nine tenths, the error of a prediction is three times that of a pose."""
+AS_ONE, AS_THREE = 1.0, 3.0
+"""Limits of σ in the worst direction, in σ of one pose. They are the same two limits if there is no covariance."""
+WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
+"""Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
+that were never calibrated and poses of single tags stay below half of these."""
+OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
+"""Deviation of a board's size, and in σ, beyond which it is told: printers err by that, measured pitches do not."""
+NOTHING_MM = 1e-6
+"""Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
+
+
+def judged(outcome: Outcome) -> Verdict:
+    """Returns the verdict on a calibration."""
+    kinds = (_of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers)
+    tests = [judge(outcome) for judge in kinds]
+    for note in outcome.all_notes():  # the text behind a note's colon is the remedy
+        if not isinstance(note, Aside):
+            said, _, remedy = note.partition(": ")
+            tests.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
+    return Verdict(tuple(each for each in tests if each is not None))
+
+
+def _of_residuals(outcome: Outcome) -> Finding | None:
+    """Refuses residuals that are too large for a sound robot and camera, even if they predict held-out poses well."""
+    result, used = outcome.result, ~outcome.result.outliers
+    if outcome.pairs is None or not used.any():
+        return None
+    turn, shift = result.rms()
+    away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
+    if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
+        return None
+    size = f"{np.degrees(turn):.2g}°", f"{shift:.3g} mm"
+    said = f"the poses miss one another by {' and '.join(size)} (RMS), {shift / away:.0%} of the board's distance of "
+    said += f"{away:.0f} mm"
+    limit = f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm"
+    remedy = "pair each pose of the board with that of the flange at that time, and check units, directions and camera"
+    remedy = "" if any(isinstance(note, SizeDoubt) for note in outcome.all_notes()) else remedy
+    return Finding("Residuals", BAD, said, ", ".join(size), limit, remedy)
+
+
+def _of_prediction(outcome: Outcome) -> Finding | None:
+    """Tests held-out errors against the residuals: few or contradicting poses predict worse than they fit."""
+    title, result, held = "Poses held out", outcome.result, outcome.held_out
+    if held is None:
+        remedy = "take ten poses or more, or keep the default of --splits"
+        return Finding(title, CARE, "errors on poses held out are not known", remedy=remedy)
+    good = ~result.outliers
+    agreeing = good[held.rows]
+    if not agreeing.any():
+        return None
+    error, fitted = float(np.sqrt((held.translation_mm[agreeing] ** 2).mean())), result.rms()[1]
+    camera_covariance = result.reprojection.camera_covariance if result.reprojection else None
+    unknowns = 12 + (result.sigma_scale is not None) + (0 if camera_covariance is None else len(camera_covariance))
+    unknowns += len(outcome.arm.parameters) if outcome.arm else 0
+    equations, predicting = 6 * int(good.sum()), 6 * (len(good) - held.rows.shape[1])
+    if unknowns >= min(equations, predicting) or fitted < NOTHING_MM:
+        return None
+    # The fit makes residuals smaller than the errors; its own error makes errors on held-out poses larger.
+    expected = (1 + unknowns / predicting) / (1 - unknowns / equations)
+    dof = equations / 2, (equations - unknowns) / 2
+    limits = [fitted * float(np.sqrt(expected * f.ppf(1 - odds, *dof))) for odds in (SUSPICIOUS, FAILED)]
+    word, promised = _word(error, *limits), f"the residuals of {fitted:.3g} mm promise"
+    promise = f"as {promised}" if word == GOOD else f"where {promised} {fitted * np.sqrt(expected):.3g} mm"
+    said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
+    remedy = "take more poses, and look for poses that do not belong to the others"
+    return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
+
+
+def _of_share(outcome: Outcome) -> Finding | None:
+    """Judges the share of the transform's σ in a prediction; unknown with an arm, whose errors cancel the
+    transform's."""
+    if (share := share_of_variance(outcome)) is None or outcome.arm is not None:
+        return None
+    distance, sigma, shift = share
+    part = sigma**2 / (sigma**2 + shift**2)
+    alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
+    said = f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was "
+    said += f"({distance:.0f} mm away), the error of a single pose {shift:.2g} mm (RMS)"
+    remedy, value = "take more poses, and turn the flange more, about two axes", f"{part:.0%} of the variance"
+    return _graded("σ of the transform", _word(part, HALF, MOST), said, value, f"{HALF:.0%}", remedy)
+
+
+def _of_common_errors(outcome: Outcome) -> Finding | None:
+    """Judges what the errors of the board's poses have in common: σ contain it, and more poses do not reduce it."""
+    title, result, pairs = "Common errors of the board's poses", outcome.result, outcome.pairs
+    if (common := result.common_covariance) is None:
+        if pairs is None or pairs.camera_from_board_common is None or result.covariance is not None:
+            return None
+        said = f"{result.method} gives no σ, and the board's poses state errors that all have in common"
+        return Finding(title, CARE, said, remedy="leave --method out: no residual shows these errors, only σ do")
+    if (share := share_of_variance(outcome, common)) is None:
+        return None
+    distance, sigma, shift = share
+    said = f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
+    said += f"{FRAMES[result.setup].camera} where the board was ({distance:.0f} mm away)"
+    remedy = "calibrate the camera better, or solve from the images: more poses do not help"
+    return _graded(title, _word(sigma, shift), said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+
+
+def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
+    """Returns the board's distance, σ there due to the transform (of ``covariance``, by default without common errors),
+    and the RMS error of one pose, all in mm and 3-D."""
+    result, pairs = outcome.result, outcome.pairs
+    if covariance is None and result.covariance is not None:
+        common = result.common_covariance
+        covariance = result.covariance if common is None else result.covariance - common
+    shift, used = result.rms()[1], int((~result.outliers).sum())
+    if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
+        return None
+    place = pairs.camera_from_board.translation[~result.outliers] * result.scale
+    by_turn = -skew(place @ result.mount_from_camera.rotation.T)
+    jacobian = np.concatenate([by_turn, np.tile(np.eye(3), (used, 1, 1))], axis=2)
+    variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
+    distance = float(np.linalg.norm(place, axis=1).mean())
+    return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))
+
+
+def _of_motions(outcome: Outcome) -> Finding | None:
+    """Judges whether the flange turned enough about two axes."""
+    if (seen := outcome.result.observability) is None:
+        return None
+    ratio, (first, second, _) = seen.sigma_mm / COMMON_MM, np.degrees(seen.turns_rad)
+    title, word, limit = "Motions of the flange", _word(ratio, AS_ONE, AS_THREE), f"{AS_ONE:g}"
+    if not np.isfinite(ratio):
+        said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
+        remedy = f"measure where the camera is along this axis, {in_words(seen.axes[0])} of the flange, which a robot "
+        remedy += "with four axes cannot show; or turn the flange about another axis too, without --four-dof"
+        return Finding(title, word, said, "one axis", f"{limit} × σ of a pose", remedy)
+    said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
+    if word != GOOD:
+        said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
+    return _graded(title, word, said, f"{ratio:.2f} × σ of a pose", limit, seen.missing())
+
+
+def _of_size(outcome: Outcome) -> Finding | None:
+    """Judges a board's size that was solved for: where it is far from the stated one, something else may be wrong."""
+    scale, sigma = outcome.result.scale, outcome.result.sigma_scale
+    if sigma is None or abs(scale - 1) <= max(SIZE_SIGMAS * sigma, OTHER_SIZE):
+        return None
+    said = f"the board is {scale:.3g} times as large as stated, or the focal length wrong by as much"
+    remedy = "measure the board, and correct its file or the poses' unit; where it is as stated, check the camera file"
+    return Finding("Size of the board", CARE, said, f"{scale:.3g}", f"1 ± {OTHER_SIZE:g}", remedy)
+
+
+def _of_outliers(outcome: Outcome) -> Finding:
+    """Judges the number of outliers; one good set in a hundred has an outlier."""
+    result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
+    if not bad:
+        return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
+    flips: tuple[str, ...] = ()
+    if outcome.pairs is not None:
+        loop = Loop.of(outcome.pairs, result.setup)
+        tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
+        flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+    others, said, remedies = tuple(name for name in bad if name not in flips), [], []
+    if flips:
+        tilt = "poses are tilted the other way, as the second pose of a flat target is"
+        said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
+        if outcome.views is None:
+            undo = "solve with --undo-flips, which takes the other tilt, or give images, not the board's poses"
+            remedies.append(undo)
+    if others:
+        said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
+        which = _few(others) if flips else "these poses"
+        remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")
+    word = BAD if len(bad) > MANY * count else CARE
+    return Finding("Outliers", word, "; ".join(said), str(len(bad)), "0", "; ".join(remedies))
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(map(spoken, names[:SHOWN])) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+
+
+def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: str) -> Finding:
+    return Finding(title, word, said, value, limit, remedy if word != GOOD else "")
+
+
+def _word(value: float, care: float, bad: float = np.inf) -> Word:
+    return BAD if value > bad else CARE if value > care else GOOD
 
 
 def validated(

@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
-from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.handeye_problem import HandEye
 from stcal.io.json import Pose, ResultFile, Vector
 from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table
@@ -142,8 +142,10 @@ def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
     """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
     the poses, or those from the σ of the result."""
     sigma = result.sigma
-    pairs = ([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")] for side in ("robot", "camera"))
-    robot, camera = (np.diag(np.square(np.repeat(pair, 3))) for pair in pairs)
+    robot, camera = (
+        np.diag(np.square(np.repeat([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")], 3)))
+        for side in ("robot", "camera")
+    )
     if loop.robot_covariance is not None and "robot_rad" not in sigma:
         robot = loop.robot_covariance.mean(0)
     if loop.camera_covariance is not None:
@@ -156,7 +158,7 @@ def _information(loop: Loop, errors: tuple[np.ndarray, np.ndarray], result: Hand
     x, scale = result.mount_from_camera, result.scale
     robot, camera = loop.by_robot(x, scale), loop.by_camera(x, scale)
     spread = robot @ errors[0] @ np.swapaxes(robot, 1, 2) + camera @ errors[1] @ np.swapaxes(camera, 1, 2)
-    jacobian = loop.jacobian(x, scale)[:, :, :12]
+    jacobian = loop.jacobian(x, scale)
     return np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(spread, jacobian)
 
 
@@ -184,7 +186,11 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     base = rng.integers(len(earlier), size=CANDIDATES)
     facing = earlier.rotation[base, :, 2]
     facing = facing * np.sign(np.einsum("ma,ma->m", facing, places[base]))[:, None]
-    straight = _turned_onto(facing, sight) @ earlier.rotation[base]
+    axis = np.cross(facing, sight)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, np.einsum("ma,ma->m", facing, sight))
+    onto = Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None])
+    straight = onto.as_matrix() @ earlier.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -198,14 +204,6 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     pixels = camera.project(points[front].reshape(-1, 3)).reshape(-1, len(outline), 2)
     inside = ((pixels >= MARGIN * size) & (pixels <= (1 - MARGIN) * size)).all((1, 2))
     return poses[np.flatnonzero(front)[inside]]
-
-
-def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotations (m, 3, 3) that turn the unit vectors ``first`` (m, 3) onto ``second`` (m, 3)."""
-    axis = np.cross(first, second)
-    sine = np.linalg.norm(axis, axis=1)
-    angle = np.arctan2(sine, np.einsum("ma,ma->m", first, second))
-    return Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None]).as_matrix()
 
 
 class HandEyePlanFile(ResultFile):
@@ -223,16 +221,29 @@ class HandEyePlanFile(ResultFile):
     turn_rad: Vector = Field(description="of each pose against the nearest pose taken")
     joints: dict[str, Vector] = Field(description="values of the poses by column, deg or mm; empty without a robot")
 
+    @classmethod
+    def of(cls, result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> "HandEyePlanFile":
+        """Returns the file of the planned poses, after those of a result."""
+        return cls(
+            format="stcal handeye plan 1",
+            setup=result.setup,
+            method=result.method,
+            taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
+            sigma_mm=planned.sigma_mm,
+            turn_rad=planned.turn_rad,
+            joints=joints,
+            **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
+        )
+
 
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
     """Returns the report of ``handeye plan``."""
     taken = int((~result.outliers).sum())
-    rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
     heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
-    rows = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]]
-    cells = []
+    rows, cells = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]], []
     for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
-        place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
+        flange = planned.base_from_flange[k]
+        place = [f"{value:.2f}" for value in (*flange.translation, *np.degrees(flange.log()[:3]))]
         rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
         cells.append([f"next {k + 1}", *(f"{values[k]:.3f}" for values in joints.values())])
     last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
@@ -270,17 +281,3 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
         poses = (cell for each in frames.values() for cell in pose_cells(each[k]))
         rows.append([k + 1, *(repr(float(value)) for value in values), *poses])
     return csv_text(rows)
-
-
-def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
-    """Returns the file of the planned poses, for programs."""
-    return HandEyePlanFile(
-        format="stcal handeye plan 1",
-        setup=result.setup,
-        method=result.method,
-        taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
-        sigma_mm=planned.sigma_mm,
-        turn_rad=planned.turn_rad,
-        joints=joints,
-        **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
-    )

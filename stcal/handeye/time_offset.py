@@ -14,10 +14,9 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
-from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.handeye_problem import HandEye
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.noise import UNKNOWNS, Noise
-from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, adjust_poses
 
 WITHIN_S, SCAN_S = 1.0, 0.05
 """Range and step of the scan for a first offset, in s. A robot's motion within one step is smooth."""
@@ -60,12 +59,12 @@ class TimeOffset:
 
     def in_words(self) -> str:
         """Returns the offset with its sign, σ, and the speed of the flange as one sentence."""
-        order = "ahead of" if self.seconds >= 0 else "behind"
-        speed = f"{self.speed_mm_s:.3g} mm/s and {np.degrees(self.speed_rad_s):.3g}°/s"
+        order, sign = ("ahead of", "+") if self.seconds >= 0 else ("behind", "-")
         return (
             f"time offset: {1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms, robot's clock minus camera's: the "
-            f"robot's is {order} the camera's, an image stamped t was taken at t {'+' if self.seconds >= 0 else '-'} "
-            f"{1e3 * abs(self.seconds):.2f} ms of the robot's; the flange moves by {speed} at the images (RMS)"
+            f"robot's is {order} the camera's, an image stamped t was taken at t {sign} {1e3 * abs(self.seconds):.2f} "
+            f"ms of the robot's; the flange moves by {self.speed_mm_s:.3g} mm/s and "
+            f"{np.degrees(self.speed_rad_s):.3g}°/s at the images (RMS)"
         )
 
     def carried(self, result: HandEye) -> HandEye:
@@ -115,13 +114,12 @@ def estimate_offset(
             raise InputError("E-TIME-OFFSET-RANGE", said)
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
-        state = state or LoopState(*closed_form.robust(loop, with_scale))
+        state = state or closed_form.robust(loop, with_scale)
         solution = adjust_poses(loop, state, noise, with_scale)
-        state, speed = solution.state, stream.velocity(at)
+        state, speed, count = solution.state, stream.velocity(at), UNKNOWNS + with_scale
         x, scale = state.mount_from_camera, state.scale
-        count = UNKNOWNS + with_scale
         by_time = loop.by_robot(x, scale) @ speed[:, :, None]
-        jacobian = np.concatenate([loop.jacobian(x, scale)[:, :, :count], by_time], axis=2)
+        jacobian = np.concatenate([loop.jacobian(x, scale, count), by_time], axis=2)
         used = np.flatnonzero(~solution.outliers)
         weighted = np.linalg.solve(solution.covariance[used], jacobian[used])
         inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian[used], weighted))

@@ -15,10 +15,9 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, resect
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Motions, Setup
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.methods.noise import UNKNOWNS
-from stcal.handeye.solving import IN_COMMON, METHODS, HandEyeOptions, HandEyeProblem
+from stcal.handeye.handeye_problem import IN_COMMON, METHODS, HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS
+from stcal.handeye.remarks import Aside, Grave
 from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
@@ -214,14 +213,6 @@ def errors_without(problem: HandEyeProblem, method: str | None, out: np.ndarray)
     return errors_of(result, problem[out])
 
 
-def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
-    """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
-    pairs, arm, adjusted = unseen.pairs, unseen.options.arm, result.reprojection
-    if arm is not None and adjusted is not None and adjusted.arm is not None:
-        pairs = replace(pairs, base_from_flange=arm.poses(adjusted.arm))
-    return predicted(result, pairs, unseen.views) | {"mount_from_camera": result.mount_from_camera.matrix()}
-
-
 @contextmanager
 def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
     """Adds to a DegenerateError the names of the poses ``out``, (k,), that were held out."""
@@ -232,13 +223,40 @@ def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
         raise DegenerateError(error.code, f"without {names}: {error}") from error
 
 
-def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
+def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
+    """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
+    pairs, arm, adjusted, views = unseen.pairs, unseen.options.arm, result.reprojection, unseen.views
+    if arm is not None and adjusted is not None and adjusted.arm is not None:
+        pairs = replace(pairs, base_from_flange=arm.poses(adjusted.arm))
+    loop, x, z, scale = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board, result.scale
+    errors = {"mount_from_camera": x.matrix()}
+    if views is not None:
+        camera, seen = as_adjusted(result, views)
+        by_view, _ = resect(Views(camera, tuple(seen)), pairs.names)
+        chains = list(zip(seen, poses_by_robot(result, loop), by_view, strict=True))
+        off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
+        errors["board_mm"] = np.array([_beside(view, camera, pose) for view, pose, _ in chains])
+        errors["pose_mm"] = np.array([np.linalg.norm(each, axis=1).mean() for each in off])
+        loop, scale = replace(loop, camera_from_board=by_view), 1.0
+    turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
+    return {"rotation_rad": turn, "translation_mm": shift, **errors}
+
+
+def deciding_error(result: HandEye, unseen: HandEyeProblem) -> np.ndarray:
     """Returns errors (k,), mm, that choose among solutions: ``board_mm``, or ``translation_mm`` without views."""
-    if views is None:
-        return predicted(result, pairs, None)["translation_mm"]
-    camera, adjusted_views = as_adjusted(result, views)
-    poses = zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
+    if unseen.views is None:
+        return errors_of(result, unseen)["translation_mm"]
+    camera, seen = as_adjusted(result, unseen.views)
+    poses = zip(seen, poses_by_robot(result, Loop.of(unseen.pairs, result.setup)), strict=True)
     return np.array([_beside(view, camera, pose) for view, pose in poses])
+
+
+def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
+    """Returns the mean distance of the corners from where their rays meet the board's plane at the corner's height."""
+    ray = np.column_stack([camera.normalised_from_pixel(view.xy_px), np.ones(len(view))]) @ camera_from_board.rotation
+    camera_centre, normal = camera_from_board.inverse().translation, view.normals()
+    length = ((view.xyz_board - camera_centre) * normal).sum(1) / (ray * normal).sum(1)
+    return float(np.linalg.norm(camera_centre + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 
 def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
@@ -252,22 +270,6 @@ def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
 def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
     """Returns camera_from_board as the robot's poses give it."""
     return result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
-
-
-def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
-    """Returns the errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views unknown to the result."""
-    loop, x, z = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board
-    scale, at_board = result.scale, {}
-    if views is not None:
-        camera, adjusted_views = as_adjusted(result, views)
-        by_view, _ = resect(Views(camera, tuple(adjusted_views)), pairs.names)
-        chains = zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
-        off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
-        pose_mm = [np.linalg.norm(each, axis=1).mean() for each in off]
-        at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
-        loop, scale = replace(loop, camera_from_board=by_view), 1.0
-    turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
-    return {"rotation_rad": turn, "translation_mm": shift, **at_board}
 
 
 @one_thread()
@@ -323,11 +325,8 @@ def compare(
     problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
     problem.solved("pose")  # raises if the poses themselves are at fault, whatever the method
     rows = splits(len(pairs)) if rows is None else rows
-    compared, told = [], progress or (lambda *_: None)
-    for done, method in enumerate(methods):
-        told(done, len(methods))
-        if method == "reprojection" and views is None:
-            continue
+    compared, methods = [], tuple(each for each in methods if views is not None or each != "reprojection")
+    for done, method in enumerate(methods, 1):
         result, held_out, reason = None, None, ""
         try:
             result = problem.solved(method).result
@@ -335,17 +334,9 @@ def compare(
         except StcalError as error:
             reason = str(error)
         compared.append(Compared(method, result, held_out, reason))
-    told(len(methods), len(methods))
+        if progress is not None:
+            progress(done, len(methods))
     return tuple(compared)
-
-
-def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
-    """Returns the mean distance of the corners from where their rays meet the board's plane at the corner's height."""
-    ray = np.column_stack([camera.normalised_from_pixel(view.xy_px), np.ones(len(view))]) @ camera_from_board.rotation
-    camera_centre = camera_from_board.inverse().translation
-    normal = view.normals()
-    length = ((view.xyz_board - camera_centre) * normal).sum(1) / (ray * normal).sum(1)
-    return float(np.linalg.norm(camera_centre + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 
 def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:

@@ -13,13 +13,13 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.data.inputs import ToldPairs, own_told, read_pairs, read_two, require_own
+from stcal.handeye.conventions import flipped, tilted
+from stcal.handeye.data.pose_content import Said
+from stcal.handeye.data.pose_files import ToldPairs, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pose_pairs import Setup
-from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.conventions import flipped, tilted
-from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.solving import HandEyeProblem
+from stcal.handeye.handeye_problem import HandEyeProblem
+from stcal.handeye.remarks import motions_missing
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -243,7 +243,7 @@ class Files:
                 lines = own_told(source, self.quaternions)
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
-        lines += [f"setup: {setup}, {origin}", count, *spread_text(flange, setup)]
+        lines += [f"setup: {setup}, {origin}", count, *motions_missing(flange, setup)]
         return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 

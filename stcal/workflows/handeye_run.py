@@ -16,11 +16,9 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.handeye_pipeline import validated
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
-from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.solving import HandEyeProblem
+from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
+from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
+from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
 from stcal.io.cameras.camera_model import CameraPrior
@@ -269,7 +267,7 @@ def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
     residuals = loop.residuals(x, result.stand_from_board, result.scale)
     by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
     columns = 12 + (result.sigma_scale is not None)
-    jacobian = np.concatenate([loop.jacobian(x, result.scale)[:, :, :columns], by_time], axis=2)
+    jacobian = np.concatenate([loop.jacobian(x, result.scale, columns), by_time], axis=2)
     size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
     weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
     flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()

@@ -10,9 +10,9 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import TWIST
 from stcal.geometry.rigid import Order, Poses, Rigid
-from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
+from stcal.handeye.data.pose_content import Said, require_each_once
+from stcal.handeye.data.pose_files import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pose_pairs import SIDES, read_side
-from stcal.handeye.data.record import Said, require_each_once
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.table import LENGTHS, read_table
 from stcal.robot import Robot
@@ -101,7 +101,7 @@ class RobotPoses:
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: Said | None = None) -> RobotPoses:
-    """Read the robot's poses in any format of :mod:`stcal.handeye.data.recognise`.
+    """Read the robot's poses in any format of :mod:`stcal.handeye.data.pose_files`.
 
     A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 

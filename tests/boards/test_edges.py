@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.area import solved
+from stcal.boards.area import integrated_step, solved
 from stcal.boards.board_designs import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
-from stcal.boards.edges import crossings, integrated_step
+from stcal.boards.edges import crossings
 from stcal.boards.finders import find_charuco, find_chessboard
 from stcal.boards.tags import corner_blocks, find_tags
 from tests.support.areas import homography, rendered, squares_nees, warped

@@ -25,7 +25,8 @@ from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.data.group_model import detections_csv
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make import make_pattern, sides_of
-from stcal.sfm.pipeline import RunOptions, run
+from stcal.sfm.pipeline import run
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile
 from stcal.synthetic.dataset import write_dataset

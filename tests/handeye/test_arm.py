@@ -9,16 +9,15 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, cross_validate, splits
 from stcal.handeye.data.pose_pairs import SETUPS
-from stcal.handeye.solving import handeye
 from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
 from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.workflows.robot_at_images import Arm
 from tests.boards.drawn import chessboard_mm
-from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
+from tests.handeye.photographed import FLANGE_FROM_CAMERA, PER_MM, looks, photographs
 from tests.outcome import INPUT, assert_error, fails_with
-from tests.support.handeye import simulated_views, squared
+from tests.support.handeye import BASE_FROM_BOARD, handeye, simulated_views, squared
 
 OFF = (1e-3, 0.5)
 """σ of the axes about the robot's file: rad, mm."""

@@ -2,7 +2,6 @@
 
 import re
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +10,10 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
+from stcal.handeye.conventions import repair
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
-from stcal.handeye.judge.conventions import repair
-from stcal.handeye.judge.observable import Observability
-from stcal.handeye.judge.remarks import of_size
-from stcal.handeye.methods.noise import Noise
-from stcal.handeye.solving import handeye
+from stcal.handeye.remarks import Observability
 from stcal.io.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
 from tests.levels import FULL
@@ -29,6 +25,7 @@ from tests.support.handeye import (
     FLANGE_FROM_CAMERA,
     board_corners,
     disturbed,
+    handeye,
     simulated,
     simulated_views,
 )
@@ -79,21 +76,6 @@ def test_parallel_axes_are_refused_with_the_missing_rotation(setup, axis, exact)
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-def test_the_missing_rotation_helps(setup):
-    """Two poses turned by 30° about the axis that the message names, and the same poses are solved."""
-    rng = np.random.default_rng(2)
-    turns = np.outer(rng.uniform(-1, 1, 8), [0, 0, 1.0])
-    alone = seen_from(flange_turned(rng, turns), setup, rng)
-    other = Observability.of(Loop.of(alone, setup)).axes[1]
-    more = seen_from(flange_turned(rng, np.vstack([turns, np.outer([0.52, -0.52], other)])), setup, rng)
-    true = FLANGE_FROM_CAMERA if setup == "eye-in-hand" else BASE_FROM_CAMERA
-    found = handeye(more, setup)
-    assert (true.inverse() @ found.mount_from_camera).angle_rad() < 3e-3
-    sigma = np.sqrt(np.diag(found.covariance))
-    assert 0.01 < sigma[3:].max() < 3
-
-
-@pytest.mark.parametrize("setup", SETUPS)
 def test_motions_that_are_too_small_are_refused(setup):
     pairs = simulated(np.random.default_rng(3), 12, setup, tilt=2e-4).pairs
     refuses("E-HANDEYE-AXES", handeye, pairs, setup)
@@ -119,8 +101,11 @@ def test_four_dof_where_it_does_not_belong():
     options = HandEyeOptions(four_dof=True)
     with fails_with("E-HANDEYE-AXES … four_dof"):
         handeye(simulated(rng, 10).pairs, options=options)
-    with fails_with("E-HANDEYE-AXES"):
-        handeye(seen_from(flange_turned(rng, np.zeros((6, 3))), "eye-in-hand", rng), options=options)
+    still = seen_from(flange_turned(rng, np.zeros((6, 3))), "eye-in-hand", rng)
+    turns = Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", rng.uniform(-1, 1, (12, 1)))
+    at_one_place = turning(Poses(turns.as_matrix(), np.tile([600.0, 0, 500], (12, 1))), 20)
+    for pairs in (still, at_one_place):
+        refuses("E-HANDEYE-AXES", handeye, pairs, options=options)
 
 
 def times(factor: float):
@@ -219,18 +204,13 @@ def test_metres_on_both_sides_are_said():
     assert "--length-unit m" in found.notes[0]
 
 
-def test_both_sides_inverted_put_the_board_behind_the_camera():
-    """It fits, with X and Z exchanged; only the place of the board can tell."""
+def test_a_board_behind_the_camera_is_said():
+    """Both sides inverted fit, with X and Z exchanged; only the place of the board can tell."""
     truth = simulated(np.random.default_rng(9), 10, **NOISE)
-    pairs = HandEyePoses(truth.pairs.base_from_flange.inverse(), truth.pairs.camera_from_board.inverse())
-    found = handeye(pairs)
+    found = handeye(HandEyePoses(truth.pairs.base_from_flange.inverse(), truth.pairs.camera_from_board.inverse()))
     assert found.flange_from_camera.translation == pytest.approx(truth.stand_from_board.translation, abs=2)
     assert found.notes[0].startswith("the board lies behind the camera in all poses")
     assert all(name in found.notes[0] for name in ("flange_from_base", "board_from_camera"))
-
-
-def test_one_board_behind_the_camera_is_named():
-    truth = simulated(np.random.default_rng(9), 10, **NOISE)
     board = list(truth.pairs.camera_from_board)
     board[6] = Rigid(board[6].rotation, -board[6].translation)
     found = handeye(HandEyePoses(truth.pairs.base_from_flange, Poses.of(board)))
@@ -287,34 +267,17 @@ def test_units_of_one_side_are_named(factor, unit):
         handeye(pairs, options=HandEyeOptions(with_scale=True))
 
 
-def test_four_dof_at_one_place():
-    rng = np.random.default_rng(20)
-    turns = Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", rng.uniform(-1, 1, (12, 1)))
-    pairs = turning(Poses(turns.as_matrix(), np.tile([600.0, 0, 500], (12, 1))), 20)
-    with fails_with("E-HANDEYE-AXES"):
-        handeye(pairs, options=HandEyeOptions(four_dof=True))
-
-
-def test_many_outliers_make_the_setup_suspect():
-    pairs = simulated(np.random.default_rng(21), 15, **NOISE).pairs
-    places = pairs.camera_from_board.translation.copy()
-    places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
-    found = handeye(HandEyePoses(pairs.base_from_flange, Poses(pairs.camera_from_board.rotation, places)))
-    assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
-
-
-@pytest.mark.parametrize("moved", [pytest.param(False, marks=FULL), True])
 @pytest.mark.parametrize("sets", [1, pytest.param(40, marks=FULL)])
-def test_a_board_that_was_moved_half_way_is_said(moved, sets):
-    """By 5° and 30 mm, every other pose: too many for outliers. Without, no such note for 40 sets in a row."""
+def test_a_board_that_was_moved_half_way_is_said(sets):
+    """By 5° and 30 mm, every other pose: too many for outliers."""
     said = 0
     for seed in range(sets):
         pairs = simulated(np.random.default_rng(seed), 20, **NOISE).pairs
         away = Rigid.exp([0.05, 0.08, 0.02, 20, 20, 10])
-        board = [p @ away if moved and i % 2 else p for i, p in enumerate(pairs.camera_from_board)]
+        board = [p @ away if i % 2 else p for i, p in enumerate(pairs.camera_from_board)]
         notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(board))).notes
         said += any("the poses fall into two groups" in note for note in notes)
-    assert said >= 0.9 * sets if moved else said == 0
+    assert said >= 0.9 * sets
 
 
 @pytest.mark.parametrize(("what", "row"), [("camera", 12), ("board", 8)])
@@ -373,6 +336,7 @@ def test_sound_poses_do_not_move(sets, most):
     """In the order of their rows; at 1 %, of 200 sets seven or more once in 200 runs."""
     notes = [handeye(simulated(np.random.default_rng(seed), 20, **NOISE).pairs).notes for seed in range(sets)]
     assert sum(any("moved before" in note or "drifts" in note for note in each) for each in notes) <= most
+    assert not any("two groups" in note for each in notes for note in each)
 
 
 @pytest.mark.slow
@@ -484,15 +448,3 @@ def test_rough_poses_of_a_square_board_are_put_right(seed):
     mended = repair(HandEyePoses(truth.pairs.base_from_flange, board), "eye-in-hand", tuple(every[1:]))
     left = np.array([every[k].rotation @ every[t].rotation for k, t in zip(labels, mended.turned, strict=True)])
     assert np.abs(left - left[0]).max() < 1e-9
-
-
-def test_a_board_of_another_size_is_said_of_few_poses_too():
-    """It makes the σ of the robot, and with them those of its own step: 7 poses leave 3.6 of them."""
-    truth = simulated(np.random.default_rng(3), 7, robot=(1e-6, 1e-3), camera=(1e-5, 1e-2))
-    seen = truth.pairs.camera_from_board
-    large = replace(truth.pairs, camera_from_board=Poses(seen.rotation, 1.05 * seen.translation))
-    loop = Loop.of(large, "eye-in-hand")
-    (note,) = of_size(loop, (0.9523, 0.0132), Noise())
-    assert "the board is 0.952" in note
-    assert of_size(loop, (0.9523, 0.03), Noise()) == ()
-    assert of_size(Loop.of(truth.pairs, "eye-in-hand"), (0.9523, 0.0132), Noise()) == ()

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses
-from stcal.handeye.solving import handeye
 from tests.outcome import fails_with
-from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed
+from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed, handeye
 
 
 def scara(rng, count=12, setup="eye-to-hand", sigma=(5e-4, 0.1)):

@@ -1,5 +1,6 @@
 """Boards of every kind in a folder of images."""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -21,9 +22,20 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
-from tests.handeye.photographed import CAMERA, MARGIN_MM, PER_MM, image_from_sheet, sheet_of_dots, take
+from tests.handeye.photographed import (
+    CAMERA,
+    MARGIN_MM,
+    PER_MM,
+    image_from_sheet,
+    looks,
+    photographs,
+    sheet_of_dots,
+    take,
+)
+from tests.handeye.test_cli import CHANCE, EXACT, in_sigmas
 from tests.outcome import fails_with
 from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.handeye import FLANGE_FROM_CAMERA
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
 SLANTED = Rigid(Rotation.from_rotvec([0.5, -0.3, 0.2]).as_matrix(), [-60, -50, 420])
@@ -98,16 +110,6 @@ def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
     assert found.symmetries == ()
 
 
-def test_dots_carry_a_covariance_like_their_errors(tmp_path):
-    """Mean squared error in units of σ²: 2 per dot for true σ; drawing in steps adds to the noise that σ knows."""
-    board, sheet, first = boards()["dots"]
-    cv2.imwrite(str(tmp_path / "a.png"), take(sheet, first, SLANTED))
-    view = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1).views()["a.png"]
-    off = CAMERA.project(SLANTED @ view.xyz_board) - view.xy_px
-    squared = np.einsum("na,nab,nb->n", off, np.linalg.inv(view.covariance_px2), off)
-    assert 0.5 < squared.mean() < 20
-
-
 def test_images_of_centres_are_exact():
     """Against the conics of circles seen aslant from near: their centres are off by a tenth of a pixel."""
     board = dots(corner=(0, 0))
@@ -150,16 +152,6 @@ def test_a_board_that_looks_the_same_after_half_a_turn_is_numbered_up_to_it(tmp_
     assert min(errors) < CORNER_PX < 20 < max(errors)
 
 
-def test_a_strip_hidden_is_said(tmp_path):
-    """Seven of eight columns of a plain board: which one is hidden cannot be known."""
-    board = dots()
-    image = take(*sheet_of_dots(board.xy_mm()[board.xy_mm()[:, 0] < 139], board.radii_mm()[:42]), SLANTED)
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    found = detect_boards(find_images(tmp_path)[0], MODEL, board, workers=1)
-    assert found.views() == {}
-    assert "strip" in found.skipped[0].reason
-
-
 def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
     with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
@@ -167,23 +159,6 @@ def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
-
-
-@pytest.mark.parametrize(
-    ("changed", "reason"),
-    [
-        ({"dictionary": "DICT_4X4_50"}, "no tag of DICT_4X4_50"),
-        ({"rows": 4, "columns": 5}, "of 10 on a board of 4×5"),
-        ({"legacy": True}, "of its tags, as on a board of rows = 6, columns = 8, legacy = false; correct its file"),
-    ],
-)
-def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):
-    design, sheet, first = charuco()
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / "0.png"), take(sheet, first, SLANTED))
-    files, _ = find_images(tmp_path / "images")
-    found = detect_boards(files, MODEL, replace(design, **changed), workers=1)
-    assert reason in found.skipped[0].reason
 
 
 def test_the_radius_of_circles_may_be_unknown(tmp_path):
@@ -224,3 +199,45 @@ def test_several_boards_are_one(tmp_path):
     found = detect_boards(find_images(tmp_path)[0], MODEL, both, workers=1)
     assert len(found.views()["a.png"]) <= len(own.xy_mm())
     assert found.unused()[0].startswith("board 2: no tag of the AprilGrid")
+
+
+SET = """type = "boards"
+[[board]]
+type = "charuco"
+rows = 6
+columns = 8
+square_mm = 20.0
+marker_mm = 10.0
+dictionary = "5X5_50"
+[[board]]
+type = "aprilgrid"
+rows = 3
+columns = 4
+tag_mm = 25.0
+spacing = 0.3
+x_mm = -165.0
+y_mm = 105.0
+z_mm = 30.0
+rpy_deg = [0.0, 30.0, 0.0]
+"""
+
+
+@pytest.mark.slow
+def test_several_boards_are_solved_as_one(command, tmp_path):
+    """Eye-in-hand, without errors of the robot: within chance of its σ, and within 0.2 mm; `--dry-run` says what the
+    board is."""
+    seen = looks(np.random.default_rng(21), 8, np.array([10, 60]), 1.0)
+    _, sheet, first = charuco()
+    files, out = photographs(tmp_path, sheet, first, seen, SET), tmp_path / "h.json"
+    for i, pose in enumerate(seen):
+        cv2.imwrite(str(files.images / f"{i}.png"), photograph_of_both(pose))
+    code, shown, _ = command(*files.arguments(), "--dry-run")
+    assert code == 0
+    assert "2 boards" in shown
+    options = ("--workers", 1, "--splits", 0, "--method", "reprojection", "--out", out)
+    code, shown, err = command(*files.arguments(), *options, *EXACT)
+    assert code == 0, err
+    data = json.loads(out.read_text())
+    assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
+    off = Rigid.from_matrix(data["flange_from_camera"]).translation - FLANGE_FROM_CAMERA.translation
+    assert np.linalg.norm(off) < 0.2

@@ -1,8 +1,6 @@
 """Corners of a ChArUco board on a real robot, static camera: the camera file has no distortion, and the board is 0.5 %
 larger than stated. Errors on poses held out are those of its photographs, in ``test_shared_sets``."""
 
-import csv
-
 import numpy as np
 import pytest
 import yaml
@@ -10,8 +8,8 @@ import yaml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, pairs_of_views
-from stcal.handeye.solving import handeye
 from stcal.io.cameras.camera_model import camera_prior
+from tests.support.handeye import handeye
 
 
 @pytest.fixture(scope="module")
@@ -19,18 +17,13 @@ def charuco(shared_data):
     folder = shared_data("charuco_handeye")
     k = yaml.safe_load((folder / "test_set_charuco" / "cal_data.yaml").read_text())["intrinsics"]
     camera = Camera(1600, 1200, [k["fx"], k["fy"]], [k["cx"], k["cy"]], np.zeros(8))
-    rows = list(csv.DictReader((folder / "charuco_corners_opencv4.14.csv").read_text().splitlines()))
-    values = np.array([[float(row[c]) for c in ("image", "X_m", "Y_m", "u_px", "v_px")] for row in rows])
-    views, poses = [], []
-    for i in range(16):
-        own = values[values[:, 0] == i]
-        xyz = np.column_stack([1000 * own[:, 1:3], np.zeros(len(own))])
-        views.append(View(xyz, own[:, 3:]))
-        pose = yaml.safe_load((folder / "test_set_charuco" / "poses" / f"{i}.yaml").read_text())
-        poses.append([pose[c] for c in ("qw", "qx", "qy", "qz", "x", "y", "z")])
-    poses = np.array(poses)
+    rows = np.genfromtxt(folder / "charuco_corners_opencv4.14.csv", delimiter=",", names=True)
+    image, u, v = rows["image"], rows["u_px"], rows["v_px"]
+    xyz, px = 1000 * np.column_stack([rows["X_m"], rows["Y_m"], 0 * u]), np.column_stack([u, v])
+    views = Views(camera, tuple(View(xyz[image == i], px[image == i]) for i in range(16)))
+    files = [yaml.safe_load((folder / "test_set_charuco" / "poses" / f"{i}.yaml").read_text()) for i in range(16)]
+    poses = np.array([[pose[c] for c in ("qw", "qx", "qy", "qz", "x", "y", "z")] for pose in files])
     flange = Poses.from_quaternions(poses[:, :4], 1000 * poses[:, 4:])
-    views = Views(camera, tuple(views))
     prior = camera_prior(Camera.of(camera, "OPENCV"))
     return pairs_of_views(flange, views, tuple(f"{i}.png" for i in range(16))), views, prior
 

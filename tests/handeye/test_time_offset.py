@@ -1,15 +1,18 @@
 """The clocks' offset: found with true σ where the robot moves, refused where it stands."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.handeye.solving import handeye
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from tests.outcome import fails_with, refuses
-from tests.support.handeye import squared
+from tests.handeye.photographed import BOARD, write_poses
+from tests.outcome import INPUT, assert_error, fails_with, refuses
+from tests.support.handeye import handeye, squared
 from tests.support.handeye_stream import StreamTruth, simulated_stream
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
@@ -67,3 +70,97 @@ def test_what_does_not_do_is_said():
     truth = simulated_stream(np.random.default_rng(5), 8)
     refuses("E-TIME-OFFSET-FEW … 3 … 4", estimate_offset, truth.pairs[:3], truth.stream, truth.seconds[:3])
     refuses("E-TIME-OFFSET-RANGE … 0 … 8 … 67%", estimate_offset, truth.pairs, truth.stream, truth.seconds + 100)
+
+
+CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
+
+
+def tum(path: Path, times: np.ndarray, poses: Poses) -> Path:
+    rows = []
+    for time, pose, (w, x, y, z) in zip(times, poses, poses.quaternions(), strict=True):
+        place = " ".join(f"{v / 1000:.9f}" for v in pose.translation)
+        rows.append(f"{1700000000 + time:.6f} {place} {x:.12f} {y:.12f} {z:.12f} {w:.12f}")
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def two_files(folder: Path, truth: StreamTruth, late: float = 0.0) -> list:
+    """``late`` : s that the camera's times are later than they are."""
+    robot = tum(folder / "robot.txt", truth.stream.seconds, truth.stream.base_from_flange)
+    camera = tum(folder / "camera.txt", truth.seconds + late, truth.pairs.camera_from_board)
+    return ["--a", robot, "--b", camera, "--poses-are", "base_from_flange", "--poses-are", "camera_from_board"]
+
+
+def off(data: dict, truth: StreamTruth) -> np.ndarray:
+    found = Poses.of([Rigid.from_matrix(data["flange_from_camera"])])
+    return found.difference(Poses.of([truth.mount_from_camera]))[0]
+
+
+@pytest.mark.slow
+def test_the_offset_is_found_and_used(command, tmp_path):
+    truth = simulated_stream(np.random.default_rng(7), 16)
+    files = two_files(tmp_path, truth)
+    out = tmp_path / "h.json"
+    code, shown, error = command(*files, "--time-offset", "--splits", 0, "--method", "pose", "--out", out)
+    assert code == 0, error
+    found = json.loads(out.read_text())
+    offset = found["time_offset"]
+    assert abs(offset["seconds"] - 0.023) < 3 * offset["sigma_s"] < 2e-3
+    assert "robot's clock minus camera's: the robot's is ahead of the camera's" in shown
+    wrong = off(found, truth)
+    assert wrong @ np.linalg.solve(np.array(found["covariance"]), wrong) < 22.5  # χ² of 6, once in a thousand
+    code, shown, _ = command(*files, "--splits", 0, "--method", "pose", "--out", tmp_path / "plain.json")
+    plain = json.loads((tmp_path / "plain.json").read_text())
+    assert code == 0
+    assert "time_offset" not in plain
+    assert plain["rms"]["translation_mm"] > 5 * found["rms"]["translation_mm"]
+    assert "poses by time: 16 times in 1200 samples of robot.txt: 16 interpolated (cubic; samples 0.02 s apart" in shown
+
+
+def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:
+    """A folder of images that no one looks at, and a stream with a column time_s."""
+    truth = simulated_stream(np.random.default_rng(3), 4)
+    (folder / "images").mkdir()
+    for name in names:
+        (folder / "images" / name).write_bytes(b"x")
+    poses = {f"{t:.3f}": pose for t, pose in zip(times, truth.stream.base_from_flange, strict=False)}
+    write_poses(folder / "robot.csv", poses, "time_s")
+    (folder / "board.toml").write_text(BOARD)
+    (folder / "cameras.txt").write_text(CAMERA)
+    files = [("--poses", "robot.csv"), ("--camera", "cameras.txt"), ("--board", "board.toml")]
+    return [folder / "images", *(word for option, name in files for word in (option, folder / name))]
+
+
+def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
+    names = ["100.105.png", "100.300.png", "100.6017.png", "200.5.png"]
+    given = photographs(tmp_path, names, 100 + np.arange(40) * 0.02)
+    code, shown, error = command(*given, "--dry-run")
+    assert code == 0, error
+    assert "poses by time: 4 times in 40 samples of robot.csv: 1 at a sample, 2 interpolated" in shown
+    assert "images: 3 of 4 with a pose of the robot" in shown
+    assert "left out 200.5.png: 99.72 s after the samples of robot.csv" in shown
+
+
+def test_times_of_images_in_a_file(command, tmp_path):
+    given = photographs(tmp_path, ["a.png", "b.png", "c.png"], 100 + np.arange(40) * 0.02)
+    times = tmp_path / "times.csv"
+    times.write_text("image,time_s\na,100.105\nb.png,100.3\n")
+    code, shown, error = command(*given, "--dry-run", "--image-times", times)
+    assert code == 0, error
+    assert "1 at a sample, 1 interpolated" in shown
+    assert "left out c.png: no time in" in shown
+    said = "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)"
+    assert_error(command(*given, "--dry-run"), INPUT, said)
+    for row, said in (("a,soon", "time_s of a.png is 'soon', a number of"), ("z,1.5", "no row is of an image: z")):
+        times.write_text(f"image,time_s\n{row}\n")
+        assert_error(command(*given, "--dry-run", "--image-times", times), INPUT, said)
+
+
+def test_the_nearest_sample_stands_within_the_tolerance(command, tmp_path):
+    given = photographs(tmp_path, ["100.05.png", "102.3.png", "103.9.png"], 100 + np.arange(6) * 1.0)
+    code, shown, error = command(*given, "--dry-run", "--time-tolerance", 0.15)
+    assert code == 0, error
+    assert "2 by the nearest sample, up to 0.1 s away (0.15 s allowed), 1 left out" in shown
+    assert "left out 102.3.png: in a gap of 1 s of robot.csv, 0.25 s allowed; the nearest sample is 0.3 s away" in shown
+    outcome = command(*given, "--dry-run", "--time-tolerance", 0.01)
+    assert_error(outcome, INPUT, "no image has a pose: 100.05.png")

@@ -13,16 +13,17 @@ import pytest
 
 from stcal.boards.board_file import load_board, load_flat_board
 from stcal.boards.target_file import load_boards, load_target
+from stcal.design import StatedSize
 from stcal.errors import InputError, InputNote, StcalError
-from stcal.handeye.data.inputs import read_pairs, require_own
-from stcal.handeye.data.record import Said
+from stcal.handeye.data.pose_content import Said
+from stcal.handeye.data.pose_files import read_pairs, require_own
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.urdf import load_urdf
-from stcal.sfm.budget.sources import StatedSize, statement_of
+from stcal.sfm.budget.sources import statement_of
 from stcal.workflows.robot_at_images import read_robot_poses
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))

@@ -11,7 +11,8 @@ from stcal.sfm import run
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, second_design
+from stcal.synthetic.designs import second_design
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.outcome import fails_with
 
 CIRCLES = AsymmetricCirclesDesign(11, 5, 20.0, 6.0, "dark")

@@ -13,12 +13,13 @@ from stcal.labels import DotLabel
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.pipeline import require_dots
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.task import require_dots
 from stcal.synthetic.dataset import image_name, write_dataset
+from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm
 from tests.outcome import fails_with
 

@@ -8,7 +8,8 @@ from stcal.boards.target_file import load_target
 from stcal.sfm import run
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+from stcal.synthetic.designs import second_design
+from stcal.synthetic.scene import SceneOptions, make_scene
 
 
 @pytest.fixture(scope="module")

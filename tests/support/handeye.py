@@ -9,7 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import HandEyePoses, Setup
-from stcal.handeye.handeye_result import HandEye
+from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
 
 FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])
 BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])
@@ -37,8 +37,7 @@ def simulated(
     camera: tuple[float, float] = (0.0, 0.0),
     tilt: float = 0.5,
 ) -> Truth:
-    """Pose pairs; σ (rad, mm) of robot and camera are those of :class:`~stcal.handeye.methods.noise.Noise`; ``tilt`` in
-    rad."""
+    """Pose pairs; σ (rad, mm) of robot and camera are those of :class:`~stcal.handeye.Noise`; ``tilt`` in rad."""
     camera_from_board, base_from_flange, x, z = _poses(rng, count, setup, tilt)
     pairs = HandEyePoses(disturbed(rng, base_from_flange, *robot), disturbed(rng, camera_from_board, *camera))
     return Truth(pairs, None, x, z, setup)
@@ -66,6 +65,17 @@ def simulated_views(
     )
     views = Views(camera, views)
     return Truth(pairs_of_views(disturbed(rng, base_from_flange, *robot), views), views, x, z, setup)
+
+
+def handeye(
+    pairs: HandEyePoses,
+    setup: Setup = "eye-in-hand",
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+) -> HandEye:
+    """One method's result, with σ from its own residuals."""
+    return HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).solved(method).result
 
 
 def error(found: HandEye, truth: Truth) -> np.ndarray:

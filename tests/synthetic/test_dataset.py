@@ -10,8 +10,9 @@ from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
 from stcal.io.cameras.read import read_camera
 from stcal.synthetic.dataset import TruthFile, write_dataset
+from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import refuses
 
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points
 from tests.outcome import refuses
 from tests.support.circle_images import area_and_centroid
 

@@ -8,7 +8,8 @@ import pytest
 from stcal.design import TargetDesign, reference_target
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
+from stcal.synthetic.designs import second_design
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points
 from tests.outcome import fails_with, refuses
 from tests.support.circle_images import area_and_centroid, simulate_centres
 

@@ -152,10 +152,9 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
         with suppress(DegenerateError):
             starts.append(camera_from_plane(fit_homography(xyz[:, :2], seen[rows])) @ board_from_plane.inverse())
     if not starts:
-        seen_of_each = "of each board are fewer than four or " * (view.normal is not None)
-        raise DegenerateError(
-            "E-VIEW-CORNERS", f"{name}: the corners seen {seen_of_each}lie on a line; take the image out"
-        )
+        which = "of each board are fewer than four or " * (view.normal is not None)
+        said = f"{name}: the corners seen {which}lie on a line; take the image out"
+        raise DegenerateError("E-VIEW-CORNERS", said)
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():
@@ -179,18 +178,12 @@ def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
         height = view.xyz_board[alike] @ normal
         order = np.argsort(height, kind="stable")
         steps = np.flatnonzero(np.diff(height[order]) > APART * extent) + 1
+        turn = np.eye(3)
+        if normal[2] <= SAME_COSINE:
+            x = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
+            x /= np.linalg.norm(x)
+            turn = np.column_stack([x, np.cross(normal, x), normal])
         for group in np.split(order, steps):
             if len(group) >= LEAST_CORNERS:
-                rows = np.sort(alike[group])
-                turn = _turn_to(normal)
-                planes.append((rows, Rigid(turn, turn @ [0, 0, height[group].mean()])))
+                planes.append((np.sort(alike[group]), Rigid(turn, turn @ [0, 0, height[group].mean()])))
     return planes
-
-
-def _turn_to(normal: np.ndarray) -> np.ndarray:
-    """Returns a rotation (3, 3) that takes Z to a unit vector; the identity where the vector is Z."""
-    if normal[2] > SAME_COSINE:
-        return np.eye(3)
-    across = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
-    x = across / np.linalg.norm(across)
-    return np.column_stack([x, np.cross(normal, x), normal])

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,23 +114,19 @@ class HandEyePoses(Brief):
 
     def _check_copies(self):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
-        flange, board = self.base_from_flange, self.camera_from_board
-        first: dict[bytes, int] = {}
-        same = ((first.setdefault(content, i), i) for i, content in enumerate(_bytes(board)))
-        copies = [(j, i) for j, i in same if j != i]
-        for j, i in copies:
-            pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
-            moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
-            turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
-            if moved == 0 and turned < 1e-12:
-                more = f", and {len(copies) - 1} more pairs" if len(copies) > 1 else ""
-                out = "one of each" if more else "one of them"
-                raise InputError("E-POSES-IDENTICAL", f"{pair}{more} are identical poses; take {out} out")
-            raise InputError(
-                "E-POSES-IDENTICAL",
-                f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
-                f"{np.degrees(turned):.3g}°; give each its own pose of the board",
-            )
+        flange, copies = self.base_from_flange, _copies(self.camera_from_board)
+        if not copies:
+            return
+        i, j = min((i, same[0]) for same in copies for i in same[1:])
+        pair, others = f"{self.where}: {self.names[j]} and {self.names[i]}", sum(map(len, copies)) - len(copies) - 1
+        moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
+        turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
+        said = f": the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
+        said += f"{np.degrees(turned):.3g}°; give each its own pose of the board"
+        if moved == 0 and turned < 1e-12:
+            more, out = (f", and {others} more pairs", "one of each") if others else ("", "one of them")
+            said = f"{more} are identical poses; take {out} out"
+        raise InputError("E-POSES-IDENTICAL", f"{pair}{said}")
 
     def require_moving_flange(self):
         """Refuse poses of the flange that are equal to the last digit while the board moved about it.
@@ -138,18 +134,15 @@ class HandEyePoses(Brief):
         Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
         board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
         """
-        board, rows = self.camera_from_board, {}
-        for i, content in enumerate(_bytes(self.base_from_flange)):
-            rows.setdefault(content, []).append(i)
-        copies = [same for same in rows.values() if len(same) > 1]
+        board, copies = self.camera_from_board, _copies(self.base_from_flange)
         if not copies:
             return
         usual = np.median(apart(board, np.arange(len(self))), axis=0)
-        stale = [same for same in copies if (apart(board, np.array(same)) > STALE * usual).all(1).any()]
+        stale = [same for same in copies if (apart(board, same) > STALE * usual).all(1).any()]
         if stale:
             same = max(stale, key=len)
             named = ", ".join(self.names[i] for i in same[:3]) + (" …" if len(same) > 3 else "")
-            turn, shift = apart(board, np.array(same)).max(0)
+            turn, shift = apart(board, same).max(0)
             raise InputError(
                 "E-POSES-IDENTICAL",
                 f"{self.where}: {named}: the flange's pose is the same to the last digit in {len(same)} rows, while "
@@ -158,8 +151,12 @@ class HandEyePoses(Brief):
             )
 
 
-def _bytes(poses: Poses) -> list[bytes]:
-    return [r.tobytes() + t.tobytes() for r, t in zip(poses.rotation, poses.translation, strict=True)]
+def _copies(poses: Poses) -> list[np.ndarray]:
+    """Returns the rows of poses that are equal to the last digit, for each such pose, in order of the first one."""
+    values = np.column_stack([poses.rotation.reshape(-1, 9), poses.translation])
+    inverse = np.unique(values, axis=0, return_inverse=True)[1].ravel()
+    groups = (np.flatnonzero(inverse == k) for k in np.flatnonzero(np.bincount(inverse) > 1))
+    return sorted(groups, key=lambda same: int(same[0]))
 
 
 STALE = 0.2
@@ -250,23 +247,18 @@ SETUPS: tuple[str, ...] = get_args(Setup)
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of the frame that carries the camera and of the frame that carries the board."""
+    """The frames that carry camera and board, and the names of mount_from_camera and stand_from_board."""
 
     mount: str
     stand: str
-
-    @property
-    def camera(self) -> str:
-        """Name of mount_from_camera."""
-        return f"{self.mount}_from_camera"
-
-    @property
-    def board(self) -> str:
-        """Name of stand_from_board."""
-        return f"{self.stand}_from_board"
+    camera: str
+    board: str
 
 
-FRAMES = {"eye-in-hand": Frames("flange", "base"), "eye-to-hand": Frames("base", "flange")}
+FRAMES = {
+    "eye-in-hand": Frames("flange", "base", "flange_from_camera", "base_from_board"),
+    "eye-to-hand": Frames("base", "flange", "base_from_camera", "flange_from_board"),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,20 +301,17 @@ class Loop:
 
     def chain(self, mount_from_camera: Rigid, scale: float = 1.0) -> Poses:
         """Returns stand_from_board by each pose; the camera's lengths are multiplied by ``scale``."""
-        camera = self.camera_from_board
-        if scale != 1:
-            camera = Poses(camera.rotation, scale * camera.translation)
-        return self.stand_from_mount @ mount_from_camera @ camera
+        seen = self.camera_from_board
+        return self.stand_from_mount @ mount_from_camera @ Poses(seen.rotation, scale * seen.translation)
 
     def residuals(self, mount_from_camera: Rigid, stand_from_board: Rigid, scale: float = 1.0) -> np.ndarray:
         """Returns the residuals of the chains against ``stand_from_board``, (m, 6): rad, and mm at the board's origin;
         stand axes."""
-        chain = self.chain(mount_from_camera, scale)
-        return chain.difference(Poses.of([stand_from_board] * len(self)))
+        return self.chain(mount_from_camera, scale).difference(Poses.of([stand_from_board] * len(self)))
 
-    def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
-        """Returns the derivative (m, 6, 13) of :meth:`residuals` by left perturbations of X and Z, and by the scale;
-        that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""
+    def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0, count: int = 12) -> np.ndarray:
+        """Returns the derivative (m, 6, 12 or 13) of :meth:`residuals` by left perturbations of X and Z, and by the
+        scale; that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""
         to_stand = self.stand_from_mount.rotation
         arm = self.camera_from_board.translation @ mount_from_camera.rotation.T
         derivative = np.zeros((len(self), 6, 13))
@@ -330,7 +319,7 @@ class Loop:
         derivative[:, 3:, :3] = -to_stand @ skew(scale * arm)
         derivative[:, :, 6:12] = -np.eye(6)
         derivative[:, 3:, 12] = np.einsum("mij,mj->mi", to_stand, arm)
-        return derivative
+        return derivative[:, :, :count]
 
     def by_camera(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
         """Returns the derivative (m, 6, 6) of :meth:`residuals` by left perturbations of camera_from_board."""
@@ -345,6 +334,19 @@ class Loop:
         arm = self.chain(mount_from_camera, scale).translation - self.stand_from_mount.translation
         derivative[:, 3:, :3] = -skew(arm)
         return derivative @ inverse_jacobian(self.stand_from_mount.inverse()) if self.inverted else derivative
+
+
+class LoopState(NamedTuple):
+    """The unknowns of a loop: X, Z and the board's scale."""
+
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    scale: float = 1.0
+
+    def moved(self, step: np.ndarray) -> "LoopState":
+        """Returns the state after left perturbations of X and Z and a change of the scale, (12,) or (13,)."""
+        x, z = self.mount_from_camera.moved(step[:6]), self.stand_from_board.moved(step[6:12])
+        return LoopState(x, z, self.scale + float(step[12:].sum()))
 
 
 LARGEST_RAD = np.radians(170)

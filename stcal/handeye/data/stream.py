@@ -147,35 +147,33 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     taken from the nearest sample within the tolerance."""
     samples = stream.seconds
     after = np.clip(np.searchsorted(samples, seconds), 1, len(samples) - 1)
-    before = after - 1
-    nearest = np.where(seconds - samples[before] <= samples[after] - seconds, before, after)
-    gap_s, spacing = np.abs(samples[nearest] - seconds), samples[after] - samples[before]
-    inside = (seconds >= samples[0]) & (seconds <= samples[-1]) & (spacing <= LONGEST_S)
-    same = gap_s < SAME_S
-    kept = inside | same | (gap_s <= tolerance_s)
-    at = np.where(inside & ~same, seconds, samples[nearest])
-    why = []
+    nearest = np.where(seconds - samples[after - 1] <= samples[after] - seconds, after - 1, after)
+    gap_s, spacing = np.abs(samples[nearest] - seconds), samples[after] - samples[after - 1]
+    same, covered = gap_s < SAME_S, (seconds >= samples[0]) & (seconds <= samples[-1])
+    between = covered & (spacing <= LONGEST_S) & ~same
+    nearby = ~between & ~same & (gap_s <= tolerance_s)
+    kept, why = between | same | nearby, []
     for k, time in enumerate(seconds):
-        away = f"{gap_s[k]:.4g} s"
-        reason = f"{away} {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
-        if samples[0] <= time <= samples[-1]:
-            allowed = f"{LONGEST_S:g} s allowed; the nearest sample is {away} away"
-            reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {allowed}"
+        reason = f"{gap_s[k]:.4g} s {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
+        if covered[k]:
+            reason = (
+                f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed; the nearest sample is "
+            )
+            reason += f"{gap_s[k]:.4g} s away"
         why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
-    interpolated, nearby = inside & ~same, kept & ~inside & ~same
-    parts = [f"{int(same.sum())} at a sample"] if same.any() else []
-    if interpolated.any():
+    parts = [f"{same.sum()} at a sample"] if same.any() else []
+    if between.any():
         turn, shift = stream.rest()
         noise = "" if np.isnan(turn) else f", each within {shift:.2g} mm and {np.degrees(turn):.2g}° of the others"
-        spaced = f"cubic; samples {stream.spacing_s():.3g} s apart{noise}"
-        parts.append(f"{int(interpolated.sum())} interpolated ({spaced})")
+        parts.append(f"{between.sum()} interpolated (cubic; samples {stream.spacing_s():.3g} s apart{noise})")
     if nearby.any():
         farthest = f"up to {gap_s[nearby].max():.3g} s away ({tolerance_s:g} s allowed)"
-        parts.append(f"{int(nearby.sum())} by the nearest sample, {farthest}")
-    if len(seconds) > kept.sum():
-        parts.append(f"{len(seconds) - int(kept.sum())} left out")
+        parts.append(f"{nearby.sum()} by the nearest sample, {farthest}")
+    if not kept.all():
+        parts.append(f"{(~kept).sum()} left out")
     message = f"poses by time: {len(seconds)} times in {len(samples)} samples of {stream.where}: {', '.join(parts)}"
-    return Taken(kept, stream.at(at[kept]) if kept.any() else Poses.of([]), tuple(why), message)
+    at = np.where(between, seconds, samples[nearest])[kept]
+    return Taken(kept, stream.at(at) if kept.any() else Poses.of([]), tuple(why), message)
 
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:

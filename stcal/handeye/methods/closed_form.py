@@ -1,16 +1,17 @@
-"""OpenCV's closed-form methods by their authors' names, linear solutions of the loop from subsets of the poses, and
-Zhao's convex method."""
+"""Methods that solve AX = XB or AX = ZB: closed forms, Zhao's convex method, differential evolution (Jin et al.)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy.optimize import minimize, nnls
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.rigid import Poses, Rigid, best_rotations
-from stcal.handeye.data.pose_pairs import Loop, Motions
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.arrays import require_fields
+from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.rigid import Poses, Rigid, best_rotations, skew
+from stcal.handeye.data.pose_pairs import Loop, LoopState, Motions
 from stcal.io.device import quiet_opencv
 
 SUBSETS = 200
@@ -23,7 +24,7 @@ SEED = 0
 """Seed of the subsets, so that they are the same every time."""
 
 
-def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+def robust(loop: Loop, with_scale: bool = False) -> LoopState:
     """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation.
 
     The product needs no weight between the two units. Translations are in units of the board, since a board shrunk to
@@ -52,10 +53,10 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
         if np.median(new_turn) * np.median(new_shift) < np.median(turn) * np.median(shift):
             parts, best = again, 0
     x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
-    return Rigid(x, t_x), Rigid(z, t_z), float(scale)
+    return LoopState(Rigid(x, t_x), Rigid(z, t_z), float(scale))
 
 
-def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> LoopState:
     """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along it.
     Translations give the angle about it, and the scale."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
@@ -85,7 +86,7 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
     scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
     t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
-    return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
+    return LoopState(*slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale)
 
 
 def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid, Rigid]:
@@ -111,15 +112,12 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
 
 def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
     """Returns the shortest t_X and t_Z (s, 3), and scales (s,), for R_X: R_G t_X + s R_G R_X t_C − t_Z = −t_G."""
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    hand, eye, s = loop.stand_from_mount, loop.camera_from_board, len(subsets)
     rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
     moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
-    right = -hand.translation[subsets]
+    right = -hand.translation[subsets] - (0 if with_scale else moved)
     if with_scale:
         rows = np.concatenate([rows, moved[..., None]], axis=3)
-    else:
-        right = right - moved
-    s = len(subsets)
     solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
     return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
 
@@ -128,13 +126,11 @@ def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
     """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
     infinite for a board of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
-    chain = hand.rotation @ (x[:, None] @ eye.rotation)
-    cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
+    cosine = (np.einsum("smab,sab->sm", hand.rotation @ (x[:, None] @ eye.rotation), z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)
-    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(size < LEAST_SCALE, np.inf, shift.T / size).T
+    shift, size = np.linalg.norm(at + hand.translation - t_z[:, None], axis=2), np.abs(scale)[:, None]
+    shift = np.where(size < LEAST_SCALE, np.inf, shift / np.maximum(size, LEAST_SCALE))
     return np.arccos(np.clip(cosine, -1, 1)), shift
 
 
@@ -256,3 +252,144 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
             "bound; use another method",
         )
     return x
+
+
+MOST = 100_000
+"""Largest number of candidates, and of generations."""
+EXACT = 1e-24
+"""Gain of a step at which the minimum is reached, rad²: the objective is not in units of any σ."""
+FARTHEST = 1e9
+"""Largest number of bounds, mm or rad: a thousand kilometres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Bounds of three coordinates of the first population.
+
+    ``half_width`` : mm, or rad of the rotation vector; ``centre`` : (3,) centre of the bounds; where None, that of the
+    closed-form solution (Park & Martin 1994).
+
+    Raises InputError: the half width is not positive, or a number is not finite or beyond :data:`FARTHEST`.
+    """
+
+    half_width: float
+    centre: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        require_fields(self, "differential evolution")
+        if not (0 < self.half_width <= FARTHEST and (np.abs(self.centre or 0) <= FARTHEST).all()):
+            raise InputError(
+                "E-EVOLUTION-OPTIONS",
+                f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; numbers up to "
+                f"{FARTHEST:g} and a positive half width needed",
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class EvolutionOptions:
+    """DE/rand/1/bin (Storn & Price 1997) with the values of the paper.
+
+    Parameters
+    ----------
+    population, generations : M and the number of generations
+    factor, crossover : F and CR
+    weight : λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated)
+    bounds_rad : bounds of the rotation vectors of the first population. The paper takes them from knowledge of the
+        set-up; its values are not legible in the source.
+    bounds_mm : bounds of its translations; where None, about zero, as wide as the distance of the farthest board or
+        flange
+    seed : int
+    """
+
+    population: int = 30
+    generations: int = 100
+    factor: float = 0.5
+    crossover: float = 0.9
+    weight: float = 1.0
+    bounds_rad: Bounds = Bounds(np.pi)
+    bounds_mm: Bounds | None = None
+    seed: int = 0
+
+    def __post_init__(self):
+        require_fields(self, "differential evolution", seed=0)
+        numbers = (self.population, self.generations, self.factor, self.crossover, self.weight)
+        least, most = (4, 0, 1e-300, 0, 1e-300), (MOST, MOST, 2, 1, FARTHEST)
+        if not all(low <= number <= high for low, number, high in zip(least, numbers, most, strict=True)):
+            raise InputError(
+                "E-EVOLUTION-OPTIONS",
+                "differential evolution: population {}, {} generations, F {:g}, CR {:g}, λ {:g}; ".format(*numbers)
+                + f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed",
+            )
+
+    def needs_closed_form(self) -> bool:
+        """True if some bounds lie about the closed-form solution."""
+        return any(bounds is not None and bounds.centre is None for bounds in (self.bounds_rad, self.bounds_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """Objective f = Σ‖α − R_X β‖² + λ Σ‖(R_A − I) b_X + b_A − R_X b_B‖², lengths in ``unit_mm``; x = (log R_X, b_X)."""
+
+    motions: Motions
+    unit_mm: float
+    weight: float
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Returns the objective (p,) of candidates (p, 6)."""
+        turn = Rotation.from_rotvec(x[:, :3]).as_matrix()
+        rotation, translation = self._parts(turn, x[:, 3:])
+        return (rotation**2).sum((1, 2)) + self.weight * (translation**2).sum((1, 2))
+
+    def linear(self, x: Rigid) -> NormalEquations:
+        """Returns the normal equations about X, translation in mm."""
+        rotation, translation = self._parts(x.rotation[None], x.translation[None] / self.unit_mm)
+        root = np.sqrt(self.weight)
+        white = np.concatenate([rotation[0], root * translation[0]]).ravel()
+        jacobian = np.zeros((2, len(self.motions), 3, 6))
+        jacobian[0, :, :, :3] = skew(self.motions.beta @ x.rotation.T)
+        jacobian[1, :, :, :3] = root / self.unit_mm * skew(self.motions.camera.translation @ x.rotation.T)
+        jacobian[1, :, :, 3:] = root / self.unit_mm * (self.motions.mount.rotation - np.eye(3))
+        return NormalEquations.of(white, jacobian.reshape(-1, 6))
+
+    def _parts(self, turn: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the errors (p, k, 3) of rotation and translation."""
+        a, b = self.motions.mount, self.motions.camera
+        rotation = self.motions.alpha - np.einsum("pij,kj->pki", turn, self.motions.beta)
+        moved = np.einsum("kij,pj->pki", a.rotation - np.eye(3), shift) + a.translation / self.unit_mm
+        return rotation, moved - np.einsum("pij,kj->pki", turn, b.translation / self.unit_mm)
+
+
+def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, closed_form: Rigid | None = None) -> Rigid:
+    """Returns the best candidate of the last generation; bounds limit the first one only. ``reach_mm``, ``closed_form``
+    : half width and centre of bounds that have none."""
+    rng, size = np.random.default_rng(options.seed), options.population
+    about = np.zeros(6) if closed_form is None else closed_form.log()
+    parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
+    own = (about[:3], about[3:])
+    centre = np.concatenate([a if b.centre is None else b.centre for a, b in zip(own, parts, strict=True)])
+    scale = np.repeat([1.0, 1 / objective.unit_mm], 3)
+    centre, half = centre * scale, np.repeat([bounds.half_width for bounds in parts], 3) * scale
+    x = rng.uniform(centre - half, centre + half, (size, 6))
+    value = objective.values(x)
+    for _ in range(options.generations):
+        a, b, c = three_others(rng, size)
+        mutant = x[a] + options.factor * (x[b] - x[c])
+        trial = np.where(rng.random((size, 6)) <= options.crossover, mutant, x)
+        trial_value = objective.values(trial)
+        better = trial_value <= value
+        x, value = np.where(better[:, None], trial, x), np.where(better, trial_value, value)
+    best = x[np.argmin(value)]
+    return Rigid.exp(np.concatenate([best[:3], objective.unit_mm * best[3:]]))
+
+
+def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Returns three other candidates for each of ``size`` candidates, all different, (3, size)."""
+    order = rng.random((size, size))
+    np.fill_diagonal(order, 2)  # the candidate itself comes last
+    return np.argsort(order, axis=1)[:, :3].T
+
+
+def polish(objective: Objective, x: Rigid) -> Rigid:
+    """Returns the minimum of the objective next to X; raises ConvergenceError."""
+    minimum = minimise(x, objective.linear, Rigid.moved, least_gain=EXACT)
+    return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -14,12 +14,19 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses
 from stcal.handeye.data.corner_views import Views, resect, whitened
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import Loop, LoopState
 from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
-from stcal.handeye.methods.noise import CAUTION, FARTHEST, UNKNOWNS, Noise
-from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
+from stcal.handeye.methods.pose_adjustment import (
+    CAUTION,
+    FALSE_ALARM,
+    FARTHEST,
+    LEAST_POSES,
+    UNKNOWNS,
+    Noise,
+    PoseSolution,
+)
 from stcal.io.cameras.camera_model import CameraPrior
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
@@ -143,27 +150,6 @@ def problem(
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
 
-def found_of(corners: Corners, state: Bundle, solution: Solution, reported: Poses, rows: np.ndarray) -> Reprojection:
-    """Returns the results. ``rows`` : (m,) row in ``reported`` of each pose of the problem."""
-    inverse = generalised_inverse(solution.normal)
-    covariance = {name: inverse[at, at] for name, at in solution.places.items()}
-    true = list(reported)
-    for row, pose in zip(rows, state.base_from_flange, strict=True):
-        true[row] = pose
-    return Reprojection(
-        state.camera,
-        covariance.get("camera"),
-        Poses.of(true),
-        corners.xyz_board,
-        state.scale * state.corners,
-        rows[corners.view],
-        corners.corner,
-        corners.residuals(state),
-        None if corners.arm is None else corners.arm.parameters + state.arm,
-        covariance.get("arm"),
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraError:
     """``slope`` : (12, q) derivative of the gradient of X and Z by the intrinsics; ``moment`` : (q, q) second moment of
@@ -265,9 +251,8 @@ def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraE
 def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
     """Returns the derivative (12, q), or (13, q) with the scale, of the gradient, from the board's poses (m, 6, q)."""
     used = np.flatnonzero(~solution.outliers)
-    state: LoopState = solution.state
-    jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, : len(solution.normal)]
-    moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_unknown
+    x, _, scale = solution.state
+    jacobian, moves = loop.jacobian(x, scale, len(solution.normal)), loop.by_camera(x, scale) @ by_unknown
     weighted = np.linalg.solve(solution.covariance[used], moves[used])
     return np.einsum("mai,maj->ij", jacobian[used], weighted)
 
@@ -300,9 +285,8 @@ class AdjustedCorners:
     ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses,
     ``solution`` : its solution, ``state`` : the same as what is sought; ``covariance`` : (12, 12) of X and Z;
     ``camera_error`` : error of the intrinsics as filed, which it does not hold, where their prior is known;
-    ``sigma_scale``; ``sigma`` : by kind; ``estimated`` : kinds whose σ were estimated; ``scale_hint`` : the scale if it
-    were solved for, and its σ; ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for;
-    ``found`` : other results; ``settled`` : whether the estimated σ settled.
+    ``estimated`` : kinds whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its σ;
+    ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for; ``settled`` : whether σ settled.
     """
 
     loop: Loop
@@ -313,12 +297,16 @@ class AdjustedCorners:
     covariance: np.ndarray
     camera_error: CameraError | None
     sigma_scale: float | None
-    sigma: dict[str, float]
     estimated: tuple[str, ...]
     scale_hint: tuple[float, float]
     camera_gain: float
     found: Reprojection
     settled: bool
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """The σ by kind that are not 0."""
+        return {name: float(value) for name, value in self.corners.sigma.items() if value}
 
     @property
     def outliers(self) -> np.ndarray:
@@ -349,7 +337,7 @@ def adjust_views(
     loop: Loop,
     base_from_flange: Poses,
     views: Views,
-    first: tuple[Rigid, Rigid, float],
+    first: LoopState,
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
@@ -367,23 +355,23 @@ def adjust_views(
 
     Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
     """
-    options, parameters, sigma = (noise, intrinsics, with_scale), np.zeros(0 if arm is None else len(arm.angles)), FIRST
+    parameters, sigma, settled = np.zeros(0 if arm is None else len(arm.angles)), FIRST, False
     for _ in range(1 if arm is None else ARM_ROUNDS):
         linear, flange = None, base_from_flange
         if arm is not None:
             linear, flange = LinearArm(parameters, arm.slope(parameters), arm.angles), arm.poses(parameters)
             loop = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
-        used, good = _near(loop, *first), len(loop)
+        used, good = _near(loop, first), len(loop)
         while True:
             rows = np.flatnonzero(used)
             if len(rows) < 3:
-                raise DegenerateError(
-                    "E-HANDEYE-DISAGREE",
+                said = (
                     f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
-                    "belong together, and the conventions of both",
                 )
-            own_arm = None if linear is None else linear[rows]
-            corners, free = problem(loop[rows], flange[rows], views[rows], *options, own_arm, sigma)
+                said += "belong together, and the conventions of both"
+                raise DegenerateError("E-HANDEYE-DISAGREE", said)
+            own = loop[rows], flange[rows], views[rows], noise, intrinsics, with_scale
+            corners, free = problem(*own, None if linear is None else linear[rows], sigma)
             corners, solution, settled = adjust(corners, corners.start(*first), free)
             inverse = generalised_inverse(solution.normal)
             bad = contradicting(corners, solution, inverse)
@@ -392,15 +380,16 @@ def adjust_views(
             used[rows[bad]] = False
             good -= int(bad.sum())
         state = corners.bundle(solution.values)
-        if arm is None or linear is None:
+        if linear is None:
             break
-        parameters, first = parameters + state.arm, (state.mount_from_camera, state.stand_from_board, state.scale)
-        sigma = FIRST | _sigma(corners)
+        first = LoopState(state.mount_from_camera, state.stand_from_board, state.scale)
+        parameters = parameters + state.arm
+        sigma = FIRST | {name: float(value) for name, value in corners.sigma.items() if value}
         if np.linalg.norm(linear.slope[:, 3:] @ state.arm, axis=1).max() < SETTLED_MM:
             break
     else:
         settled = False
-    values, at, camera_error, gain = solution.values, solution.places["scale"], None, 1.0
+    values, camera_error, gain = solution.values, None, 1.0
     if intrinsics is None:
         if camera is not None:
             known = intrinsic_basis(camera.colmap_model), np.linalg.inv(camera.covariance)
@@ -409,27 +398,25 @@ def adjust_views(
         wider, unknown = corners.with_intrinsics(*UNKNOWN_LENS), UNKNOWN_LENS[0].shape[1]
         step = wider.problem().at(values | {"camera": Vector(np.zeros((1, unknown)))})
         gain = (float(step.right @ generalised_inverse(step.normal) @ step.right) + step.reduction.gain) / unknown
-    return AdjustedCorners(
-        loop=loop,
-        used=used,
-        corners=corners,
-        solution=solution,
-        state=state,
-        covariance=inverse[:UNKNOWNS, :UNKNOWNS],
-        camera_error=camera_error,
-        sigma_scale=float(np.sqrt(inverse[at, at].item())) if with_scale else None,
-        sigma=_sigma(corners),
-        estimated=free,
-        scale_hint=_scale_hint(corners, values),
-        camera_gain=gain,
-        found=found_of(corners, state, solution, flange, rows),
-        settled=settled,
+    covariance, true = {name: inverse[at, at] for name, at in solution.places.items()}, list(flange)
+    for row, pose in zip(rows, state.base_from_flange, strict=True):
+        true[row] = pose
+    found = Reprojection(
+        state.camera,
+        covariance.get("camera"),
+        Poses.of(true),
+        corners.xyz_board,
+        state.scale * state.corners,
+        rows[corners.view],
+        corners.corner,
+        corners.residuals(state),
+        None if corners.arm is None else corners.arm.parameters + state.arm,
+        covariance.get("arm"),
     )
-
-
-def _sigma(corners: Corners) -> dict[str, float]:
-    """Returns the σ by kind that are not 0."""
-    return {name: float(value) for name, value in corners.sigma.items() if value}
+    sigma_scale = float(np.sqrt(covariance["scale"].item())) if with_scale else None
+    hint, of_loop = _scale_hint(corners, values), inverse[:UNKNOWNS, :UNKNOWNS]
+    more = (camera_error, sigma_scale, free, hint, gain, found, settled)
+    return AdjustedCorners(loop, used, corners, solution, state, of_loop, *more)
 
 
 def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> np.ndarray:
@@ -458,8 +445,8 @@ def _scale_hint(corners: Corners, values: dict[str, Any]) -> tuple[float, float]
     return float(values["scale"].array[0, 0]) + step, float(np.sqrt(inverse[at, at]))
 
 
-def _near(loop: Loop, x: Rigid, z: Rigid, scale: float) -> np.ndarray:
+def _near(loop: Loop, first: LoopState) -> np.ndarray:
     """Returns which poses (m,) are not wrong from the start."""
-    miss = loop.residuals(x, z, scale)
+    miss = loop.residuals(*first)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
     return ~(far | (np.linalg.norm(miss[:, :3], axis=1) > GROSS_RAD))

@@ -18,13 +18,13 @@ from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
-from stcal.sfm.adjust.equations import UNKNOWN_SHAPES
+from stcal.sfm.adjust.equations import CIRCLES, UNKNOWN_SHAPES
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
-from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
+from stcal.sfm.adjust.uncertainty import calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.group_model import GroupModel, M, MetricModel, WorldModel
 
 FLATNESS_MM = 0.02  # σ of the circles off the plane of their face where none is stated

@@ -17,7 +17,8 @@ from stcal.sfm.budget.length_test import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, judgement_of
-from stcal.sfm.runs.saved import SavedRun, Verified
+from stcal.sfm.runs.run_result import SavedRun
+from stcal.sfm.runs.saved import Verified
 
 MICRO = 1e3
 MILLIDEGREES = 1e3 * float(np.degrees(1.0))

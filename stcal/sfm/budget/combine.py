@@ -16,7 +16,8 @@ from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
 from stcal.sfm.budget.sources import BudgetSource, StatedConditions, Statement, conditions_of, sources_of, statement_of
 from stcal.sfm.data.group_model import MetricModel
-from stcal.sfm.runs.saved import SavedRun, adjusted_run
+from stcal.sfm.runs.run_result import SavedRun
+from stcal.sfm.runs.saved import adjusted_run
 
 COVERAGE_FACTOR = 2.0
 LONGEST = 5

@@ -17,17 +17,8 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.toml import Strict, load_toml
 from stcal.sfm.adjust.calibration import FLATNESS_MM
-from stcal.sfm.adjust.uncertainty import (
-    BOARD,
-    CIRCLES,
-    DISTANCES,
-    DOTS,
-    FLATNESS,
-    INTRINSICS,
-    PRINT,
-    SIZES,
-    Contributions,
-)
+from stcal.sfm.adjust.equations import BOARD, CIRCLES, DOTS
+from stcal.sfm.adjust.uncertainty import DISTANCES, FLATNESS, INTRINSICS, PRINT, SIZES, Contributions
 
 FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, after those that are given, and empty if they are not."""

@@ -9,6 +9,7 @@ import numpy as np
 from stcal.design import Polarity
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import singular_values
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
@@ -20,7 +21,6 @@ from stcal.sfm.detect.circles.candidates import (
     MIN_DIAMETER_PX,
     EllipseOptions,
     Ellipses,
-    singular_values,
 )
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.circles.fits import MIN_SIGMA

@@ -25,7 +25,8 @@ from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seed
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged
 from stcal.sfm.runs.folder import require_report, write_report
-from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.run_result import AnyRun, SavedRun
+from stcal.sfm.runs.saved import saved_run
 from stcal.sfm.runs.tolerances import (
     CameraDifference,
     Crosscheck,
@@ -38,7 +39,7 @@ from stcal.sfm.runs.tolerances import (
     Tolerances,
     allowed_text,
 )
-from stcal.sfm.runs.transaction import added_results
+from stcal.sfm.runs.transaction import AGAIN, added_results
 
 MICRO = 1e3
 MIN_INLIERS = pycolmap.TwoViewGeometryOptions().min_num_inliers

@@ -17,7 +17,8 @@ from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.sfm.interop import gltf
 from stcal.sfm.interop.export_content import Content, content_of, require_new
-from stcal.sfm.runs.saved import AnyRun, saved_run
+from stcal.sfm.runs.run_result import AnyRun
+from stcal.sfm.runs.saved import saved_run
 
 COLUMNS = (
     *("kind", "face", "circle", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "nx", "ny", "nz", "radius_mm"),

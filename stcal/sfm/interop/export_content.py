@@ -15,7 +15,7 @@ from stcal.io.static_transforms import Static
 from stcal.labels import CircleLabel, parse_label
 from stcal.report.text import number
 from stcal.sfm.runs.report_file import ReportCamera, Space
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.run_result import SavedRun
 
 FACES_RGB = (
     (230, 159, 0),

@@ -13,7 +13,8 @@ from stcal.sfm.interop.export_content import require_new
 from stcal.sfm.interop.schema import Schema, find_schema
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.run_result import AnyRun, SavedRun
+from stcal.sfm.runs.saved import saved_run
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,8 @@ from stcal.sfm.interop.export_content import BOARD_RGB, colours
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import from_colmap_px
 from stcal.sfm.mapping.models import open_model, require_keypoints, rigid_from_colmap, write_reconstruction
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.run_result import AnyRun, SavedRun
+from stcal.sfm.runs.saved import saved_run
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")

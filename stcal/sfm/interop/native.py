@@ -24,7 +24,8 @@ from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.run_result import AnyRun, SavedRun
+from stcal.sfm.runs.saved import saved_run
 
 INSTALL = "install it with `sudo apt-get install colmap` (Debian, Ubuntu) or `brew install colmap` (macOS)"
 ASK_SECONDS = 60.0

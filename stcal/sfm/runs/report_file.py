@@ -15,11 +15,11 @@ from stcal.io.images import Skipped, name_fault
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, ResultFile, Vector, Vector3
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.chain import FaceChain
-from stcal.sfm.checks.significance import Check
 from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations
 from stcal.sfm.data.note import Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
+from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.groups import GroupSolution
 from stcal.sfm.runs.run_result import Comparison, RunResult

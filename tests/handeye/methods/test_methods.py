@@ -1,5 +1,6 @@
 """Every method on simulated poses with known truth."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -8,12 +9,20 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise
-from stcal.handeye.data.pose_pairs import Loop, Motions, poses_with_log
-from stcal.handeye.methods.closed_form import AX_XB, equations, smallest_largest
-from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish, three_others
-from stcal.handeye.solving import handeye
+from stcal.handeye.data.pose_pairs import FRAMES, Loop, Motions, poses_with_log
+from stcal.handeye.methods.closed_form import (
+    AX_XB,
+    Bounds,
+    EvolutionOptions,
+    Objective,
+    equations,
+    evolve,
+    polish,
+    robust,
+    smallest_largest,
+)
 from tests.outcome import fails_with, refuses
-from tests.support.handeye import simulated
+from tests.support.handeye import disturbed, handeye, simulated
 
 FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
 EXACT = tuple(m for m in FROM_POSES if m != "de")
@@ -31,6 +40,7 @@ def off(found, truth, name="mount_from_camera"):
 def test_exact_poses_give_the_truth(method, setup):
     truth = simulated(np.random.default_rng(3), 12, setup)
     found = handeye(truth.pairs, setup, method)
+    assert found.transforms[f"{FRAMES[setup].mount}_from_camera"] is found.mount_from_camera
     for name in ("mount_from_camera", "stand_from_board"):
         angle, distance = off(found, truth, name)
         assert angle < 1e-8
@@ -98,29 +108,6 @@ def test_evolution_follows_its_rules():
     assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
 
 
-@pytest.mark.parametrize("centre", ["zero", "closed form", "truth"])
-def test_evolution_from_close_bounds_is_near_the_minimum(centre):
-    """Within ±10° and ±100 mm about what is known: 1.5 times the least objective, where ±180° ends at several times."""
-    truth = simulated(np.random.default_rng(6), 19, camera=(1e-3, 0.3))
-    loop = Loop.of(truth.pairs, "eye-in-hand")
-    objective = Objective(Motions.consecutive(loop), 1000.0, 1.0)
-    least = objective.linear(polish(objective, truth.mount_from_camera)).cost
-    log = truth.mount_from_camera.log()
-    known = {"zero": (0.0,) * 6, "closed form": None, "truth": tuple(log)}[centre]
-    about = (known[:3], known[3:]) if known else (None, None)
-    bounds = Bounds(np.radians(10), about[0]), Bounds(100.0, about[1])
-    x = evolve(objective, EvolutionOptions(bounds_rad=bounds[0], bounds_mm=bounds[1]), 500, truth.mount_from_camera)
-    cost = objective.linear(x).cost / least
-    assert (cost < 1.5) == (centre != "zero")  # zero is not within 10° of it
-
-
-def test_evolution_takes_three_others():
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        others = three_others(rng, 5)
-        assert all(len({i, *three}) == 4 for i, three in enumerate(others.T.tolist()))
-
-
 def test_evolution_and_its_polish_look_at_the_same_objective():
     truth = simulated(np.random.default_rng(7), 10, camera=(1e-3, 0.3))
     motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
@@ -158,15 +145,6 @@ def test_the_convex_method_is_at_its_minimum():
         assert min(largest(x + step) for step in steps) > largest(x) * (1 - 1e-4)
 
 
-def test_result_by_its_names():
-    truth = simulated(np.random.default_rng(3), 6, "eye-to-hand")
-    found = handeye(truth.pairs, "eye-to-hand")
-    assert set(found.transforms) == {"base_from_camera", "flange_from_board"}
-    assert found.base_from_camera is found.mount_from_camera
-    with fails_with("E-HANDEYE-NO-TRANSFORM … eye-to-hand … flange_from_camera"):
-        _ = found.flange_from_camera
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -179,6 +157,8 @@ def test_wrong_arguments(arguments, message):
     truth = simulated(np.random.default_rng(3), 6)
     with fails_with(message):
         handeye(truth.pairs, **arguments)
+    with fails_with("E-HANDEYE-NO-TRANSFORM … eye-in-hand … base_from_camera"):
+        _ = handeye(truth.pairs).base_from_camera
 
 
 def test_wrong_options():
@@ -189,14 +169,6 @@ def test_wrong_options():
     refuses("E-SIGMA-VALUE … 10 … 100", Noise, camera_rad=1e-3, camera_mm=-1.0)
     refuses("E-SIGMA-VALUE … corner_px … 0 … more … than 0", Noise, corner_px=0.0)
     refuses("E-SIGMA-VALUE", Noise, 0.0, 0.1, 0.0, 0.1)
-
-
-def test_the_order_of_the_poses_makes_no_difference():
-    truth = simulated(np.random.default_rng(10), 12, camera=(1e-3, 0.3))
-    order = np.random.default_rng(0).permutation(12)
-    for method in ("pose", "shah"):  # OpenCV's AX = XB takes each motion in one direction only
-        one, other = (handeye(p, method=method).mount_from_camera for p in (truth.pairs, truth.pairs[order]))
-        assert one.translation == pytest.approx(other.translation, abs=1e-4)
 
 
 def test_park_and_martin_as_they_wrote_it():
@@ -225,3 +197,49 @@ def test_every_name_is_a_method_of_its_own():
         assert apart > 1e-6, (one, other)
     horaud = found["horaud"].rotation  # Horaud's quaternion and Shah's product minimise the same over rotations only
     assert horaud == pytest.approx(found["park-martin"].rotation, abs=3e-3)
+
+
+def apart(found: Rigid, true: Rigid) -> np.ndarray:
+    error = (found @ true.inverse()).log()
+    return np.array([np.linalg.norm(error[:3]), np.linalg.norm(found.translation - true.translation)])
+
+
+def test_the_board_s_size_comes_out_too():
+    truth = simulated(np.random.default_rng(1), 12)
+    loop = Loop.of(truth.pairs, "eye-in-hand")
+    eye = loop.camera_from_board
+    x, _, scale = robust(replace(loop, camera_from_board=Poses(eye.rotation, eye.translation / 1.05)), True)
+    assert scale == pytest.approx(1.05, rel=1e-9)
+    assert apart(x, truth.mount_from_camera)[1] < 1e-5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_third_of_bad_poses_does_no_harm(seed):
+    """Five of fifteen off by 0.3 rad and 100 mm, the others by 1e-4 rad and 0.05 mm: about what ten good ones give; the
+    solution of all at once is tens of mm off."""
+    rng = np.random.default_rng(seed)
+    truth = simulated(rng, 15)
+    loop = Loop.of(truth.pairs, "eye-in-hand")
+    eye, bad = loop.camera_from_board, np.arange(15) < 5
+    good, spoilt = disturbed(rng, eye, 1e-4, 0.05), disturbed(rng, eye, 0.3, 100.0)
+    rotation = np.where(bad[:, None, None], spoilt.rotation, good.rotation)
+    translation = np.where(bad[:, None], spoilt.translation, good.translation)
+    x, z, _ = robust(replace(loop, camera_from_board=Poses(rotation, translation)))
+    assert 1e-6 < apart(x, truth.mount_from_camera)[0] < 1e-3
+    assert 1e-3 < apart(x, truth.mount_from_camera)[1] < 1.0
+    assert apart(z, truth.stand_from_board)[1] < 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_flange_that_turns_about_a_point_does_not_shrink_the_board(seed):
+    """Six of nine poses turn about one point of the flange, exactly, which a board of no size would fit; the camera
+    errs by 1 mm at a quarter of a metre or more, so that the size is known to 1 % or so from the three that move."""
+    rng = np.random.default_rng(seed)
+    truth = simulated(rng, 9, camera=(1e-3, 0.3))
+    flange, point = truth.pairs.base_from_flange, np.array([20.0, 10.0, 350.0])
+    place = np.array(flange.translation)
+    place[:6] = place[0] + (flange.rotation[0] @ point) - flange.rotation[:6] @ point
+    moved = Poses(flange.rotation, place)
+    board = (moved @ truth.mount_from_camera).inverse() @ Poses.of([truth.stand_from_board] * 9)
+    pairs = HandEyePoses(moved, disturbed(rng, board, 1e-3, 1.0))
+    assert robust(Loop.of(pairs, "eye-in-hand"), True)[2] == pytest.approx(1, abs=0.1)

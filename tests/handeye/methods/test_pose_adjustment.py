@@ -9,11 +9,9 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise
-from stcal.handeye.data.pose_pairs import Loop
-from stcal.handeye.methods.noise import components
-from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others
-from stcal.handeye.solving import handeye
-from tests.support.handeye import error, normalised, simulated, simulated_views
+from stcal.handeye.data.pose_pairs import Loop, LoopState
+from stcal.handeye.methods.pose_adjustment import adjust_poses, against_others, components
+from tests.support.handeye import error, handeye, normalised, simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)
@@ -21,7 +19,7 @@ TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)
 
 def bound(truth, noise):
     loop = Loop.of(truth.pairs, truth.setup)
-    slope = loop.jacobian(truth.mount_from_camera)[:, :, :12]
+    slope = loop.jacobian(truth.mount_from_camera)
     spread = components(loop, noise, truth.mount_from_camera).known
     return np.linalg.inv(np.einsum("mai,maj->ij", slope, np.linalg.solve(spread, slope)))[:6, :6]
 
@@ -84,14 +82,6 @@ def test_few_poses_state_what_they_can_know(count, low, high):
     assert low < normalised(errors, covariances) < high
 
 
-@pytest.mark.parametrize("seed", [2, 34])
-def test_errors_of_one_kind_alone(seed):
-    """All but the robot's rotation exact: what errs not is found to err hardly."""
-    found = handeye(simulated(np.random.default_rng(seed), 15, robot=(1e-3, 0)).pairs)
-    assert found.sigma["robot_rad"] == pytest.approx(1e-3, rel=0.5)
-    assert found.sigma["camera_mm"] < 0.05
-
-
 @pytest.mark.parametrize(("robot", "ratio"), [((np.radians(1), 10), 0.2), ((np.radians(10), 100), 0.02)])
 def test_stated_sigma_that_are_far_too_large_are_said(robot, ratio):
     pairs = simulated(np.random.default_rng(5), 15, robot=(2e-4, 0.1), camera=(5e-4, 0.2)).pairs
@@ -127,16 +117,6 @@ def test_bad_poses_are_named_and_left_out(bad):
     assert found.mount_from_camera.translation == pytest.approx(without.mount_from_camera.translation, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_good_poses_are_rarely_called_bad():
-    """1 % of the data sets may hold one: of 40, more than 3 have a chance of 1 in 1500."""
-    named = 0
-    for seed in range(40):
-        truth = simulated(np.random.default_rng(seed), 12, camera=(1e-3, 0.3))
-        named += handeye(truth.pairs).outliers.any()
-    assert named <= 3
-
-
 def test_poses_are_judged_by_their_own_sigma():
     """Six poses to solve with and six beside: both kinds are χ² of 6 degrees, mean 6. 40 trials of 6 poses scatter by
     √(12/240) = 0.22. Without the share of the pose in the solution the means were 4 and 8 (6 ∓ 12/6)."""
@@ -150,7 +130,7 @@ def test_poses_are_judged_by_their_own_sigma():
             loop[used], LoopState(truth.mount_from_camera, truth.stand_from_board), noise, robust=False
         ).state
         x, z = solved.mount_from_camera, solved.stand_from_board
-        slope = loop.jacobian(x)[:, :, :12]
+        slope = loop.jacobian(x)
         found.append(against_others(loop.residuals(x, z), slope, components(loop, noise, x).known, used))
     inside, beside = np.array(found)[:, used].mean(), np.array(found)[:, ~used].mean()
     assert inside == pytest.approx(6, abs=0.9)

@@ -7,11 +7,10 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.report.outcome import Outcome, judged, share_of_variance
-from stcal.handeye.solving import handeye
+from stcal.handeye.handeye_pipeline import Outcome, judged, share_of_variance
+from stcal.handeye.remarks import Aside, Grave
 from stcal.handeye.validate import cross_validate, splits
-from tests.support.handeye import simulated
+from tests.support.handeye import handeye, simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 
@@ -38,16 +37,9 @@ def test_honest_poses_are_good():
     assert words.count("do not use") <= 1
 
 
-def test_a_good_one_says_why():
-    found = judged(outcome_of(20, 5))
-    assert found.word == "good"
-    sentence = found.sentence()
-    assert sentence.startswith("good: poses held out are missed by 0.")
-    assert "none of 20 poses contradicts the others" in sentence
-
-
 def test_few_poses_ask_for_care():
     """Of five poses the transform is known no better than a pose is measured."""
+    assert judged(outcome_of(20, 5)).sentence().startswith("good: poses held out are missed by 0.")
     found = judged(outcome_of(5, 5))
     assert found.word == "use with care"
     assert "Motions of the flange" in [each.title for each in found.reasons()]
@@ -87,10 +79,6 @@ def test_outliers():
     for count, word in ((1, "use with care"), (4, "use with care"), (5, "do not use")):
         bad = np.arange(16) < count
         assert word_of(replace(outcome, result=replace(outcome.result, outliers=bad)), "Outliers") == word
-    (said,) = [
-        each.said for each in judged(replace(outcome, result=replace(outcome.result, outliers=bad))).reasons()[:1]
-    ]
-    assert said == "5 of 16 poses contradict the others: pose 1, pose 2, pose 3 and 2 more"
 
 
 @pytest.mark.parametrize(

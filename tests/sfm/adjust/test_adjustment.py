@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board
+from stcal.geometry.clusters import NOTED
 from stcal.geometry.rigid import Rigid, Similarity, align_similarity
-from stcal.sfm.adjust.calibration import NOTED, AdjustOptions, calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
 from stcal.synthetic.scene import SceneOptions, make_scene
 

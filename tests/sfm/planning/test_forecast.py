@@ -39,8 +39,8 @@ from stcal.sfm.planning.forecast import (
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
 from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.runs.saved import load_run
-from stcal.synthetic.designs import tag_cube
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
+from stcal.synthetic.designs import second_design, tag_cube
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.shared import unsealed_copy
 

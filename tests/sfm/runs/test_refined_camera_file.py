@@ -12,7 +12,8 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.files import CAMERA, REFINED_CAMERA
 from stcal.sfm.camera.intrinsics import model_parameters
 from stcal.sfm.mapping.placed import unknown_lens
-from stcal.sfm.pipeline import RunOptions, run
+from stcal.sfm.pipeline import run
+from stcal.sfm.runs.run_options import RunOptions
 
 CHI2_8_999 = 26.1
 """Of the squares of eight parameters' errors over their σ, once in a thousand draws more."""

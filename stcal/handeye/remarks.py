@@ -1,4 +1,4 @@
-"""Remarks on poses and solutions, how much weight each carries, and the verdict that rests on the findings."""
+"""What the poses determine, remarks on poses and solutions, and the verdict that rests on the findings."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -6,16 +6,187 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import StcalError
+from stcal.errors import DegenerateError, StcalError
+from stcal.geometry.arrays import freeze
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pose_pairs import STALE, HandEyePoses, Loop, Setup, apart
-from stcal.handeye.judge.observable import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
+from stcal.handeye.data.pose_pairs import FRAMES, Loop, Setup
 from stcal.handeye.methods.closed_form import robust
-from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
+from stcal.handeye.methods.pose_adjustment import Noise, adjust_poses
+from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.report.document import Answer
 from stcal.row_order import change_along
+
+UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}
+SAME_UNIT = 0.05
+"""Largest difference of logarithms between a size and the ratio of two units that it is taken for."""
+LARGEST_SCALE = 5.0
+"""Largest plausible factor between a board's real and stated size; a larger one is an error of the unit."""
+SCALE_SEEN = 36.0
+"""Information on a scale, per pose, above which the scale counts as observed. Errors of the camera's translations alone
+look like an information of three per pose; at this limit the scale is too small by that share, a twelfth."""
+COMMON_RAD, COMMON_MM = 1e-3, 0.5
+"""σ of the poses of a common camera at half a metre, by which the usefulness of a set of poses is judged."""
+USELESS_RAD = np.radians(5)
+"""σ of a hand-eye rotation from such poses beyond which the transform, then at least 44 mm off, is not worth having."""
+WANTED_DEG = 30
+"""Size of rotations between poses that makes σ of X's translation about that of a pose."""
+LEAST_TURN = np.radians(5)
+"""Smallest RMS rotation of a robot of four axes."""
+LEAST_POSES = 3
+MOST_PAIRS = 100_000
+"""Number of pairs of poses from which the principal axes are computed, drawn at random from 450 poses on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """Measures of how well a loop of m poses determines X.
+
+    ``turns_rad`` : (3,) RMS rotations between poses about ``axes``, in descending order: singular values of the stacked
+    log R_A over √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
+    ``axes`` : (3, 3) rows: the principal axes of all rotations, in the flange's frame; ``mount_axis`` : (3,) the first
+    principal axis in the mount's frame; ``sigma_rad``, ``sigma_mm`` : σ of the worst direction of X from poses of a
+    common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite where it is not determined.
+    """
+
+    turns_rad: np.ndarray
+    axes: np.ndarray
+    mount_axis: np.ndarray
+    sigma_rad: float
+    sigma_mm: float
+
+    def __post_init__(self):
+        for name, shape in (("turns_rad", (3,)), ("axes", (3, 3)), ("mount_axis", (3,))):
+            freeze(self, name, shape, name)
+
+    @classmethod
+    def of(cls, loop: Loop) -> "Observability":
+        """Returns the observability of a loop of at least two poses. X itself is not needed."""
+        flange = loop.stand_from_mount.rotation
+        base_from_flange = np.swapaxes(flange, 1, 2) if loop.inverted else flange
+        turns, axes = _principal(np.swapaxes(base_from_flange, 1, 2))  # flange_j_from_flange_i
+        mount_axis = _principal(base_from_flange)[1][0] if loop.inverted else axes[0]
+        # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations with
+        # the rotation known. It depends on how the robot turned, not on X.
+        m, mean = len(flange), flange.mean(0)
+        information = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
+        size = np.sqrt(information) if information >= 1e-12 * m else 0.0
+        sigma_rad, sigma_mm = (float(sigma / size) if size else np.inf for sigma in (COMMON_RAD, COMMON_MM))
+        return cls(turns, axes, mount_axis, sigma_rad, sigma_mm)
+
+    @property
+    def useless(self) -> bool:
+        """True if no estimate of X from these poses is worth having."""
+        return self.sigma_rad > USELESS_RAD
+
+    @property
+    def one_axis(self) -> bool:
+        """True if rotations about a second axis are missing."""
+        return bool(self.turns_rad[1] < 0.1 * self.turns_rad[0])
+
+    def missing(self) -> str:
+        """Returns the motion that would help, in words."""
+        turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
+        if self.one_axis and self.turns_rad[0] > LEAST_TURN:
+            return (
+                f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about "
+                f"others; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
+            )
+        return (
+            f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; "
+            f"rotate the flange about {first} and about {in_words(self.axes[1])}, by {WANTED_DEG}° or more each"
+        )
+
+
+def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
+    """Returns the observability of a loop. Raises DegenerateError: fewer than three poses, rotations about one axis
+    only (unless ``four_dof``), or none."""
+    if len(loop) < LEAST_POSES:
+        raise DegenerateError(
+            "E-HANDEYE-FEW-POSES",
+            f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
+            f"own, by {WANTED_DEG}° or more, and take more",
+        )
+    seen, fault = Observability.of(loop), ""
+    if not four_dof and seen.useless:
+        slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
+        slides += f"{FRAMES[setup].camera} along that axis is determined"
+        said = f"{where}: {seen.missing()}{slides if seen.one_axis else ''}"
+        raise DegenerateError("E-HANDEYE-AXES", said)
+    if four_dof and seen.turns_rad[0] < LEAST_TURN:
+        fault = f"; rotate it about {in_words(seen.axes[0])} by {WANTED_DEG}° or more"
+    elif four_dof and not seen.one_axis:
+        fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
+    if fault:
+        turns = f"{_list(np.degrees(seen.turns_rad))}° (RMS)"
+        raise DegenerateError("E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about principal axes{fault}")
+    return seen
+
+
+def motions_missing(base_from_flange: Poses, setup: Setup) -> list[str]:
+    """Returns a line on the motions that are missing, where the poses cannot determine the transform."""
+    inverted = setup == "eye-to-hand"
+    stand_from_mount = base_from_flange.inverse() if inverted else base_from_flange
+    try:
+        check(Loop(stand_from_mount, base_from_flange, inverted), setup, "motions", False)
+    except DegenerateError as error:
+        return [str(error)]
+    return []
+
+
+def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
+    """True if a scale that was solved for with this σ is larger than noise alone would make it."""
+    return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
+
+
+def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
+    """Refuse a scale that is implausible or that the motions leave open; the DegenerateError says how far to move."""
+    if scale_is_seen(scale, sigma, len(loop)):
+        if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
+            said = f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}"
+            raise DegenerateError("E-HANDEYE-BOARD-SCALE", f"{said}; correct the unit of its size, or of the poses")
+        return
+    place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
+    moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))
+    raise DegenerateError(
+        "E-HANDEYE-BOARD-SCALE",
+        f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, which "
+        f"moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or more, or "
+        "solve without the scale",
+    )
+
+
+def unit_of(scale: float) -> str:
+    """Returns the words for a scale that looks like the ratio of two units; empty for any other scale."""
+    for unit, factor in UNITS.items():
+        if abs(np.log(scale / factor)) < SAME_UNIT:
+            return f", as if its lengths were in {unit}"
+        if abs(np.log(scale * factor)) < SAME_UNIT:
+            return f", as if the robot's were in {unit}"
+    return ""
+
+
+def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns RMS angles (3,) about principal axes (3, 3), in rows, of R_j R_iᵀ of all pairs of rotations (m, 3, 3)."""
+    i, j = np.triu_indices(len(rotations), 1)
+    if len(i) > MOST_PAIRS:
+        some = np.random.default_rng(0).choice(len(i), MOST_PAIRS, replace=False)
+        i, j = i[some], j[some]
+    logs = Rotation.from_matrix(rotations[j] @ np.swapaxes(rotations[i], 1, 2)).as_rotvec()
+    square, axes = np.linalg.eigh(logs.T @ logs / len(logs))
+    turns, axes = np.sqrt(np.maximum(square[::-1], 0)), axes.T[::-1]
+    largest = np.abs(axes).argmax(1)
+    return turns, axes * np.sign(axes[np.arange(3), largest])[:, None]
+
+
+def in_words(axis: np.ndarray) -> str:
+    """Returns a direction in words, to two digits."""
+    return f"({_list(axis + 0.0)})"
+
+
+def _list(values: np.ndarray) -> str:
+    return ", ".join(f"{v:.2g}" if abs(v) >= 0.005 else "0" for v in values)
+
 
 Word = Literal["good", "use with care", "do not use"]
 GOOD, CARE, BAD = get_args(Word)
@@ -113,10 +284,6 @@ MOVED_LEVEL, MOVED_SHARE = 0.01, 0.5
 SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
 """Probability that a move along the order of sound poses is named, and least share of the squares that it explains;
 the same where each pose is at a place of its own, so that errors common to a place are no move."""
-STILL = 0.005
-"""Share of the usual turn and way between two poses, below both of which a side did not move."""
-FEW = 200
-"""Largest number of poses of which all pairs are compared for what is usual."""
 HALL_MM = 5e4
 """Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 NEAR_MM = 20.0
@@ -133,7 +300,7 @@ def of_outliers(
 ) -> tuple[str, ...]:
     """Returns notes on the poses left out, (m,), by residuals (m, 6); those of ``flips`` agree if tilted the other
     way."""
-    notes = []
+    notes: list[str] = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
         said = f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
@@ -143,32 +310,11 @@ def of_outliers(
         said += "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
         notes.append(Grave(said))
     if flips.any():
+        named = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
         said = f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat "
-        said += "target is, which its image hardly excludes: "
-        said += ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
-        notes.append(Aside(f"{said}; --undo-flips takes that one, or give images"))
+        said += f"target is, which its image hardly excludes: {named}; --undo-flips takes that one, or give images"
+        notes.append(Aside(said))
     return tuple(notes)
-
-
-def of_still(pairs: HandEyePoses) -> tuple[str, ...]:
-    """Returns a note if one side hardly moved between rows that follow each other, while the other side did: its pose
-    was not measured anew, or, of a robot at rest, board or camera was moved."""
-    sides = {"flange": pairs.base_from_flange, "board": pairs.camera_from_board}
-    steps = {}
-    for side, poses in sides.items():
-        usual = np.median(apart(poses, np.linspace(0, len(pairs) - 1, min(len(pairs), FEW)).astype(int)), axis=0)
-        between = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
-        steps[side] = np.linalg.norm(between, axis=2) / np.maximum(usual, 1e-12)
-    for side, other in (("flange", "board"), ("board", "flange")):
-        rows = np.flatnonzero((steps[side] < STILL).all(1) & (steps[other] > STALE).all(1))
-        if len(rows):
-            first, many = int(rows[0]), len(rows) > MANY * len(pairs)
-            said = f"the {side} hardly moved between {spoken(pairs.names[first])} and {spoken(pairs.names[first + 1])}"
-            said += f", and {len(rows) - 1} times more," if len(rows) > 1 else ""
-            said += f" while the {other} did: read the {side}'s pose anew with each image"
-            said += " (or was the board moved?)" if side == "flange" else ""
-            return (Grave(said) if many else said,)
-    return ()
 
 
 def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
@@ -180,8 +326,7 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
         along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
         order, m = np.argsort(along), len(along)
         first = np.arange(max(3, m // 5), m - max(3, m // 5) + 1)
-        below = np.cumsum(along[order])[first - 1]
-        between = below**2 * (1 / first + 1 / (m - first))
+        between = np.cumsum(along[order])[first - 1] ** 2 * (1 / first + 1 / (m - first))
         if between.max() > APART * (along @ along):
             k = int(first[between.argmax()])
             one, two = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
@@ -204,7 +349,7 @@ def of_order(
         return ()
     white = jacobian / sigma[:, None]
     moves = {"the camera": white[:, :, :6], "the board": white[:, :, 6:]}
-    changes = [(what, change_along(residuals / sigma, white, motions)) for what, motions in moves.items()]
+    changes = ((what, change_along(residuals / sigma, white, motions)) for what, motions in moves.items())
     found = [(what, change) for what, change in changes if change is not None]
     if not found:
         return ()
@@ -230,7 +375,7 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     if not other(*hint, HINTED):
         return ()
     try:  # the hint comes from one large step, so the scale is solved for
-        solution = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
+        solution = adjust_poses(loop, robust(loop, with_scale=True), noise, with_scale=True)
     except StcalError:
         return ()
     scale, sigma = solution.state.scale, float(np.sqrt(generalised_inverse(solution.normal)[12, 12]))
@@ -278,30 +423,3 @@ def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[st
         "--poses-are" * exchanged
     )
     return (Grave(said) if away > TOO_FAR_MM and not stated else said,)
-
-
-MOST = 2000
-"""Largest number of poses of which all pairs are compared. From more poses, this many are chosen evenly."""
-
-
-def spread_text(base_from_flange: Poses, setup: Setup) -> list[str]:
-    """Returns the flange's axes, its largest rotation, the box of its places, and the motions that are missing."""
-    m = len(base_from_flange)
-    if m < LEAST_POSES:
-        return [f"motions: {m} poses, {LEAST_POSES} needed and 10 wanted"]
-    inverted = setup == "eye-to-hand"
-    stand_from_mount = base_from_flange.inverse() if inverted else base_from_flange
-    observability = Observability.of(Loop(stand_from_mount, base_from_flange, inverted))
-    turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(observability.turns_rad))
-    axes = int((observability.turns_rad > LEAST_TURN).sum())
-    some = base_from_flange.rotation[np.unique(np.linspace(0, m - 1, min(m, MOST)).astype(int))]
-    turned = (some[i + 1 :] @ some[i].T for i in range(len(some) - 1))
-    largest = max(float(Rotation.from_matrix(each).magnitude().max()) for each in turned)
-    box = " × ".join(f"{side:.0f}" for side in np.ptp(base_from_flange.translation, axis=0))
-    lines = [
-        f"motions: the flange turns about {axes} {'axis' if axes == 1 else 'axes'} ({turns} RMS about its principal "
-        f"ones), by up to {np.degrees(largest):.0f}° between two poses; its places lie within {box} mm"
-    ]
-    if observability.useless:
-        lines.append(f"motions: too little to calibrate: {observability.missing()}")
-    return lines

@@ -15,11 +15,11 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Setup, carried
-from stcal.handeye.data.record import FRAMES
-from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still
+from stcal.handeye.data.pose_content import FRAMES
+from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
+from stcal.handeye.remarks import HALL_MM, Aside, Grave
 from stcal.io.rotations import INVERTED as CONJUGATED
 from stcal.io.rotations import LAST, ORDERS, ROTATION_VECTOR
 
@@ -36,7 +36,7 @@ RADIANS_AS_DEGREES = np.radians(11.0)
 MIRROR = np.diag([1.0, -1.0, 1.0])
 SIDES = (("robot", "robot"), ("board", "camera"))
 """What messages and options call the two sides."""
-Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
+Guess = Callable[[Loop, bool], LoopState]
 
 
 def check_conventions(
@@ -53,9 +53,6 @@ def check_conventions(
     if turn > WELL[0] or shift > WELL[1]:
         size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm"
         contradict = f"{pairs.where}: the poses contradict each other by {size} (median)"
-        for still in of_still(pairs):
-            if isinstance(still, Grave):
-                raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
 
         def misfit(variant: Loop) -> float:
             again = _typical(variant, guess, with_scale)
@@ -96,9 +93,8 @@ def check_conventions(
                 remedy = "as rotations agree, rows and conventions of rotation are right: check units, signs and "
                 remedy += "order of the columns of positions"
             else:
-                remedy += (
-                    ", and check the camera file" if by_images else ", and look for another convention of rotations"
-                )
+                more = "check the camera file" if by_images else "look for another convention of rotations"
+                remedy += f", and {more}"
             what = "positions" if turn <= WELL[0] else "poses"
             raise InputError(
                 "E-HANDEYE-CONVENTION",
@@ -160,8 +156,9 @@ def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
 
 def _stated(loop: Loop, side: str) -> Poses:
     """Returns the poses of a side as their file states them."""
-    poses = loop.stand_from_mount if side == "robot" else loop.camera_from_board
-    return poses.inverse() if side == "robot" and loop.inverted else poses
+    if side == "board":
+        return loop.camera_from_board
+    return loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount
 
 
 def _with_stated(loop: Loop, side: str, poses: Poses) -> Loop:
@@ -194,7 +191,20 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
     another order. ``by_images`` : the board's poses were computed here from images."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     yield _inverted(loop, setup, by_images)
-    yield from _other_units(loop, by_images)
+    places = {"robot": ("stand_from_mount", hand), "board": ("camera_from_board", eye)}
+    # Residuals show only the ratio of two units; lengths beyond a hall tell which side it is.
+    for (side, _), (other, role) in (SIDES, SIDES[::-1]):
+        factor, which, times = 1000.0, side, "times"
+        remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
+        if side == "board" and by_images:
+            remedy = "if the size in its file is in metres, correct that"
+        if np.median(np.linalg.norm(places[other][1].translation, axis=1)) > HALL_MM:
+            factor, which, times = 1e-3, other, "divided by"
+            unit = f"{role}=mm"
+            remedy = f"if they are mm, name the columns x_mm …, or give --length-unit {unit} where none states a unit"
+        name, poses = places[which]
+        scaled = partial(replace, loop, **{name: Poses(poses.rotation, factor * poses.translation)})
+        yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", scaled)
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
@@ -208,40 +218,19 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
         yield Candidate(
             f"with each pose of the board beside that of the flange one row {which}: move the {late} poses up by one "
             "row, or the names of their images",
-            partial(lambda robot, board: Loop(hand[robot], eye[board], loop.inverted), robot_rows, board_rows),
+            partial(Loop, hand[robot_rows], eye[board_rows], loop.inverted),
         )
     for reading in (*ORDERS, CONJUGATED):
-        robot, board = (reading.poses(_stated(loop, side)) for side, _ in SIDES)
-        by_robot = _with_stated(loop, "robot", robot)
         quaternions = f"quaternions {'conjugated' if reading.conjugated else 'in another order'}: if {reading.held}"
-        order = "xyzw" if reading is LAST else "wxyz"
-        named = "name the columns so; for a file without names of columns give --rotation {}={}"
-        own = [reading.remedy if reading.conjugated else named.format(role, order) for _, role in SIDES]
-        if by_images:
-            yield Candidate(f"with the robot's {quaternions}, {reading.remedy}", partial(replace, by_robot))
-            continue
-        yield Candidate(f"with the robot's {quaternions}, {own[0]}", partial(replace, by_robot))
-        yield Candidate(f"with the board's {quaternions}, {own[1]}", partial(replace, loop, camera_from_board=board))
-        both = partial(replace, by_robot, camera_from_board=board)
-        yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
-
-
-def _other_units(loop: Loop, by_images: bool) -> Iterator[Candidate]:
-    """Yields the loop with either side's lengths in the other unit. Residuals show only the ratio of the units; lengths
-    beyond :data:`HALL_MM` tell which side it is."""
-    places = {"robot": "stand_from_mount", "board": "camera_from_board"}
-    for (side, _), (other, role) in (SIDES, SIDES[::-1]):
-        factor, which, times = 1000.0, side, "times"
-        remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
-        if side == "board" and by_images:
-            remedy = "if the size in its file is in metres, correct that"
-        if np.median(np.linalg.norm(getattr(loop, places[other]).translation, axis=1)) > HALL_MM:
-            factor, which, times = 1e-3, other, "divided by"
-            unit = f"{role}=mm"
-            remedy = f"if they are mm, name the columns x_mm …, or give --length-unit {unit} where none states a unit"
-        poses = getattr(loop, places[which])
-        scaled = {places[which]: Poses(poses.rotation, factor * poses.translation)}
-        yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", partial(replace, loop, **scaled))
+        order, changed = "xyzw" if reading is LAST else "wxyz", loop
+        for side, role in SIDES[: 1 if by_images else 2]:
+            poses = reading.poses(_stated(loop, side))
+            remedy = f"name the columns so; for a file without names of columns give --rotation {role}={order}"
+            remedy = reading.remedy if reading.conjugated or by_images else remedy
+            yield Candidate(f"with the {side}'s {quaternions}, {remedy}", partial(_with_stated, loop, side, poses))
+            changed = _with_stated(changed, side, poses)
+        if not by_images:
+            yield Candidate(f"with all {quaternions}, {reading.remedy}", partial(replace, changed))
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:

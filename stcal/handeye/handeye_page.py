@@ -7,10 +7,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.handeye_result import HandEye
-from stcal.handeye.judge.remarks import Aside, spoken
-from stcal.handeye.report.outcome import ArmFound, Outcome, judged
-from stcal.handeye.solving import FACTORS
+from stcal.handeye.handeye_pipeline import ArmFound, Outcome, judged
+from stcal.handeye.handeye_problem import FACTORS, HandEye
+from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
 from stcal.report.document import (
     Block,
@@ -84,13 +83,12 @@ def outcome_report(outcome: Outcome) -> Document:
     result, frames, found = outcome.result, FRAMES[outcome.result.setup], judged(outcome)
     turn, shift = result.rms()
     covariances, bad, seen = (result.covariance, result.stand_covariance), outcome.outliers(), result.observability
-    held_out = []
+    means = {}
     if outcome.held_out is not None:
-        held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
-        if bad and (agreeing := outcome.held_out.means(~result.outliers)):
-            held_out.append(f"held out, mean without the {len(bad)} left out above: {means_text(agreeing)}")
+        means[f"held out ({_splits_text(outcome)}), mean"] = outcome.held_out.means()
+        if bad:
+            means[f"held out, mean without the {len(bad)} left out above"] = outcome.held_out.means(~result.outliers)
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
-    asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
     sigmas = []
     for name, value in result.sigma.items():
         text, unit, factor = SIGMA_NAMES[name]
@@ -98,6 +96,10 @@ def outcome_report(outcome: Outcome) -> Document:
         how = "estimated" if name in result.estimated else "stated"
         sigmas.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
     judgements = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    told = (
+        ("To know", [note for note in outcome.all_notes() if isinstance(note, Aside)]),
+        ("What the files were taken for", outcome.understood),
+    )
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *(
@@ -108,7 +110,7 @@ def outcome_report(outcome: Outcome) -> Document:
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
-        *held_out,
+        *(f"{what}: {means_text(each)}" for what, each in means.items() if each),
         outcome.sentence(),
         Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
@@ -117,8 +119,7 @@ def outcome_report(outcome: Outcome) -> Document:
             "Camera, as adjusted (first pixel's centre at 0, 0)",
             Table(["<", "value", "± σ", "<unit"], _adjusted(outcome)),
         ),
-        *([subheading("To know"), bullets(asides)] if asides else []),
-        *([subheading("What the files were taken for"), bullets(outcome.understood)] if outcome.understood else []),
+        *(block for title, lines in told if lines for block in (subheading(title), bullets(lines))),
         fold(
             "What the verdict rests on",
             Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judgements, css="text"),
@@ -178,10 +179,8 @@ def _tried(choice: ChosenWay | None) -> list[Block]:
     """Returns a table with a row per way of solving that was tried."""
     if choice is None:
         return []
-    rows = []
-    for each in choice.tried:
-        how = "taken" if each.candidate == choice.chosen else each.reason
-        rows.append([each.candidate.name, number(each.mean_mm, 3), str(len(each.error_mm)), how])
+    how = {each.candidate: each.reason for each in choice.tried} | {choice.chosen: "taken"}
+    rows = [[w.candidate.name, number(w.mean_mm, 3), str(len(w.error_mm)), how[w.candidate]] for w in choice.tried]
     return [
         Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
         page_only(
@@ -197,14 +196,14 @@ def _arm(arm: ArmFound | None) -> list[Block]:
     """Returns a table with a row per axis: its deviation from the robot's file, and σ."""
     if arm is None:
         return []
-    cells_of_axis: dict[str, list[str]] = {}
+    axes: dict[str, list[str]] = {}
     for name, value in arm.parameters.items():
         axis, component = name.split()
         unit, factor, digits = ("°", DEGREE, 4) if component.startswith("r") else ("mm", 1.0, 3)
         text = f"{component} {number(value * factor, digits)} ± {number(arm.sigma[name] * factor, digits)} {unit}"
-        cells_of_axis.setdefault(axis, []).append(text)
-    width = max(len(cells) for cells in cells_of_axis.values())
-    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
+        axes.setdefault(axis, []).append(text)
+    width = max(map(len, axes.values()))
+    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in axes.items()]
     return [
         Table([f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], rows, css="text"),
         page_only(
@@ -221,17 +220,15 @@ def _methods(outcome: Outcome) -> list[Block]:
         return []
     means = [each.held_out.means() if each.held_out else {} for each in outcome.compared]
     kinds = [name for name in ERRORS if any(name in own for own in means)]
-    inverse, rows = outcome.result.mount_from_camera.inverse(), []
+    inverse, rows, failed = outcome.result.mount_from_camera.inverse(), [], any(e.reason for e in outcome.compared)
     for each, own in zip(outcome.compared, means, strict=True):
         far = [NONE, NONE]
         if each.result is not None:
             off = inverse @ each.result.mount_from_camera
             far = [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
         cells = [number(own.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
-        rows.append([each.method, *cells, *far, each.reason])
-    heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"]
-    if not any(row[-1] for row in rows):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
+        rows.append([each.method, *cells, *far, *[each.reason] * failed])
+    heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", *["<"] * failed]
     board = (
         " 3-D at the board: the distance from each corner to the point where the camera's ray to it meets the board "
         "as placed by the robot; by pose: distance from the corners by the pose that the image gives alone."
@@ -267,15 +264,18 @@ def _coverage(outcome: Outcome) -> list[Block]:
     else:
         measured = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)])
         residuals = board.residuals_px
-    finite = np.isfinite(residuals).all(1)
-    size, counts = (views.camera.width, views.camera.height), image_coverage(views)
-    by = "the adjustment" if board is not None else "robot and transforms"
-    factor = enlargement(residuals[finite], size[0])
+    finite, size, counts = (
+        np.isfinite(residuals).all(1),
+        (views.camera.width, views.camera.height),
+        image_coverage(views),
+    )
+    measured, residuals = measured[finite], residuals[finite]
+    by, factor = "the adjustment" if board is not None else "robot and transforms", enlargement(residuals, size[0])
     return [
         f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
         plot(
-            lambda: image_figure(size, counts, measured[finite], residuals[finite]),
+            lambda: image_figure(size, counts, measured, residuals),
             "coverage of the image",
             f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
             "",
@@ -321,15 +321,6 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     if result.covariance is not None:
         sigma = np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
         headline.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
-    turn, shift = result.rms()
-    headline.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
-    if (offset := outcome.time_offset) is not None:
-        said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
-        headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
-    if result.sigma_scale is not None:
-        pitch = "" if outcome.true_pitch_mm is None else f": pitch {outcome.true_pitch_mm:.3f} mm"
-        what = f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}"
-        headline.append((f"{result.scale:.4f}", "", what))
     return headline
 
 

@@ -1,0 +1,618 @@
+"""Pose pairs from files, whose format is recognised by their content: one direction, mm, rows that belong together."""
+
+import io
+import json
+import re
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Order, Poses
+from stcal.handeye.data.pose_content import (
+    EVERY_FRAME,
+    FRAMES,
+    Known,
+    PoseContent,
+    PoseSide,
+    Role,
+    Said,
+    read_tree,
+    require_each_once,
+)
+from stcal.handeye.data.pose_pairs import HandEyePoses, Setup, inverted
+from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
+from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
+from stcal.io.join import keys_of
+from stcal.io.rotations import (
+    find_column,
+    of_quaternions,
+    places_of,
+    read_rotations,
+    require_finite,
+    said_convention,
+    turned_values,
+)
+from stcal.io.table import FARTHEST, LENGTHS, Table, is_comment, read_table, separator_stated
+from stcal.io.toml import load_documents
+
+TABLE = "table"
+NAMES = (
+    *("image", "image_name", "filename", "file", "name", "pose"),
+    *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time_s", "time"),
+)
+"""Columns that name a row, in order of preference."""
+NUMBERS = ("nr", "no", "number", "index", "id", "#")
+"""Columns that name a row where no value occurs twice: elsewhere they number something else, such as the board."""
+
+
+def todays(table: Table) -> bool:
+    """True if the columns are those of the package's own tables: a place with its unit, and a quaternion."""
+    prefixes = ("", *(f"{name}_" for name in EVERY_FRAME))
+    placed = [prefix for prefix in prefixes if table.has(f"{prefix}x", LENGTHS)]
+    return bool(placed) and all(f"{prefix}qw" in table for prefix in placed)
+
+
+def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
+    """Returns the poses in the columns of a table; None where it has none."""
+    names, sides = _row_names(table, key), []
+    prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
+    for prefix, frames in (*prefixes.items(), ("", None)):
+        if (prefix or not sides) and (side := _side(table, prefix, frames, names, statements)) is not None:
+            sides.append(side)
+    if not sides:
+        return None
+    known = [side.frames for side in sides if side.frames is not None]
+    if len({frames.role for frames in known}) < len(known):
+        both = ", ".join(frames.name for frames in known)
+        raise InputError("E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed; drop the others")
+    return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
+
+
+def _row_names(table: Table, key: str) -> tuple[str, ...]:
+    """Returns image or time of each row, as text: nanoseconds have more digits than a float; empty without a column."""
+    lower = {name.lower(): name for name in table.columns}
+    column = next((name for name in (key, *NAMES) if name in table), None)
+    if column := column or next((lower[name] for name in NAMES if name in lower), None):
+        values = tuple(table.text(column))
+        require_each_once(values, places_of(table), table.where)
+        return values
+    number = next((lower[name] for name in NUMBERS if name in lower), None)
+    values = tuple(table.text(number)) if number is not None else ()
+    return values if len(set(values)) == len(table) else ()
+
+
+def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> PoseSide | None:
+    """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
+    if (place := _place(table, prefix)) is None:
+        return None
+    if (turned := read_rotations(table, prefix, statements.rotation)) is None:
+        return None
+    covariance, (at, unit) = table.pose_covariances(prefix), place
+    common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
+    return PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common)
+
+
+def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
+    for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
+        for unit in (*LENGTHS, ""):
+            names = (form.format(axis) + f"_{unit}" * bool(unit) for axis in "xyz")
+            present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
+            if len(present) == len("xyz"):
+                values = np.column_stack([table.numbers(column) for column in present])
+                return values, Known(unit, "by the columns") if unit else None
+            if present and unit and form == "{}":
+                alone = f"{table.where}: {', '.join(present)} alone"
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
+    return None
+
+
+KNOWN = (
+    "a table with named columns, a TUM trajectory, 4×4 matrices in JSON, npy, npz or OpenCV's FileStorage, samples of "
+    "easy_handeye or MoveIt, or lines p[x, y, z, rx, ry, rz] of Universal Robots"
+)
+NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
+"""First bytes of the files."""
+DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError, SyntaxError, tokenize.TokenError)
+"""Errors that NumPy raises for damaged files, whose heads are literals of Python."""
+TUM = 8
+"""Numbers in a line of a TUM trajectory."""
+NANOSECONDS = 19
+"""Digits of a time in ns since 1970."""
+_QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
+_UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
+_BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
+"""A unit in the header of a table, which is no list of YAML."""
+_HEADER = re.compile(r"[^:\[{]*[,;\t]")
+_SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
+"""A header of columns between which spaces stand, of six names at least, as a pose needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A file of poses. ``lines`` : those that are neither empty nor comments, by their number; ``key``,
+    ``quaternions`` : see :func:`read_content`."""
+
+    path: Path
+    data: bytes
+    text: str
+    lines: tuple[tuple[int, str], ...]
+    said: Said
+    key: str
+    quaternions: Order
+
+    @property
+    def where(self) -> str:
+        return str(self.path)
+
+    @property
+    def first(self) -> str:
+        return next((line.strip() for _, line in self.lines if not separator_stated(line)), "")
+
+
+def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
+    """Returns the content of a file. Returns None for the package's own tables, and for tables whose readers give
+    better messages.
+
+    ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
+    """
+    if path.is_dir():
+        raise InputError("E-POSES-NOT-FOUND", f"{path}: a folder; one file needed: {KNOWN}")
+    try:
+        data = read_bytes(path, TABLE_BYTES)
+    except OSError as error:
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
+    try:
+        text = "" if data.startswith((NPY, NPZ)) else text_of(data)
+    except UnicodeDecodeError:
+        return None
+    used = ((i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not is_comment(line))
+    file = File(path, data, text, tuple(used), statements, key, quaternions)
+    if (text and not file.first) or not data:
+        return None
+    content = next(reader(file) for is_of, reader in FORMATS if is_of(file))
+    if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
+        said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
+        raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
+    return content
+
+
+def _not_known(where: str, found: str) -> InputError:
+    return InputError("E-POSES-NOT-FOUND", f"{where}: {found}; {KNOWN} needed")
+
+
+def _numbers(line: str) -> list[float] | None:
+    """Returns the numbers of a line; None where a cell is no number."""
+    try:
+        return [float(cell) for cell in re.split(r"[\s,;]+", line.strip(" \t,;"))]
+    except ValueError:
+        return None
+
+
+def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: int) -> tuple[np.ndarray, tuple]:
+    """Returns the numbers (m, count) of all lines, and their places; refuses a line that holds something else."""
+    values = []
+    for number, line in file.lines:
+        row = of_line(line)
+        if row is None or len(row) != count:
+            held = "no numbers" if row is None else f"{len(row)} numbers"
+            raise InputError("E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first one needed")
+        values.append(row)
+    places = tuple(f"line {number}" for number, _ in file.lines)
+    require_finite(np.array(values), places, file.where)
+    return np.array(values), places
+
+
+def _of_universal(file: File) -> PoseContent:
+    """Returns the poses of lines ``p[x, y, z, rx, ry, rz]``."""
+
+    def inside(line: str) -> list[float] | None:
+        match = _UNIVERSAL.fullmatch(line.strip())
+        return match and _numbers(match[1])
+
+    values, places = _table_of(file, inside, 6)
+    rotation, words = turned_values(values[:, 3:], file.said.rotation, "the numbers after x, y, z", places, file.where)
+    return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
+
+
+def _of_tum(file: File) -> PoseContent:
+    """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
+    values, places = _table_of(file, _numbers, TUM)
+    names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
+    comments = (line for line in file.text.splitlines() if is_comment(line))
+    order = next((letters for c in comments if len(letters := _QUATERNION.findall(c.lower())) == 4), [])
+    if sorted(order) != sorted("wxyz"):
+        order = list("xyzw")
+        if file.said.rotation or all(name.isdigit() and len(name) >= NANOSECONDS for name in names):
+            what = "the last four numbers after a time in ns"
+            order = list(said_convention(file.said.rotation, what, file.where, len("wxyz")).order)
+    require_each_once(names, places, file.where)
+    wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
+    turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
+    poses = Poses(of_quaternions(wxyz, places, file.where), values[:, 1:4])
+    side = PoseSide(poses, places, turned, unit, names=names, trajectory=True)
+    return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
+
+
+def _row_of_numbers(file: File) -> list[float] | None:
+    """Returns the numbers of the first line, with or without a name before them; None for any other line."""
+    name, *others = re.split(r"[\s,;]+", file.first, maxsplit=1)
+    named = others and ":" not in name and name != "-"
+    return _numbers(file.first) or (_numbers(others[0]) if named else None)
+
+
+def _refuse_rows(file: File) -> PoseContent:
+    raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
+
+
+def _of_table(file: File) -> PoseContent | None:
+    table = read_table(file.path, "pose file", file.quaternions)
+    return None if todays(table) else read_columns(table, file.key, file.said)
+
+
+def _is_json(file: File) -> bool:
+    try:
+        return file.text.lstrip().startswith(("{", "[")) and json.loads(file.text) is not None
+    except (ValueError, RecursionError):
+        return False
+
+
+def _of_values(file: File, value: Any, form: str) -> PoseContent:
+    content = read_tree(value, form, file.said, file.where)
+    if content is None:
+        held = f"keys {', '.join(map(str, list(value)[:SHOWN]))} …" if isinstance(value, dict) else form
+        raise _not_known(file.where, f"no poses in {held}")
+    return content
+
+
+def _of_yaml(file: File) -> PoseContent:
+    if len(file.text.encode("utf-8")) > SETTINGS_BYTES:
+        sizes = f"{len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
+        raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
+    try:
+        documents = [each for each in load_documents(file.text) if each is not None]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(
+            "E-YAML-INVALID", f"{file.where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed"
+        ) from error
+    if len(documents) != 1 or not isinstance(documents[0], list | dict):
+        raise _not_known(file.where, f"{len(documents)} documents of YAML" if documents[1:] else "not understood")
+    return _of_values(file, documents[0], "YAML")
+
+
+def _of_npz(file: File) -> PoseContent:
+    """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
+    arrays: dict[str, Any] = {}
+    others = []
+    try:
+        with zipfile.ZipFile(io.BytesIO(file.data)) as archive:
+            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+            size = sum(member.file_size for member in members)
+            if size > TABLE_BYTES:
+                sizes = f"{size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
+                raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
+            for member in members:
+                name, content = member.filename.removesuffix(".npy"), archive.read(member)
+                try:
+                    arrays[name] = _array(content, file.where)
+                except InputError:
+                    others.append(name)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
+        raise _damaged(file.where, error) from error
+    if not any(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise InputError("E-NUMPY-CONTENT", f"{file.where}: no arrays of numbers; save it with np.savez")
+    form, [first, *more] = "NumPy arrays", arrays.values()
+    single = None if more else read_tree(first, form, file.said, file.where)
+    content = single or _of_values(file, arrays, form)
+    return replace(content, passed_over=(*content.passed_over, *others))
+
+
+def _array(data: bytes, where: str) -> np.ndarray | list[str]:
+    """Returns the array of an npy file, or its strings, which are mostly names of images."""
+    stream = io.BytesIO(data)
+    try:
+        array = np.load(stream, allow_pickle=False)
+    except DAMAGED as error:
+        raise _damaged(where, error) from error
+    if stream.tell() != len(data):
+        raise InputError("E-NUMPY-UNREADABLE", f"{where}: {len(data) - stream.tell()} bytes after its array; save anew")
+    if array.dtype.kind == "U":
+        return [str(text) for text in array.ravel()]
+    if array.dtype.kind not in "iuf" or not array.ndim or not array.size:
+        raise InputError("E-NUMPY-CONTENT", f"{where}: array of {array.dtype}, shape {array.shape}; numbers needed")
+    return np.array(array, dtype=float)
+
+
+def _damaged(where: str, error: Exception) -> InputError:
+    said = " ".join(str(error).split())[:80]
+    return InputError("E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({said}); save it again")
+
+
+FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], PoseContent | None]], ...] = (
+    (
+        lambda file: file.data.startswith(NPY),
+        lambda file: _of_values(file, _array(file.data, file.where), "NumPy array"),
+    ),
+    (lambda file: file.data.startswith(NPZ), _of_npz),
+    (_is_json, lambda file: _of_values(file, json.loads(file.text), "JSON")),
+    (lambda file: bool(_UNIVERSAL.fullmatch(file.first)), _of_universal),
+    (lambda file: len(_numbers(file.first) or ()) == TUM, _of_tum),
+    (_row_of_numbers, _refuse_rows),
+    (lambda file: bool(_HEADER.match(_BRACKETED_UNIT.sub("", file.first)) or _SPACED.fullmatch(file.first)), _of_table),
+    (lambda file: True, _of_yaml),
+)
+"""Whether a file is of a format, by its content, and the reader of that format, in this order."""
+
+
+METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
+"""Lengths are metres if all are below the first limit, and millimetres if one is above the second. Flanges and boards
+are farther from base and camera than 5 mm, and nearer than 50 m."""
+MIXED = 100.0
+"""Ratio of the farthest to the nearest pose above which poses are in two units."""
+SHOWN = 4
+"""Keys that a message names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldPairs:
+    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
+    (name, why); ``timed`` : where the robot's poses were taken by time."""
+
+    pairs: HandEyePoses
+    understood: tuple[str, ...]
+    setup: Setup | None = None
+    left_out: tuple[tuple[str, str], ...] = ()
+    timed: Timed | None = None
+
+    @classmethod
+    def of(
+        cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, lines: Sequence[str] = (), **more: Any
+    ) -> "ToldPairs":
+        """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
+        covariances = robot.covariance, camera.covariance
+        pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
+        return cls(pairs, (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines), **more)
+
+
+def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs | None:
+    """Returns the pose pairs of one file; None where it is one of the package's own tables.
+
+    Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
+    """
+    content = read_content(path, statements, key, quaternions)
+    if content is None:
+        return None
+    if len(content.sides) == 1:
+        frames = content.sides[0].frames
+        held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
+        said = f"{path}: {content.form} with {held}"
+        raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
+    robot, camera = (settled(content, role, path, statements) for role in FRAMES)
+    if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
+        said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
+    return ToldPairs.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
+
+
+def read_two(
+    first: Path,
+    second: Path,
+    statements: Said,
+    key: str,
+    quaternions: Order = "wxyz",
+    tolerance_s: float = TOLERANCE_S,
+    timed: bool = False,
+) -> ToldPairs | None:
+    """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
+    tables.
+
+    The rows are joined by image or time, or by their order where neither file has names. Where times are not equal,
+    and for all rows where ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``.
+    """
+    files = tuple(zip(FRAMES, (first, second), keys_of(key), strict=True))
+    contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
+    if not any(contents):
+        return None
+    sides = []
+    for (role, path, own), content in zip(files, contents, strict=True):
+        if content is None:
+            table = read_table(path, "table", quaternions)
+            content = read_columns(table, own, statements)
+            if content is None:
+                raise _no_poses(table)
+        sides.append(settled(content, role, path, statements))
+    (robot, camera), where = sides, f"{first.name} with {second.name}"
+    setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
+    times, wanted = (stamps_of(side.names) if side.names else None for side in sides)
+    if timed and (times is None or wanted is None):
+        untimed = (robot if times is None else camera).where
+        raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
+    if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
+        stream = Stream.of(times, robot.poses, Path(robot.where).name)
+        return _by_time(robot, camera, stream, stream.after_origin(wanted), setup, where, tolerance_s)
+    rows, how = matched(robot, camera, key)
+    a, b = ([row[k] for row in rows] for k in (0, 1))
+    stamped = None
+    if times is not None and wanted is not None and len(set(times)) >= max(len(times), len(rows) + 1):
+        stream = Stream.of(times, robot.poses, first.name)
+        if stream.spacing_s() <= LONGEST_S:
+            stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
+    alone = [(robot, first, a)] if stamped is None else []  # samples between images are no mistake
+    left_out = [
+        (name, f"in {path.name} alone")
+        for side, path, used in (*alone, (camera, second, b))
+        for i, name in enumerate(side.called())
+        if i not in used
+    ]
+    more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
+    lines = (f"rows joined {how}",) if how else ()
+    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
+
+
+def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseSide | None:
+    """Returns the robot's poses of a file; None where it is one of the package's own tables."""
+    content = read_content(path, statements.of("robot"), key, quaternions)
+    return None if content is None else settled(content, "robot", path, statements)
+
+
+def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
+    """Returns lines that describe a table of pose pairs of the package's own."""
+    table = read_table(source, "pose file", quaternions)
+    content, place = read_columns(table, "image", Said()), Path(table.where.removeprefix("pose file "))
+    return [f"{role}: {settled(content, role, place, Said()).understood}" for role in FRAMES] if content else []
+
+
+def require_own(path: Path, quaternions: Order = "wxyz") -> None:
+    """Refuse a table without poses in its columns."""
+    table = read_table(path, "table", quaternions)
+    if not todays(table):
+        raise _no_poses(table)
+
+
+def _no_poses(table: Table) -> InputError:
+    return InputError(
+        "E-POSES-NOT-FOUND",
+        f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
+        f"a, b, c …) needed; the header is {table.header()}; rename them",
+    )
+
+
+def _by_time(
+    robot: PoseSide,
+    camera: PoseSide,
+    stream: Stream,
+    seconds: np.ndarray,
+    setup: Setup | None,
+    where: str,
+    tolerance_s: float,
+) -> ToldPairs:
+    """Returns the robot's poses of a stream at the camera's times, ``seconds`` after its origin."""
+    taken = taken_at(stream, seconds, tolerance_s)
+    if not taken.kept.any():
+        first = f"{camera.names[0]}, {taken.why[0]}"
+        raise InputError("E-POSES-UNMATCHED", f"{camera.where}: no pose has one of the robot: first {first}")
+    rows, lines = np.flatnonzero(taken.kept), (taken.said,)
+    if robot.covariance is not None:
+        lines += ("covariances of the robot's poses are not used: they are of other times",)
+    at_images, seen = replace(robot, poses=taken.base_from_flange, covariance=None), camera[rows.tolist()]
+    left_out = tuple((name, why) for name, why in zip(camera.names, taken.why, strict=True) if why)
+    more = {"setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
+    return ToldPairs.of(at_images, seen, seen.names, where, lines, **more)
+
+
+def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
+    """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
+    with a line on how they were read."""
+    wanted, first, statements = FRAMES[role][0], content.sides[0], statements.of(role)
+    side = content.of(role) or (first if len(content.sides) == 1 and first.frames is None else None)
+    if side is None:
+        held = first.frames.name if first.frames else "poses"
+        raise InputError("E-POSES-MIXED", f"{path}: {content.form} of {held}, {wanted} needed here; give another file")
+    lengths = side.poses.translation
+    far = np.flatnonzero(np.abs(lengths).max(axis=1) > FARTHEST)
+    if len(far):
+        said = f"length {np.abs(lengths[far[0]]).max():.3g}, at most {FARTHEST:g}"
+        raise InputError("E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: {said}")
+    frames = _direction(side, role, path, statements)
+    unit, guessed = _unit(side, frames.name, path, statements)
+    poses, covariance, common = Poses(side.poses.rotation, LENGTHS[unit.name] * lengths), side.covariance, side.common
+    if frames.name != wanted:
+        poses, covariance, common = inverted(poses, covariance, common)
+    parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned]
+    parts.append(f"{unit.name} {unit.by}")
+    if content.passed_over:
+        ellipsis = " …" if len(content.passed_over) > SHOWN else ""
+        parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
+    read = {"where": str(path), "understood": "; ".join(parts), "guessed": guessed}
+    return replace(side, poses=poses, covariance=covariance, common=common, **read)
+
+
+def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Known:
+    """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
+    option, frames = statements.frames_of(role), side.frames
+    if option is not None and frames is not None and frames.stated and frames.name != option:
+        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}"
+        remedy = "if the name is wrong, change it in the file; else leave the option out"
+        raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
+    if option is not None:
+        return Known(option, "as you say")
+    if frames is None and side.trajectory and role == "camera":
+        return Known("board_from_camera", "by default, the camera's trajectory")
+    return frames or Known(FRAMES[role][0], "by default")
+
+
+def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Known, str]:
+    """Returns the unit, and its name again if it was guessed from the size of lengths."""
+    option = statements.length_unit
+    if side.unit is not None and (option is None or side.unit.stated):
+        return side.unit, ""
+    if option is not None:
+        return Known(option, "as you say", False), ""
+    distances = np.linalg.norm(side.poses.translation, axis=1)
+    farthest, nearest = float(distances.max()), float(distances.min())
+    if 0 < nearest < farthest / MIXED:
+        near, far = side.places[int(distances.argmin())], side.places[int(distances.argmax())]
+        said = f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units"
+        raise InputError("E-POSES-UNITS", f"{said}; write all in the same unit and give --length-unit mm or m")
+    if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
+        raise InputError(
+            "E-POSES-UNITS",
+            f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
+            f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
+        )
+    guess = "m" if farthest <= METRES_UP_TO else "mm"
+    return Known(guess, f"by their size, up to {farthest:.4g}", False), guess
+
+
+def matched(robot: PoseSide, camera: PoseSide, key: str) -> tuple[list[tuple[int, int]], str]:
+    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched;
+    empty where the names are the same."""
+    if not robot.names and not camera.names:
+        if len(robot) == len(camera):
+            return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
+        counts = f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times"
+        raise InputError("E-POSES-COUNT", f"{counts}; as many of each, or names, needed")
+    if not robot.names or not camera.names:
+        without, other = (robot, camera) if not robot.names else (camera, robot)
+        said = f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …"
+        raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column {key}")
+    rows = partners(robot.names, camera.names)
+    if rows is None:
+        said = f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one"
+        raise InputError("E-POSES-UNMATCHED", f"{said}, {camera.names[0]} … in the other; correct them")
+    return rows
+
+
+def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
+    """Returns the places of names in both lists that mean the same, and how they were matched: as they are, as times,
+    without folder and ending, or by the number at their ends, where no number occurs twice. None where none match."""
+    ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
+        (str, ""),
+        (time_of, "by their times as numbers"),
+        (stem_of, "by names without folder and ending"),
+        (trailing_number, "by the number at the end of each name, like"),
+    )
+    for way, description in ways:
+        one, other = ([way(name) for name in names] for names in (first, second))
+        known = [[key for key in keys if key is not None] for keys in (one, other)]
+        if not all(keys and len(set(keys)) == len(keys) for keys in known):
+            continue
+        place = {key: j for j, key in enumerate(other)}
+        rows = [(i, place[key]) for i, key in enumerate(one) if key is not None and key in place]
+        if rows:
+            i, j = rows[0]
+            return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
+    return None
+
+
+def trailing_number(name: str) -> int | None:
+    """Returns the number at the end of a name: 7 for ``img07.png``; None where there is none, or for a time."""
+    match = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
+    return int(match[1]) if match else None

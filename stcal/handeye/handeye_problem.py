@@ -1,0 +1,529 @@
+"""Hand-eye calibration: the problem, its result, and one call for every method."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import Brief, ByValue, freeze, require_fields
+from stcal.geometry.normal_equations import generalised_inverse
+from stcal.geometry.rigid import Rigid
+from stcal.handeye import remarks
+from stcal.handeye.conventions import check_conventions, flipped, repair
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
+from stcal.handeye.methods import closed_form
+from stcal.handeye.methods.bundle import ROBOT, ArmModel
+from stcal.handeye.methods.closed_form import (
+    AX_XB,
+    AX_ZB,
+    EvolutionOptions,
+    Objective,
+    convex,
+    evolve,
+    polish,
+    solve_closed_form,
+)
+from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
+from stcal.handeye.methods.reprojection import (
+    CAMERA_GAIN,
+    AdjustedCorners,
+    Reprojection,
+    adjust_views,
+    in_common,
+    of_poses,
+    resected,
+)
+from stcal.handeye.remarks import Aside, Observability, Verdict, check, in_words, require_scale
+from stcal.io.cameras.camera_model import CameraPrior
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HandEye(Brief):
+    """A hand-eye calibration from m pose pairs.
+
+    Parameters
+    ----------
+    method : name of the method, one of :data:`~stcal.handeye.METHODS`
+    setup : ``eye-in-hand`` or ``eye-to-hand``
+    mount_from_camera, stand_from_board : the two unknowns, mm; see :attr:`transforms`
+    residuals : (m, 6), deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation
+        (mm) at the board's origin, in the axes of the stand
+    names : names of the poses
+    outliers : (m,) bool, poses that were left out of the solution because they contradict the others
+    covariance, stand_covariance : (6, 6), covariances of ``mount_from_camera`` and ``stand_from_board``: rotation
+        (rad), translation (mm), left perturbation. None if the method gives no covariance.
+    scale : the board's true size over its stated size, if it was solved for; else 1
+    sigma_scale : σ of the scale
+    sigma : σ by which poses or corners were weighted, if the method weights: ``robot_rad``, ``robot_mm``,
+        ``camera_rad``, ``camera_mm``, ``corner_px``, ``board_mm``. ``camera_factor`` is the factor on the σ that were
+        stated with camera_from_board. ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential``
+        (``camera_all`` if their covariance is stated) are the factors, 1 or more, by which the σ of the stated
+        intrinsics were widened.
+    estimated : keys of ``sigma`` that were estimated from the residuals
+    reprojection : adjusted camera, board and robot, if corners were adjusted
+    observability : what the poses determine
+    notes : notes on the result, one line each
+    common_covariance : (6, 6), part of ``covariance`` that comes from what the errors of the board's poses have in
+        common, where that is stated; more poses do not make it smaller
+    judgement : whether to use the result; None of a single method's solution, which was not judged. See
+        :attr:`verdict`.
+    """
+
+    method: str
+    setup: Setup
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    residuals: np.ndarray
+    names: tuple[str, ...]
+    outliers: np.ndarray
+    covariance: np.ndarray | None = None
+    stand_covariance: np.ndarray | None = None
+    scale: float = 1.0
+    sigma_scale: float | None = None
+    sigma: dict[str, float] = field(default_factory=dict)
+    estimated: tuple[str, ...] = ()
+    reprojection: Reprojection | None = None
+    observability: Observability | None = None
+    notes: tuple[str, ...] = ()
+    common_covariance: np.ndarray | None = None
+    judgement: Verdict | None = None
+
+    def __post_init__(self):
+        m = len(self.names)
+        freeze(self, "residuals", (m, 6), "residuals")
+        freeze(self, "outliers", (m,), "outliers", bool)
+        for name in ("covariance", "stand_covariance", "common_covariance"):
+            if getattr(self, name) is not None:
+                freeze(self, name, (6, 6), name)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether to use the result: its ``word`` is ``good``, ``use with care`` or ``do not use``.
+
+        ``sentence()`` adds the reasons, ``remedies()`` what to do. Raises InputError if nobody judged the result.
+        """
+        if self.judgement is None:
+            said = f"hand-eye: the solution of {self.method} alone has no verdict"
+            raise InputError("E-HANDEYE-NOT-JUDGED", f"{said}; handeye.handeye judges what it returns")
+        return self.judgement
+
+    @property
+    def transforms(self) -> dict[str, Rigid]:
+        """``flange_from_camera`` and ``base_from_board``, or ``base_from_camera`` and ``flange_from_board``."""
+        frames = FRAMES[self.setup]
+        return {frames.camera: self.mount_from_camera, frames.board: self.stand_from_board}
+
+    @property
+    def flange_from_camera(self) -> Rigid:
+        """The transform flange_from_camera of the eye-in-hand setup; raises InputError in the other setup."""
+        return self._named("flange_from_camera")
+
+    @property
+    def base_from_camera(self) -> Rigid:
+        """The transform base_from_camera of the eye-to-hand setup; raises InputError in the other setup."""
+        return self._named("base_from_camera")
+
+    def _named(self, name: str) -> Rigid:
+        if name not in self.transforms:
+            said = f"hand-eye: {self.setup} has no {name}; it has {' and '.join(self.transforms)}"
+            raise InputError("E-HANDEYE-NO-TRANSFORM", said)
+        return self.transforms[name]
+
+    def widened(self, factor: float) -> "HandEye":
+        """Returns the result with all σ of the two unknowns multiplied by ``factor``."""
+        if self.covariance is None or self.stand_covariance is None:
+            return self
+        square = factor**2
+        return replace(self, covariance=square * self.covariance, stand_covariance=square * self.stand_covariance)
+
+    def rms(self) -> tuple[float, float]:
+        """Returns the RMS lengths of the residuals of all poses except outliers: rad, mm."""
+        return rms_of(self.residuals[~self.outliers])
+
+
+S = TypeVar("S", PoseSolution, AdjustedCorners)
+SCALED = ("pose", "reprojection")
+"""Methods that weigh errors, and can find the board's size."""
+METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", *SCALED)
+"""Names of all methods."""
+UNIT_MM = 1000.0
+"""Length that weighs like one radian if no σ are stated, in mm: an error of 1 mm weighs like one of 1 mrad."""
+FACTORS = {
+    "camera_focal": "focal length",
+    "camera_centre": "principal point",
+    "camera_radial": "radial distortion",
+    "camera_tangential": "tangential distortion",
+    "camera_all": "all",
+}
+LEAST_WITH_SCALE = 4
+"""Least number of poses if the scale is unknown: three leave a redundancy of five, too little to estimate σ."""
+WIDENED = 2.0
+"""Factor on the σ of a camera file, or of poses computed with it, beyond which a note questions the file."""
+ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
+"""Smallest ratio of estimated to stated σ at which a robot's stated σ are doubted, and the probability with which
+chance may exceed the ratio that is required."""
+REST_WORSE = 1.2
+"""Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
+AT_ONE_PLACE = Aside("the robot stood several times at one place: its errors there count once in σ")
+OF_EVOLUTION = Aside("differential evolution: what it reaches depends on its bounds; the paper's own are not legible")
+IN_COMMON = Aside("σ contain the errors that the board's poses have in common (columns common…)")
+UNSETTLED = "the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses"
+HELD_MM = 1e-6
+"""σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeOptions(ByValue):
+    """Options of a hand-eye calibration: known errors, and further unknowns.
+
+    Parameters
+    ----------
+    noise : known σ of the errors; unknown σ are estimated
+    intrinsics : prior of the camera's parameters; if given, they are solved for. ``reprojection`` only.
+    with_scale : solve for the board's true size too; ``pose`` and ``reprojection`` only
+    symmetries : all board_from_board except the identity that map the board onto itself. Views whose corners were
+        numbered from another end are renumbered.
+    four_dof : the flange turns about one axis only: solve for everything except X along this axis. ``pose`` and
+        ``reprojection`` only.
+    evolution : options of ``de`` and ``de-polished``
+    camera : uncertainty of the camera's parameters if they are not solved for. With views, it is propagated into σ. The
+        parameters are exact if None.
+    arm : model of the arm, with the joint vectors of the same poses. Its parameters are solved for too, held by σ that
+        are estimated. Its poses replace those of the pairs. ``reprojection`` only.
+    """
+
+    noise: Noise = field(default_factory=Noise)
+    intrinsics: CameraPrior | None = None
+    with_scale: bool = False
+    symmetries: tuple[Rigid, ...] = ()
+    four_dof: bool = False
+    evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
+    camera: CameraPrior | None = None
+    arm: ArmModel | None = None
+
+    def __post_init__(self):
+        require_fields(self, "hand-eye")
+
+    @property
+    def names_unknowns(self) -> bool:
+        """True if the options name what is solved for, so that no way of solving is left to choose."""
+        return bool(self.intrinsics or self.with_scale or self.four_dof or self.arm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeProblem:
+    """What is solved: ``pairs`` of poses in a ``setup``, the ``views`` from which they were computed, and ``options``;
+    ``notes`` : on repairs; ``part`` : whether the poses are a part of others, of which conventions were judged."""
+
+    pairs: HandEyePoses
+    setup: Setup = "eye-in-hand"
+    views: Views | None = None
+    options: HandEyeOptions = field(default_factory=HandEyeOptions)
+    notes: tuple[str, ...] = ()
+    part: bool = False
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, rows: np.ndarray) -> "HandEyeProblem":
+        """Returns the problem of these poses alone."""
+        views, arm = (None if each is None else each[rows] for each in (self.views, self.options.arm))
+        return replace(self, pairs=self.pairs[rows], views=views, options=replace(self.options, arm=arm))
+
+    def without(self, out: np.ndarray) -> "HandEyeProblem":
+        """Returns the problem without the poses ``out``, (k,)."""
+        return replace(self[np.setdiff1d(np.arange(len(self)), out)], part=True)
+
+    @property
+    def loop(self) -> Loop:
+        """The poses in the terms of the equation."""
+        return Loop.of(self.pairs, self.setup)
+
+    def mended(self) -> "HandEyeProblem":
+        """Returns the problem with the numberings of a symmetric board corrected, and a note on that."""
+        if not self.options.symmetries:
+            return self
+        mended = repair(self.pairs, self.setup, self.options.symmetries, self.views)
+        options, notes = replace(self.options, symmetries=()), (*self.notes, *mended.notes())
+        return replace(self, pairs=mended.pairs, views=mended.views, options=options, notes=notes)
+
+    def require_observable(self) -> Observability:
+        """Returns what the poses determine; raises DegenerateError if that is not enough."""
+        return check(self.loop, self.setup, self.pairs.where, self.options.four_dof)
+
+    def solved(self, method: str | None = None) -> "Solved":
+        """Returns the result of one method, ``reprojection`` with views, else ``pose``, if None, with the state from
+        which solutions without some poses start. Its σ are estimated from its own residuals. Raises StcalError: as
+        :func:`stcal.handeye.handeye`."""
+        method = method or ("pose" if self.views is None else "reprojection")
+        options, pairs = self.options, self.pairs
+        if method not in METHODS:
+            choices = ", ".join(METHODS)
+            raise InputError("E-OPTION-METHOD", f"hand-eye: method {method!r} is unknown; one of {choices} needed")
+        if method == "reprojection" and (self.views is None or len(self.views) != len(pairs)):
+            said = "hand-eye: reprojection needs the corners of every pose; give views, or use method pose"
+            raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
+        if options.arm is not None and method != "reprojection":
+            said = f"hand-eye: {method} does not solve for the arm; give views, and method reprojection"
+            raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
+        seen = self.require_observable()
+        if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
+            said = f"{len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
+            raise DegenerateError("E-HANDEYE-FEW-POSES", f"{pairs.where}: {said}")
+        problem = self.mended()
+        if options.arm is None:
+            problem.pairs.require_moving_flange()
+
+        @cache
+        def guess(loop: Loop, with_scale: bool) -> LoopState:
+            if options.four_dof:
+                return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
+            return closed_form.robust(loop, with_scale)
+
+        loop, by_images = problem.loop, problem.views is not None
+        if not self.part:
+            doubts = check_conventions(problem.pairs, loop, self.setup, guess, options.with_scale, by_images)
+            problem = replace(problem, notes=(*problem.notes, *doubts))
+        task = _Task(problem, loop, seen)
+        if method not in SCALED:
+            return task.by_equations(method)
+        first = guess(loop, options.with_scale)
+        return (
+            task.by_poses(first) if problem.views is None or method == "pose" else task.by_views(first, problem.views)
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """``result`` of a ``task``, and the ``solution`` behind it where the method adjusts poses or corners."""
+
+    task: "_Task"
+    result: HandEye
+    solution: PoseSolution | AdjustedCorners | None = None
+
+    def without(self, out: np.ndarray) -> HandEye:
+        """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
+        all poses. Adjustments take one step; other methods are solved again. Raises StcalError: they fail."""
+        task, solution, board = self.task, self.solution, None
+        if solution is None:
+            problem = task.problem.without(out)
+            again = replace(task, problem=problem, loop=problem.loop).by_equations(self.result.method).result
+            x, z = again.mount_from_camera, again.stand_from_board
+            return replace(self.result, mount_from_camera=x, stand_from_board=z)
+        if isinstance(solution, AdjustedCorners):
+            state = solution.without(out)
+            board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
+        else:
+            state = solution.without(task.loop, out)
+        x, z = state.mount_from_camera, state.stand_from_board
+        if task.problem.options.four_dof:
+            x, z = closed_form.slid(x, z, task.seen.mount_axis, task.loop)
+        return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """A ``problem`` after repair, with its ``loop``, and what its poses determine, ``seen``."""
+
+    problem: HandEyeProblem
+    loop: Loop
+    seen: Observability
+
+    def solved(
+        self,
+        method: str,
+        x: Rigid,
+        z: Rigid,
+        residuals: np.ndarray,
+        notes: tuple[str, ...],
+        covariance: np.ndarray | None = None,
+        solution: PoseSolution | AdjustedCorners | None = None,
+        **more: Any,
+    ) -> Solved:
+        """Returns X and Z as a result, with their ``covariance`` (12, 12) or more; ``more`` : further fields of it."""
+        names = self.problem.pairs.names
+        outliers = np.zeros(len(names), bool)
+        if solution is not None:
+            outliers, notes = solution.outliers, notes if solution.settled else (*notes, UNSETTLED)
+            more["scale"] = solution.state.scale
+        if covariance is not None:
+            more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
+        more |= {"observability": self.seen, "notes": notes}
+        return Solved(self, HandEye(method, self.problem.setup, x, z, residuals, names, outliers, **more), solution)
+
+    def by_equations(self, method: str) -> Solved:
+        """Solves AX = XB or AX = ZB by the named method."""
+        options, pairs, loop, notes = self.problem.options, self.problem.pairs, self.loop, self.problem.notes
+        if options.four_dof:
+            said = f"hand-eye: {method} needs turns about two axes; of four axes use pose"
+            raise DegenerateError("E-HANDEYE-AXES", said)
+        noise, evolution = options.noise, options.evolution
+        unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
+        if method in AX_XB and not (used := poses_with_log(loop)).all():
+            left_out = ", ".join(name for name, u in zip(pairs.names, used, strict=True) if not u)
+            notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
+            loop = loop[used]
+            if len(loop) < 3 or Observability.of(loop).useless:
+                raise DegenerateError(
+                    "E-HANDEYE-LARGE-TURNS",
+                    f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
+                    f"left for {method}; use method pose or shah",
+                )
+        if method in (*AX_XB, *AX_ZB):
+            x, z = solve_closed_form(loop, method, unit_mm)
+        else:
+            motions = Motions.consecutive(loop)
+            if method == "zhao":
+                x = convex(motions, unit_mm)
+            else:
+                objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
+                known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if evolution.needs_closed_form() else None
+                farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
+                x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
+                x = polish(objective, x) if method == "de-polished" else x
+            if method == "de":
+                notes = (*notes, OF_EVOLUTION)
+            z = closed_form.mean_pose(loop.chain(x))
+        return self.solved(method, x, z, self.loop.residuals(x, z), notes)
+
+    def by_poses(self, first: LoopState) -> Solved:
+        """Solves by least squares of the poses' errors, from ``first`` X, Z and scale."""
+        problem, options, loop, scaled = self.problem, self.problem.options, self.loop, self.problem.options.with_scale
+        solution, noise, notes = self.by_true_robot(lambda loop, noise: adjust_poses(loop, first, noise, scaled))
+        state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
+        notes, covariance, common = problem.notes + notes, generalised_inverse(solution.normal), None
+        if not options.four_dof and (clusters := by_places(loop, solution)):
+            covariance, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
+        sigma_scale = float(np.sqrt(covariance[12, 12])) if scaled else None
+        if sigma_scale is not None:
+            require_scale(state.scale, sigma_scale, loop, problem.pairs.where)
+        if options.four_dof:
+            x, z, covariance, notes = self.without_slide(x, z, solution.normal)
+        inverse = covariance
+        notes += self.remarks(x, solution.outliers, solution.residuals, solution.scale_hint)
+        if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
+            notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
+        if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
+            factor, redundancy = solution.variance_factor, solution.redundancy
+            low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
+            if not low <= factor <= high:
+                times = f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect"
+                notes += (f"{times}; correct σ, or look for errors",)
+                covariance = covariance * max(factor, 1)
+        if loop.camera_common is not None:
+            added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
+            common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
+        if problem.views is not None and options.camera is not None:
+            error = of_poses(loop, solution, problem.views, options.camera)
+            covariance = covariance + error.covariance(inverse) - inverse
+        stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
+        sigma = {name: value for name, value in stated.items() if value} | solution.sigma
+        more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
+        more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
+        return self.solved("pose", x, z, solution.residuals, notes, **more)
+
+    def by_views(self, first: LoopState, views: Views) -> Solved:
+        """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
+        options, pairs = self.problem.options, self.problem.pairs
+
+        def adjusted(loop: Loop, noise: Noise) -> AdjustedCorners:
+            prior, scaled, flange = options.intrinsics, options.with_scale, pairs.base_from_flange
+            return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera, options.arm)
+
+        solution, _, notes = self.by_true_robot(adjusted)
+        state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
+        if sigma_scale is not None:
+            require_scale(state.scale, sigma_scale, self.loop, pairs.where)
+        x, z = state.mount_from_camera, state.stand_from_board
+        notes, covariance = self.problem.notes + notes, solution.covariance
+        if options.four_dof:
+            x, z, covariance, notes = self.without_slide(x, z, solution.normal())
+        if solution.camera_error is not None:
+            covariance = solution.camera_error.covariance(covariance)
+        closed = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
+        residuals, good = closed.residuals(x, z), closed[~outliers]
+        if not options.four_dof and places(good) is not None:
+            # What the places add to the covariance of the board's poses, they add to that of the corners.
+            by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)
+            if clusters := by_places(good, by_poses):
+                added = clusters.covariance - clusters.independent
+                covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
+                if sigma_scale is not None:
+                    sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
+        notes += self.remarks(x, outliers, residuals, solution.scale_hint)
+        if solution.camera_gain > CAMERA_GAIN:
+            notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
+        doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
+        if doubted:
+            which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+            notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
+        more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
+        more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
+        return self.solved("reprojection", x, z, residuals, notes, **more)
+
+    def by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+        """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
+        contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
+        noise, loop = self.problem.options.noise, self.loop
+        solution, stated = solved(loop, noise), loop.robot_covariance
+        if stated is not None:
+            rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
+        elif noise.robot_rad is not None and noise.robot_mm is not None:
+            rad, mm = noise.robot_rad, noise.robot_mm
+        else:
+            return solution, noise, ()
+        unknown = replace(noise, robot_rad=None, robot_mm=None)
+        free = solved(replace(loop, robot_covariance=None), unknown)
+        estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
+        if rad and mm:
+            dof = max(3 * (len(loop) - LEAST_WITH_SCALE), 3)
+            limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
+            contradicted = estimated[0] > limit * rad or estimated[1] > limit * mm
+        else:  # an exact robot, with which corners or the board's poses fit worse
+            shared = [
+                name for name in ("corner_px", "camera_factor") if solution.sigma.get(name) and free.sigma.get(name)
+            ]
+            worse = max((solution.sigma[name] / free.sigma[name] for name in shared), default=1.0)
+            contradicted = any(estimated) and worse > REST_WORSE
+        if contradicted and isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
+            # σ of a robot far better than the camera hardly show: what is estimated then is no evidence by itself.
+            used = ~free.outliers
+            contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
+        if not contradicted:
+            return solution, noise, ()
+        note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
+        note += (
+            f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
+        )
+        return free, unknown, (note,)
+
+    def remarks(
+        self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
+    ) -> tuple[str, ...]:
+        """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
+        if self.problem.part:
+            return ()
+        pairs, options, loop, good = self.problem.pairs, self.problem.options, self.loop, ~outliers
+        tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
+        notes = remarks.of_outliers(pairs.names, outliers, residuals, tilted)
+        moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
+        notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
+        if not (options.with_scale or options.four_dof):
+            notes += remarks.of_size(loop[good], hint, options.noise)
+        return notes + remarks.of_distance(loop)
+
+    def without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
+        """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
+        axis, frames = self.seen.mount_axis, FRAMES[self.problem.setup]
+        x, z = closed_form.slid(x, z, axis, self.loop)
+        held = normal.copy()
+        held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
+        note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which "
+        note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along "
+        note += "that axis"
+        return x, z, generalised_inverse(held), (*self.problem.notes, note)

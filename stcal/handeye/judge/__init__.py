@@ -1,1 +1,0 @@
-"""Judgement of poses and solutions: observability, conventions, and notes on a solution."""

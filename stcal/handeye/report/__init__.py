@@ -1,1 +1,0 @@
-"""Reports and files of hand-eye calibrations, for people and for other programs."""
