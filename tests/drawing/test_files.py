@@ -13,18 +13,8 @@ from stcal.boards.board_file import board_toml
 from stcal.boards.cells import outlines
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
-from stcal.drawing.draw import POINT_MM, draw
-from stcal.drawing.parts import Disc, Line, Text, parts_of
-from stcal.drawing.sheets import (
-    EDGE,
-    FOOT,
-    OVERLAP,
-    PAPERS,
-    SIDE,
-    framed,
-    paper_sheets,
-    seams_between,
-)
+from stcal.drawing.draw import EDGE, FOOT, OVERLAP, PAPERS, POINT_MM, SIDE, draw, framed, paper_sheets, seams_between
+from stcal.drawing.parts import Disc, Outline, Text, parts_of
 from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -105,7 +95,7 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
                 whole.add(disc.name)
             cut = ((box[0] < inner[0]) & (box[1] > inner[0])) | ((box[0] < inner[1]) & (box[1] > inner[1]))
             assert not cut.any(), disc.name
-        marks = [s for s in tile.shapes if isinstance(s, Line) and s.ink == "white"]
+        marks = [s for s in tile.shapes if isinstance(s, Outline) and s.ink == "white"]
         assert len(marks) >= 6  # both strokes of at least three crosses
         covered += np.prod(high - low)
     assert whole == set(place)
@@ -115,7 +105,7 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
 
 @pytest.mark.parametrize("taken", [np.zeros((0, 2)), np.array([[40.0, 60.0], [90.0, 101.0]])])
 def test_seams_leave_no_gap(taken):
-    seams = seams_between(0.0, 250.0, 100.0, taken)
+    seams = seams_between(0.0, 250.0, 100.0, taken, np.zeros((0, 2)))
     ends = [0.0, *seams, 250.0]
     pieces = [(a - OVERLAP / 2 * (a > 0), b + OVERLAP / 2 * (b < 250)) for a, b in pairwise(ends)]
     assert max(b - a for a, b in pieces) <= 100.0

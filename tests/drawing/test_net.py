@@ -8,10 +8,8 @@ import pytest
 
 from stcal.boards.target_file import target_toml
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.draw import draw, net_text
-from stcal.drawing.net import _is_clear, net_part
-from stcal.drawing.parts import Disc, Text
-from stcal.drawing.sheets import one_sheet
+from stcal.drawing.draw import draw, net_text, one_sheet
+from stcal.drawing.parts import Disc, Text, _is_clear, net_part
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -56,9 +54,9 @@ def test_a_box_is_one_net(target):
     assert len(folds) == 8  # and all eight are folded
     corners = np.concatenate(list(plates.values()))
     for line in folds:
-        ends = [np.linalg.norm(corners - end, axis=1) < 1e-9 for end in line.points]
+        ends = [np.linalg.norm(corners - end, axis=1) < 1e-9 for end in line.lines[0]]
         assert all(end.any() for end in ends)
-    lengths = sorted(float(np.linalg.norm(np.diff(line.points, axis=0))) for line in folds)
+    lengths = sorted(float(np.linalg.norm(np.diff(line.lines[0], axis=0))) for line in folds)
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
 
 
