@@ -78,7 +78,7 @@ def _library(module: str) -> str:
 
 
 def _native() -> str:
-    from stcal.sfm.interop.native import find_colmap
+    from stcal.sfm.interop.crosscheck import find_colmap
 
     if shutil.which("colmap") is None:
         return "not found"

@@ -16,8 +16,7 @@ import pytest
 
 from stcal.cli.main import main_sfm
 from stcal.io.files import RUN_MARKER
-from stcal.sfm.interop.crosscheck import mapper_options
-from stcal.sfm.interop.native import find_colmap
+from stcal.sfm.interop.crosscheck import find_colmap, mapper_options
 from stcal.sfm.mapping.incremental import pipeline_options
 from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.sfm.interop.export_model import export_model
+from stcal.sfm.interop.export_colmap import export_model
 from tests.outcome import fails_with
 from tests.shared import own_copy, unsealed_copy
 
