@@ -1,6 +1,7 @@
 """The report in four sentences."""
 
 import copy
+import re
 
 import pytest
 
@@ -198,7 +199,8 @@ def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
-    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; faces 5, 6")
+    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; ")
+    assert "faces 5, 6" in told.use
     assert "4 of the 6 faces" in told.limit
     assert told.next.startswith("Photograph faces 5, 6")
     assert told.next.endswith("For 2 more checks: add a group.")
@@ -234,7 +236,7 @@ def test_a_missing_face_that_was_expected_is_named():
     assert "faces 5, 6" in told.use
     assert "Face 6 should have been photographed" in told.limit
     own["checks"] = [check("a", "failed", remedy="x")]
-    assert "the first: Check a; faces 5, 6 " in judgement_of(own).use
+    assert re.search("the first: Check a; .* faces 5, 6 ", judgement_of(own).use)
 
 
 def test_a_face_that_was_read_and_left_out_is_missing():
