@@ -17,7 +17,6 @@ from stcal.boards.target_file import load_target
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.parts import (
     LAYERS,
-    WIDTH_PER_HEIGHT,
     Disc,
     Part,
     Shape,
@@ -30,7 +29,6 @@ from stcal.drawing.parts import (
     net_part,
     parts_of,
     said_mm,
-    words_with_room,
 )
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
@@ -40,9 +38,6 @@ APART = 6.0  # distance from a part to its first dimension, and between dimensio
 ARROW = 1.5
 CUT_FROM, CUT_TO = 1.5, 5.0  # distances from the outline at which cut marks begin and end, mm
 LETTERS = 2.0
-ROW = 4.0
-COLUMN_GAP = 3.0
-PLAN, PLAN_LETTERS = 45.0, 1.5  # longer side of the plan of a plate, and height of its numbers, mm
 BAR, SHORT_BAR = 100.0, 50.0  # lengths of scale bars, mm
 
 
@@ -63,31 +58,6 @@ def framed(part: Part, bare: bool = False) -> list[Shape]:
             shapes += _dimension(axis, low, high, words, float(box[0, 1 - axis]), APART * (place + 1))
     shapes.append(Text(float(box[0, 0]), float(box[1, 1]) + CUT_TO + 1.5, part.name, LETTERS))
     return shapes
-
-
-def table(part: Part, below: bool) -> list[Shape]:
-    """Return the part's table and plan, beside or below the shapes of :func:`framed`."""
-    if not part.table:
-        return []
-    box = extent(framed(part))
-    top = float(part.outline[:, 1].max())
-    beside = float(box[1, 0]) + APART, top - LETTERS
-    x, y = (float(part.outline[:, 0].min()), float(box[0, 1]) - ROW) if below else beside
-    heading, *rows = part.table
-    shapes: list[Shape] = [Text(x, y, " ".join(filter(None, heading)), LETTERS)]
-    widths = [max(len(row[k]) for row in rows) * WIDTH_PER_HEIGHT * LETTERS + COLUMN_GAP for k in range(len(rows[0]))]
-    ends = x + np.cumsum(widths)
-    for number, row in enumerate(rows, 1):
-        places = zip(row, ends.tolist(), strict=True)
-        shapes += [Text(end - COLUMN_GAP, y - ROW * number, word, LETTERS, "end") for word, end in places]
-    # The circles' numbers stand in a plan: a detector may take those on the plate itself for circles.
-    corner = np.array((float(ends[-1]), y + LETTERS) if below else (x, y - ROW * len(part.table)))
-    low, high = box_of(part.outline)
-    scale, left_above = min(PLAN / float((high - low).max()), 1.0), np.array([low[0], high[1]])
-    discs = [shape for shape in part.pattern() if isinstance(shape, Disc)]
-    places = corner + scale * (np.array([(disc.x, disc.y) for disc in discs]) - left_above)
-    shapes.append(line(corner + scale * (part.outline - left_above), "LABELS", closed=True))
-    return [*shapes, *words_with_room(places, [row[0] for row in part.table[2:]], PLAN_LETTERS)]
 
 
 def scale_bars(width: float, height: float) -> list[Shape]:
@@ -166,12 +136,12 @@ class Sheet:
     height: float
     placed: tuple[Placed, ...]
     cuts: bool = False  # whether a seam runs through the pattern of its part
-    bare: bool = False  # whether the part is without dimensions and table, with which it would take more sheets
+    bare: bool = False  # whether the part is without dimensions, with which it would take more sheets
 
 
 def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
     """Return one sheet with all parts, as large as needed."""
-    drawn = [[*framed(part), *table(part, below=False)] for part in parts]
+    drawn = [framed(part) for part in parts]
     boxes = [extent(shapes) for shapes in drawn]
     widest = max(np.sqrt(sum(np.prod(box[1] - box[0] + BETWEEN) for box in boxes)), *(np.ptp(b, 0)[0] for b in boxes))
     placed: list[Shape] = []
@@ -190,7 +160,7 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
 def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
 
-    A part that is larger than a sheet only by its dimensions and its table is drawn without them.
+    A part that is larger than a sheet only by its dimensions is drawn without them.
     """
     split = [min(_ways(part, paper), key=lambda way: (way.cuts, way.count, way.bare)) for part in parts]
     total = sum(way.count for way in split)
@@ -223,52 +193,33 @@ class _Way:
 
 
 def _ways(part: Part, paper: str) -> list[_Way]:
-    """Return the layouts of a part: portrait and landscape, with the table beside and below, or bare on one sheet."""
+    """Return the layouts of a part: portrait and landscape, with dimensions, or bare on one sheet."""
     ways, boxes = [], np.array([shape.box() for shape in part.pattern()])
-    drawn = [(False, [*framed(part), *table(part, below)]) for below in (True, False)]
-    if not part.lines:  # the pieces of a net need their names
-        drawn.append((True, framed(part, bare=True)))
-    for (bare, shapes), turned in product(drawn, (False, True)):
-        width, height = PAPERS[paper]
-        size = (height, width) if turned else (width, height)
+    for bare, size in product((False, True), (PAPERS[paper], PAPERS[paper][::-1])):
+        shapes = framed(part, bare)
         box, room = extent(shapes), np.array(size) - FURNITURE
-        words = np.array([shape.box() for shape in shapes if isinstance(shape, Text)]).reshape(-1, 2, 2)
         across, down = (
-            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k], words[:, :, k])
-            for k in (0, 1)
+            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k]) for k in (0, 1)
         )
         low, high = np.moveaxis(boxes, 1, 0)
         cuts = any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in (across, down)[k])
         way = _Way(shapes, box, size, (across, down), cuts, bare)
-        if not bare or way.count == 1:
+        if not bare or (way.count == 1 and not part.lines):  # the pieces of a net need their names
             ways.append(way)
     return ways
 
 
-def seams_between(low: float, high: float, room: float, taken: np.ndarray, words: np.ndarray) -> list[float]:
+def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
-
-    Seams avoid the intervals ``taken`` (n, 2) and, in a piece's second half, those of ``words`` (m, 2) if they can.
-    """
-    both, seams, start = np.concatenate([taken, words]), [], low
+    Seams avoid the intervals ``taken`` (n, 2) if they can."""
+    seams, start = [], low
     while high - start > room:
-        last = start + room - OVERLAP / 2
-        choices = ((start + room / 2, both), (start + room / 2, taken), (start + OVERLAP, taken))
-        places = (_free(last, first, avoided) for first, avoided in choices)
-        seams.append(next((place for place in places if place is not None), last))
+        place = last = start + room - OVERLAP / 2
+        while len(hit := taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]):
+            place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
+        seams.append(place if place > start + OVERLAP else last)
         start = seams[-1] - OVERLAP / 2
     return seams
-
-
-def _free(last: float, first: float, taken: np.ndarray) -> float | None:
-    """Return the last place up to ``last`` that is clear of the intervals ``taken``, or None beyond ``first``."""
-    place = last
-    while place > first:
-        hit = taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]
-        if not len(hit):
-            return place
-        place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
-    return None
 
 
 def _tiles(way: _Way, title: str) -> list[Sheet]:
@@ -587,7 +538,7 @@ def drawn_text(drawn: Drawn) -> str:
     lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
-        lines.append(f"{which} without dimensions and table, which would take more sheets")
+        lines.append(f"{which} without dimensions, which would take more sheets")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"

@@ -117,18 +117,6 @@ def corners_of(box: np.ndarray) -> np.ndarray:
     return np.array([[left, below], [right, below], [right, above], [left, above]])
 
 
-def words_with_room(places: np.ndarray, words: Iterable[str], height: float, taken: Iterable[Text] = ()) -> list[Text]:
-    """Return words about their places (n, 2), without those that would overlap others before, or the ``taken`` ones."""
-    found, boxes = [], [text.box() for text in taken]
-    for (x, y), word in zip(places.tolist(), words, strict=True):
-        text = Text(x, y - height / 2, word, height, "middle")
-        low, high = text.box()
-        if all((low >= box[1]).any() or (high <= box[0]).any() for box in boxes):
-            found.append(text)
-            boxes.append(text.box())
-    return found
-
-
 def said_mm(value: float) -> str:
     """Return the text of a length in mm to the µm, without trailing zeros."""
     text = f"{value:.3f}".rstrip("0").rstrip(".")
@@ -147,7 +135,6 @@ class Part:
     outline: np.ndarray  # (k, 2) cutting line
     shapes: tuple[Shape, ...]
     spans: Spans = ()  # lengths that are dimensioned
-    table: tuple[tuple[str, ...], ...] = ()  # rows of words, the first a note, the second the heads
     lines: tuple[Outline, ...] = ()  # to cut and fold, if they replace the outline, which then only encloses the part
 
     def pattern(self) -> list[Shape]:
@@ -162,13 +149,7 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
         outline = as_seen(face).outline_mm
         return part if outline is None else replace(part, outline=outline)
     shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
-    rows = [
-        (circle, said_mm(x), said_mm(y), said_mm(2 * r))
-        for circle, (x, y), r in zip(face.ids, face.xy_mm.tolist(), face.radius_mm.tolist(), strict=True)
-    ]
-    frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
-    table = (frame, ("circle", "x", "y", "diameter"), *rows)
-    return _part(f"face {face.id}", shapes, polarity, margin_mm, table=table, outline=face.outline_mm)
+    return _part(f"face {face.id}", shapes, polarity, margin_mm, outline=face.outline_mm)
 
 
 def as_seen(face: FaceDesign) -> FaceDesign:
@@ -260,21 +241,20 @@ def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
     return [Disc(x, y, radius, ink, name=str(name)) for (x, y), radius, name in rows]
 
 
-def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=(), outline=None) -> Part:
+def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), outline=None) -> Part:
     if outline is None:
         outline = corners_of(extent(pattern) + margin_mm * np.array([[-1.0], [1.0]]))
     outline = np.asarray(outline)
     ground = [Outline((outline,), "GROUND")] if polarity == "bright" else []
-    return Part(name, outline, (*ground, *pattern), spans, table)
+    return Part(name, outline, (*ground, *pattern), spans)
 
 
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
 TAB_MM, TAB_SHARE = 10.0, 0.25  # largest width of a tab, mm, and as a share of its edge
-SKETCH, SKETCH_OF_CIRCLES = 1 / 8, 1 / 5
-"""Scale of the sketch that names the faces, and of one that numbers their circles too."""
+SKETCH = 1 / 8  # scale of the sketch that names the faces
 BESIDE = 15.0  # distance of the sketch from the net, mm
-LETTERS, SMALL_LETTERS = 2.0, 1.2  # height of names, and of the numbers of circles in the sketch, mm
+LETTERS = 2.0  # height of names, mm
 IN_CORNER = 3.0
 """Distance of the name of a printed face from the corner of its plate, mm: in the white about a tag."""
 TOUCH = 1e-3  # overlap of plates that counts as rounding, mm
@@ -427,22 +407,12 @@ def _tab(ends: np.ndarray) -> np.ndarray:
 
 
 def _sketch(plates: list[_Plate], left_above: np.ndarray) -> list[Shape]:
-    """Return a small sketch of the plates, each with the numbers of its circles, and the name of its face near its
-    middle, if there is room."""
+    """Return a small sketch of the plates, each with the name of its face."""
     every = np.concatenate([plate.corners for plate in plates])
-    scale = SKETCH if any(plate.face.printed for plate in plates) else SKETCH_OF_CIRCLES
-    shift = left_above - scale * np.array([every[:, 0].min(), every[:, 1].max()])
-    words: list[Text] = []
+    shift = left_above - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
+    shapes: list[Shape] = []
     for plate in plates:
-        if plate.face.printed is None:  # corners of tags have no numbers
-            places = scale * (plate.face.xy_mm @ plate.turn.T + plate.shift) + shift
-            words += words_with_room(places, plate.face.ids, SMALL_LETTERS, words)
-    outlines = [scale * plate.corners + shift for plate in plates]
-    for plate, corners in zip(plates, outlines, strict=True):
-        face, middle = plate.face.id, corners.mean(0)
-        inner = np.maximum(np.ptp(corners, axis=0) / 2 - Text(0, 0, face, LETTERS, "middle").box()[1], 0)
-        grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 17)]), axis=-1).reshape(-1, 2) * inner
-        grid = np.concatenate([np.zeros((1, 2)), grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")]])
-        free = words_with_room(middle + grid, [face] * len(grid), LETTERS, words)
-        words += free[:1] or words_with_room(middle[None], [face], LETTERS)
-    return [*(line(corners, "LABELS", closed=True) for corners in outlines), *words]
+        corners = SKETCH * plate.corners + shift
+        x, y = corners.mean(0).tolist()
+        shapes += [line(corners, "LABELS", closed=True), Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle")]
+    return shapes

@@ -105,7 +105,7 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
 
 @pytest.mark.parametrize("taken", [np.zeros((0, 2)), np.array([[40.0, 60.0], [90.0, 101.0]])])
 def test_seams_leave_no_gap(taken):
-    seams = seams_between(0.0, 250.0, 100.0, taken, np.zeros((0, 2)))
+    seams = seams_between(0.0, 250.0, 100.0, taken)
     ends = [0.0, *seams, 250.0]
     pieces = [(a - OVERLAP / 2 * (a > 0), b + OVERLAP / 2 * (b < 250)) for a, b in pairwise(ends)]
     assert max(b - a for a, b in pieces) <= 100.0

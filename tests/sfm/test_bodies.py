@@ -24,7 +24,7 @@ from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
-from stcal.sfm.budget.sources import sources_of, statement_of
+from stcal.sfm.budget.combine import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions

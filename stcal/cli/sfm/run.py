@@ -207,7 +207,7 @@ def budget(
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
     from stcal.report.document import pdf_of, require_pdf
     from stcal.sfm.budget.budget_page import budget_in_brief, uncertainty_budget
-    from stcal.sfm.budget.sources import fields_of
+    from stcal.sfm.budget.combine import fields_of
 
     if pdf and page is None:
         raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")

@@ -1,25 +1,354 @@
-"""Combination of the sources to combined and expanded uncertainties of faces and of the target's largest distances."""
+"""Uncertainty budget of a run: sources with the conditions stated for them, and how they combine to expanded
+uncertainties of faces and of the target's largest distances."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import date, time
 from itertools import combinations, combinations_with_replacement
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
+from stcal.boards.board_designs import TAG_SIGMA_MM
+from stcal.boards.board_file import BoardSizeEntry, SizeEntry
+from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.io.toml import Strict, load_toml
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.calibration import rim_covariance_mm2
+from stcal.sfm.adjust.calibration import FLATNESS_MM, rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
-from stcal.sfm.budget.sources import BudgetSource, StatedConditions, Statement, conditions_of, sources_of, statement_of
+from stcal.sfm.adjust.uncertainty import (
+    BOARD,
+    CIRCLES,
+    DISTANCES,
+    DOTS,
+    FLATNESS,
+    INTRINSICS,
+    PRINT,
+    SIZES,
+    Contributions,
+    Derivatives,
+    contributions_of,
+    derivatives,
+)
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
+FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
+"""Fields in the head of every budget, after those that are given, and empty if they are not."""
+LONGEST_TEXT = 500
+DEFAULT = "; the default, which `design` writes too: measure it and state it"
+"""Words for a σ that nobody has changed."""
+
+
+Text = Annotated[
+    str,
+    BeforeValidator(lambda value: str(value) if isinstance(value, date | time) else value),  # as TOML has them
+    Field(max_length=LONGEST_TEXT),
+]
+FieldName = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+class StatementFile(Strict):
+    """The file of ``--statement``."""
+
+    one_thermometer: bool = False
+    fields: dict[FieldName, Text] = Field(default_factory=dict)
+    board: BoardSizeEntry = BoardSizeEntry()
+    target: SizeEntry = SizeEntry()
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """What the user states."""
+
+    board: StatedSize
+    target: StatedSize
+    origin: dict[tuple[str, str], str]  # the file that states a value, by ``board`` or ``target`` and key
+    fields: dict[str, str]  # of the head by name
+    one_thermometer: bool = False  # True if the temperatures of both err alike
+
+
+def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
+    """Statement of a run: ``own`` of its ``board.toml``, overridden by the file, whose fields ``given`` overrides."""
+    file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
+    sizes: dict[str, StatedSize] = {}
+    origin: dict[tuple[str, str], str] = {}
+    for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
+        values, default = asdict(second), asdict(first)
+        sizes[body] = StatedSize(**{key: default[key] if own is None else own for key, own in values.items()})
+        origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
+    for name, value in (given or {}).items():
+        if not name or len(name) > 60 or len(value) > LONGEST_TEXT:
+            raise InputError(
+                "E-OPTION-VALUE",
+                f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST_TEXT} for a "
+                "value",
+            )
+    named = file.fields | dict(given or {})
+    named |= {name: "" for name in FIELDS if name not in named}
+    return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
+
+
+def fields_of(given: Sequence[str]) -> dict[str, str]:
+    """Parses ``NAME=VALUE`` into a dictionary; an error without ``=``, or for a name given twice."""
+    values: dict[str, str] = {}
+    for text in given:
+        name, sign, value = (word.strip() for word in text.partition("="))
+        if not sign or not name:
+            raise InputError("E-OPTION-VALUE", f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
+        if name in values:
+            raise InputError("E-OPTION-REPEATED", f"--field {name}: given twice; give it once")
+        values[name] = value
+    return values
+
+
+Origin = Literal["estimated", "stated", "assumed", "not stated", "not known"]
+PPM = 1e-6
+REFERENCE_C = 20.0
+"""Reference temperature of ISO 1:2022, used unless another one is stated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BudgetSource:
+    """A row of the budget."""
+
+    key: str  # name in files
+    title: str  # name in tables
+    evaluation: Literal["A", "B"]  # statistics of this run, or other knowledge
+    origin: Origin  # where the input's σ comes from, explained in ``words``
+    words: str
+    sigma: float | None  # in ``unit``, None if it is not one number
+    unit: str
+    covariance_mm2: np.ndarray  # (3c, 3c) of the circles due to this input alone
+
+    def __post_init__(self):
+        freeze(self, "covariance_mm2", (None, None), f"{self.key}: covariance")
+
+
+def sources_of(
+    contributions: Contributions,
+    camera: Camera,  # as given to the run, with the covariance that its file states
+    board: BoardDesign,
+    flatness_mm: float | None,
+    refined: bool,  # whether its intrinsics were adjusted
+    statement: Statement,
+    camera_given: bool = True,  # False if the camera was found from the photographs
+) -> tuple[BudgetSource, ...]:
+    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
+    joint, covariance, sigma_px = contributions.joint, contributions.covariance_mm2, contributions.centre_sigma_px
+    corners = bool(faces_of_known_shape(board))
+    title, by_residuals = "corners and centres of faces" if corners else "centres of circles", "residuals; RMS per axis"
+    points = ("estimated", by_residuals, sigma_px[CIRCLES], "px", covariance[CIRCLES])
+    rows = [BudgetSource("circle_centres", title, "A", *points)]
+    if board.rows:
+        dots = ("estimated", by_residuals, sigma_px[DOTS], "px", covariance[DOTS])
+        rows.append(BudgetSource("dot_centres", "centres of dots", "A", *dots))
+        shape = f"{100 * joint.board_common:.0f} % of it common to all groups"
+        origin, words = _stated_or_default(
+            f"sigma_mm of board.toml × σ₀ {joint.sigma_scale:.3f}; "
+            f"{shape if joint.board_common else 'each group its own'}",
+            board.sigma_mm == DOTS_SIGMA_MM,
+        )
+        sigma_um = 1e3 * board.sigma_mm * joint.sigma_scale
+        rows.append(BudgetSource("board_dots", "places of dots", "B", origin, words, sigma_um, "µm", covariance[BOARD]))
+    rows += _own_size(contributions, board)
+    if not corners or covariance[FLATNESS].any():
+        rows.append(_flatness(contributions, flatness_mm))
+    rows.append(_intrinsics(contributions, camera, refined, camera_given))
+    if board.rows:
+        by_scale, grown = contributions.by_scale, joint.xyz_model - joint.xyz_model.mean(0)
+        name, sigma = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm
+        absent, words = [name] * (sigma is None), f"{name} of {statement.origin['board', name]}"
+        rows.append(_stated("board_pitch", "board's pitch", "ppm", absent, words, sigma, (sigma or 0.0) * by_scale))
+        bodies = (("board", statement.board, by_scale), ("target", statement.target, -grown.ravel()))
+        for body, stated, effect in bodies:
+            rows += _expansion(body, stated, effect, statement)
+        if statement.one_thermometer:
+            rows.append(_one_thermometer(bodies))
+    return tuple(rows)
+
+
+def _stated_or_default(words: str, default: bool) -> tuple[Origin, str]:
+    """Returns the origin of a σ, and the words on it: assumed where nobody has changed the default."""
+    return ("assumed", words + DEFAULT) if default else ("stated", words)
+
+
+def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[BudgetSource]:
+    """Yields the rows of faces of known shape and of known distances."""
+    factor = contributions.joint.sigma_scale
+    if faces := faces_of_known_shape(board):
+        print_factor = contributions.joint.print_factor
+        within_stated = max(face.sigma_mm or 0.0 for face in faces)
+        within = within_stated * print_factor * factor
+        origin, words = _stated_or_default(
+            f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness",
+            within_stated == TAG_SIGMA_MM,
+        )
+        yield BudgetSource(
+            "print", "print of faces", "B", origin, words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
+        )
+        largest = max(faces, key=lambda face: face.size_sigma)
+        sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
+        stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
+        edges = "a common displacement of the edges of all tags"
+        words = f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
+        if by_statement:
+            words = "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
+        ppm = 1e6 * sigma if sigma else None
+        yield BudgetSource(
+            "print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES]
+        )
+    if known := known_distances(board):
+        sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
+        words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
+        covariance = contributions.covariance_mm2[DISTANCES]
+        if known[0].drawn:
+            words = "nothing of known size was in view: only the shape is known"
+            yield BudgetSource("distances", "size", "B", "not known", words, None, "µm", covariance)
+            return
+        yield BudgetSource("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
+
+
+def _flatness(contributions: Contributions, flatness_mm: float | None) -> BudgetSource:
+    words, factor = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}", contributions.joint.sigma_scale
+    row: tuple[Origin, str, float | None] = ("not stated", "--flatness off: faces need not be flat", None)
+    if flatness_mm is not None:
+        row = "stated", words, 1e3 * flatness_mm * factor
+        if flatness_mm == FLATNESS_MM:
+            row = "assumed", f"the default of {words}", row[2]
+    return BudgetSource("flatness", "flatness of faces", "B", *row, "µm", contributions.covariance_mm2[FLATNESS])
+
+
+def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
+    adjusted = contributions.covariance_mm2[INTRINSICS]
+    row: tuple[Literal["A", "B"], Origin, str, np.ndarray]
+    if not camera_given:
+        row = "A", "estimated", "found from these photographs, without a camera file; adjusted with all else", adjusted
+    elif refined and camera.covariance is not None:
+        row = "B", "stated", "adjusted; σ before that of the camera file", adjusted
+    elif refined:
+        row = "B", "assumed", "adjusted; σ before that of a calibration of some age", adjusted
+    elif camera.covariance is not None:
+        effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+        row = "B", "stated", "fixed; σ of the camera file", effect @ camera.covariance @ effect.T
+    else:
+        row = "B", "not stated", "fixed; no σ in the camera file", np.zeros_like(adjusted)
+    return BudgetSource("intrinsics", "intrinsics", *row[:3], None, "", row[3])
+
+
+def _stated(
+    key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, effect_ppm: np.ndarray
+) -> BudgetSource:
+    """Returns the row of an input that the user states; where keys are absent from the statement, it is exact.
+    ``effect_ppm``: (3c,) of one σ on the circles, times a million."""
+    covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)
+    if absent:
+        return BudgetSource(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
+    return BudgetSource(key, title, "B", "stated", words, sigma, unit, covariance)
+
+
+def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[BudgetSource]:
+    """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
+    warmer = warmer_k(stated)
+    for key, name, needed, factor, unit in (
+        ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
+        ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer, "ppm/K"),
+    ):
+        if key == "temperature" and statement.one_thermometer:
+            continue
+        sigma = getattr(stated, name)
+        absent = [name] * (sigma is None) + [needed] * (factor is None)
+        words = f"{name} of {statement.origin[body, name]}"
+        by_sigma = (sigma or 0.0) * (factor or 0.0) * effect
+        yield _stated(f"{body}_{key}", f"{body}'s {key}", unit, absent, words, sigma, by_sigma)
+
+
+def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> BudgetSource:
+    """Row of an error common to both temperatures (JCGM 100, 5.2.2, r = 1), nearly nil if bodies expand alike."""
+    total, absent, sigmas = np.zeros(1), [], set()
+    for body, stated, effect in bodies:
+        keys = {"temperature_sigma_k": stated.temperature_sigma_k, "expansion_ppm_per_k": stated.expansion_ppm_per_k}
+        absent += [f"{key} of [{body}]" for key, value in keys.items() if value is None]
+        sigmas.add(stated.temperature_sigma_k)
+        total = total + (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * effect
+    sigma = sigmas.pop() if len(sigmas) == 1 else None
+    title, words = "temperature of board and target", "temperature_sigma_k of both, one_thermometer: fully correlated"
+    return _stated("temperature", title, "K", absent, words, sigma, total)
+
+
+def warmer_k(stated: StatedSize) -> float | None:
+    """Returns the temperature in the photographs minus the reference temperature, or None if it is not stated."""
+    return None if stated.temperature_c is None else stated.temperature_c - reference_temperature_c(stated)
+
+
+def reference_temperature_c(stated: StatedSize) -> float:
+    """Returns the temperature at which the size of a body is to be stated: the given one, or 20 °C."""
+    return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
+
+
+@dataclass(frozen=True, slots=True)
+class StatedConditions:
+    """The temperature for which lengths and positions hold, and what they are corrected by for that."""
+
+    size_known: bool  # False if nothing of known size was in view
+    correction: float  # relative, 0 for none
+    temperature_c: float | None  # of the target, None if it is not known
+    words: str  # the same as a sentence without its stop
+
+
+def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
+    """Returns the temperature for which lengths hold, and their correction for the expansion of the board and, only
+    with it, of the target: that starts from the length at the photographs' temperature. A size stated of the target
+    itself holds at its reference temperature (ISO 1), so that no expansion enters."""
+    target = statement.target
+    if any(known.drawn for known in known_distances(board)):
+        words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"
+        return StatedConditions(False, 0.0, None, words)
+    wanted = reference_temperature_c(target)
+    if not board.rows:
+        words = (
+            f"Lengths and positions hold at {wanted:g} °C, as the sizes stated of the target do (ISO 1); they are its "
+            "own, so that no expansion enters"
+        )
+        return StatedConditions(True, 0.0, wanted, words)
+    of_board, of_target = _growth(statement.board), _growth(target)
+    if of_board is not None and of_target is not None:
+        total = of_board - of_target
+        words = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
+        return StatedConditions(True, total, wanted, f"Lengths and positions hold at {wanted:g} °C{words}")
+    photographed = "the temperature at which the target was photographed"
+    if target.temperature_c is not None:
+        photographed = f"{target.temperature_c:g} °C, at which the target was photographed"
+    words = f"Lengths and positions hold at {photographed}"
+    if of_board is not None:
+        words += f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
+        words += ": expansion and temperature of the target are not both stated"
+    else:
+        words += (
+            ", as far as the board's grid had the size of its file there: its expansion and temperature are not both "
+            "stated"
+        )
+        words += ", and without them the target's are not corrected for" if of_target is not None else ""
+    return StatedConditions(True, of_board or 0.0, target.temperature_c, words)
+
+
+def _growth(stated: StatedSize) -> float | None:
+    """Returns the relative expansion of a body since its reference temperature; None if it is not known."""
+    warmer = warmer_k(stated)
+    if 0.0 in (warmer, stated.expansion_ppm_per_k):
+        return 0.0
+    if warmer is None or stated.expansion_ppm_per_k is None:
+        return None
+    return stated.expansion_ppm_per_k * PPM * warmer
+
+
 COVERAGE_FACTOR = 2.0
-LONGEST = 5
+LONGEST_DISTANCES = 5
 """Number of distances in a budget."""
 DRAWS = 100_000
 """Number of random draws for the coverage (JCGM 101:2008)."""
@@ -156,7 +485,7 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
         for kind, rows in kinds
         for face in other_faces
     ]
-    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
+    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]]
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:

@@ -13,11 +13,9 @@ from stcal.errors import StcalError
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.sfm.budget import combine
-from stcal.sfm.budget.budget_file import BudgetFile, _unusual
+from stcal.sfm.budget.budget_file import BudgetFile, _unusual, against_stated
 from stcal.sfm.budget.budget_page import budget_report
-from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.length_test import against_stated
-from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
+from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
