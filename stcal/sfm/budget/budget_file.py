@@ -476,28 +476,6 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTest]) -> list[str]
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
 
-USUAL_K, USUAL_SIGMA_K, USUAL_EXPANSION = 25.0, 10.0, 250.0
-"""Distance from 20 °C, σ of a temperature, K, and expansion, ppm/K, beyond which a statement is asked about: rooms are
-nearer, thermometers better, and plastics expand less."""
-
-
-def _unusual(statement: Statement) -> list[str]:
-    """Returns questions about statements that are possible, and as unusual as those in another unit."""
-    rows = []
-    for body, size in (("board", statement.board), ("target", statement.target)):
-        warm, sigma, rate = (
-            value or 0.0 for value in (size.temperature_c, size.temperature_sigma_k, size.expansion_ppm_per_k)
-        )
-        off = 0.0 if size.temperature_c is None else abs(warm - REFERENCE_C)
-        celsius = f"the {body}'s temperature is {warm:g} °C: or °F, which were {(warm - 32) / 1.8:.1f} °C?"
-        rows += [
-            (off > USUAL_K, celsius),
-            (sigma > USUAL_SIGMA_K, f"σ of the {body}'s temperature is {sigma:g} K: is that its value?"),
-            (abs(rate) > USUAL_EXPANSION, f"the {body} expands by {rate:g} ppm/K, more than plastics do: is that so?"),
-        ]
-    return [question for is_unusual, question in rows if is_unusual]
-
-
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
@@ -527,7 +505,6 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     return [
         *notes,
         *(note for note, applies in told.items() if applies),
-        *_unusual(statement),
         *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
         "the frame is in the poses of the other faces",

@@ -21,9 +21,6 @@ PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
 """Relative σ, in ppm, from which it is stated in %."""
-SHARP_PX = 1.2
-"""σ of the blur of edges above which it limits a result: σ of centres are 1.6 times those at 0.75 px, of a sharp lens
-and the pixels' own size, which 2.5 times the images would make up for."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 FEW_IMAGES = 6
@@ -45,6 +42,30 @@ SIZES = {
     "drawing": "a length of the drawing",
 }
 """What the size of a result rests on."""
+
+
+SOURCES = {
+    "edges": (
+        "The size, by the edges of tags",
+        "all edges may have the same error, which no residual shows; {distance}",
+    ),
+    "sizes": ("The size of the print", "measure it better than size_sigma_mm says, or {distance}"),
+    "board": (
+        "The places of the board's dots",
+        "measure them, or take a better plate, and state sigma_mm in board.toml",
+    ),
+    "print": (
+        "The places of the printed corners",
+        "measure them, or take a better print, and state sigma_mm in target.toml",
+    ),
+    "distances": (
+        "The known distances",
+        "measure a longer one, or the same better, and state it with [[scale]] in target.toml",
+    ),
+    "flatness": ("The flatness of the faces", "measure it, and state it with --flatness"),
+    "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
+}
+"""Name and remedy of each source of σ beside the photographs."""
 
 
 class Judgement(Part):
@@ -217,26 +238,19 @@ class _Run:
             words.append(f"all σ are {larger:.1f} times as large, to cover what is beyond chance: {first.title}")
         return "; ".join(words)
 
-    def _left_out_in(self, face: str) -> list[str]:
-        """Returns the images in which a face was read but left out."""
-        notes = self.report["left_out"]["notes"]
-        codes = (ELSEWHERE, SINGLE)
-        return list(dict.fromkeys(e["image"] for e in notes if e["code"] in codes and e["place"] == face))
-
-    def _has_circles(self, face: str) -> bool:
-        rows = [*self.report["residuals_by_label"], *self.report["left_out"]["circles"]]
-        return any(row["label"].startswith(f"{face}:") for row in rows)
+    def _seen(self, face: str) -> str:
+        """Returns how a face that is not in the result was seen nevertheless; empty if it was not."""
+        notes, left_out = self.report["left_out"]["notes"], self.report["left_out"]["circles"]
+        if images := {n["image"] for n in notes if n["code"] in (ELSEWHERE, SINGLE) and n["place"] == face}:
+            return f"face {face} was read in {len(images)} image{'s' * (len(images) > 1)} and left out"
+        if any(row["label"].startswith(f"{face}:") for row in [*self.report["residuals_by_label"], *left_out]):
+            return f"face {face} is not in it: circles of it were seen, but they do not hold its frame"
+        return ""
 
     def _gaps(self) -> list[str]:
         """Returns in words what is missing: faces that are not in it, or in one image alone, and lost groups."""
-        never, words = [], []
-        for face in self.summary["faces_not_seen"]:
-            if images := self._left_out_in(face):
-                words.append(f"face {face} was read in {len(images)} image{'s' * (len(images) > 1)} and left out")
-            elif self._has_circles(face):
-                words.append(f"face {face} is not in it: circles of it were seen, but they do not hold its frame")
-            else:
-                never.append(face)
+        seen = {face: self._seen(face) for face in self.summary["faces_not_seen"]}
+        never, words = [face for face in seen if not seen[face]], [words for words in seen.values() if words]
         if never:
             words.insert(0, f"no image that was used shows {_faces(never)} of the design")
         if single := [name for name, face in self.faces.items() if face["images"] == 1]:
@@ -258,14 +272,7 @@ class _Run:
         if len(self.faces) == 1:
             return "There is one face, which is the target frame itself; σ of its circles are in faces.json."
         if position is None or rotation is None:
-            ways = [chain for chains in self.report["chains"].values() if len(chains) > 1 for chain in chains]
-            if not ways:
-                return "There are no σ, and no face is reached by two chains that could be compared."
-            apart, turned = max(way["translation_mm"] for way in ways), max(way["rotation_rad"] for way in ways)
-            return (
-                f"There are no σ; chains to the same face through different groups are up to {number(1e3 * apart, 1)} "
-                f"µm and {number(1e3 * math.degrees(turned), 2)} mdeg off their mean."
-            )
+            return "There are no σ; the report has how far chains to the same face are off their mean."
         ppm, rim, scale = self.summary["scale_sigma_ppm"], self.summary.get("rim_mm"), ""
         if ppm is not None:
             scale = f", the size to {f'{number(ppm, 1)} ppm' if ppm < MOST_PPM else f'{significant(1e-4 * ppm)} %'}"
@@ -388,45 +395,22 @@ class _Run:
         centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says which do most."
         if not variance:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
-        share = f"{number(100 * variance / sigma**2, 0)} {of_all}"
-        blurs = [sum(row["blur_px"]) / 2 for row in self.report.get("focus", [])]
-        if blurs and (blur := median(blurs)) > SHARP_PX:
-            return (
-                f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres "
-                f"grow with it; they are {share}.",
-                f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
-            )
-        fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
-        of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
+        fewer, share = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0)), 100 * variance / sigma**2
+        centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
-            f"The centring of circles{of_centres} in {self.summary['images_mapped']} images: {share}; no face stands "
-            "out.",
+            f"{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands out.",
             f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these "
             f"{number(sigma, 1)} µm, and {advice}",
         )
 
     def _source(self, kind: str) -> Cause:
         """Returns the name of a source other than the photographs that limits the result, and its remedy."""
-        few = "" if self.are_few else "More photographs help little: "
         given = "a longer or better known" if "distances" in self.scale_from else "the"
-        distance = f"state {given} distance of two points of the target"
+        distance = f"state {given} distance of two points of the target with [[scale]] in target.toml"
         if kind == "sizes" and (self.summary.get("edge_share") or 0.0) > 0.5:
-            common = "all edges may have the same error, which no residual shows"
-            return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
-        name, remedy = {
-            "sizes": ("The size of the print", "measure it better than size_sigma_mm says, or "
-                      f"{distance} with [[scale]] in target.toml"),
-            "board": ("The places of the board's dots", "measure them, or take a better plate, and state sigma_mm in "
-                      "board.toml"),
-            "print": ("The places of the printed corners", "measure them, or take a better print, and state sigma_mm "
-                      "in target.toml"),
-            "distances": ("The known distances", "measure a longer one, or the same better, and state it with "
-                          "[[scale]] in target.toml"),
-            "flatness": ("The flatness of the faces", "measure it, and state it with --flatness"),
-            "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give "
-                           "that file"),
-        }[kind]  # fmt: skip
-        return name, sentence(f"{few}{remedy}")
+            kind = "edges"
+        few, (name, remedy) = "" if self.are_few else "More photographs help little: ", SOURCES[kind]
+        return name, sentence(f"{few}{remedy.format(distance=distance)}")
 
     def _more(self, verdict: Use) -> list[str]:
         """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
@@ -434,7 +418,7 @@ class _Run:
         if self.faces and self.are_few:
             used, given = (self.summary[key] for key in ("images_mapped", "images"))
             advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
-        read = [face for face in self.lacking if self._left_out_in(face) or self._has_circles(face)]
+        read = [face for face in self.lacking if self._seen(face)]
         if unseen := [face for face in self.lacking if face not in read]:
             advice.append(
                 f"Photograph {_faces(unseen)} together with one of the others: no image that was used shows it."

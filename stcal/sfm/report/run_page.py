@@ -99,8 +99,6 @@ def report_html(
         Section("Faces in detail", _faces_in_detail(report, words), name="detail"),
         Section("Scale", _scale(report, words)),
         Section("Residuals", _residuals(report, colours)),
-        Section("Focus", _focus(report)),
-        Section("Initial pairs", _pairs(report), name="pairs"),
         Section("Left out", _left_out(report, words)),
         *(Section(title, make(report[key]), name=key) for key, (title, make) in others.items() if key in report),
         Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")]),
@@ -328,40 +326,6 @@ def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
 def _by_label(planes: dict[str, list]) -> Block:
     heads = ["<Label", "Images", "RMS (px)", "Max (px)"]
     return columns(*([subheading(name), Table(heads, rows)] for name, rows in planes.items()), css="columns small")
-
-
-def _focus(report: dict) -> list[Block]:
-    """Returns what was corrected for blur that varies across a circle."""
-    if not report.get("focus"):
-        return []
-    rows = []
-    for row in report["focus"]:
-        (near, far), (near_px, far_px) = row["depth_mm"], row["blur_px"]
-        depths = [number(near, 0), number(near_px, 2), number(far, 0), number(far_px, 2)]
-        rows.append([row["image"], number(row["focused_mm"], 0), *depths, number(row["shift_px"], 4)])
-    heads = ["<Image", "In focus at (mm)", "Nearest circle (mm)", "Its blur (px)", "Farthest (mm)", "Its blur (px)"]
-    return [
-        "Out of focus the blur grows with the distance from the plane of focus, also across a tilted circle, whose "
-        "centre then seems to lie nearer to its blurrier side. Centres are corrected for it, and what is uncertain of "
-        "it is in their σ",
-        Table([*heads, "Largest correction (px)"], rows),
-    ]
-
-
-def _pairs(report: dict) -> list[Block]:
-    """Returns how each group's mapping began."""
-    rows = []
-    for group in report["groups"]:
-        pair = group["pairs"][0]
-        angle = number(math.degrees(pair["median_angle_rad"]), 2)
-        start = [f"{pair['first']} and {pair['second']}", angle, group["seeded"], group["rounds"]]
-        rows.append([group["name"], len(group["images"]), join(group["faces"]), group["points"], *start])
-    heads = ["<Group", "Images mapped", "<Faces", "Points", "<Chosen pair", "Angle (°)", "<Started from", "Rounds"]
-    return [
-        "Each group starts from the pair of images with the largest median ray angle that is still safe "
-        f"({report['options']['max_pair_angle_deg']:.1f}° at most)",
-        Table(heads, rows),
-    ]
 
 
 def _left_out(report: dict, words: Words) -> list[Block]:

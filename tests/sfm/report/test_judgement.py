@@ -152,9 +152,6 @@ def test_without_sigma():
     found = judgement_of(own)
     assert (found.verdict, found.position_sigma_um, found.position_face) == ("with care", None, None)
     assert "--solve joint" in found.next
-    (way,) = own["chains"]["2"]
-    own["chains"]["2"] = [way, way | {"translation_mm": 0.02004}]
-    assert "up to 20.0 µm and 7.25 mdeg off" in judgement_of(own).quality
 
 
 def test_the_board_alone_and_one_face():
@@ -177,16 +174,6 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
     own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
     own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
     assert judgement_of(own).use == "With care: focus changed, though no check failed."
-
-
-def test_blur_that_limits_is_said_before_more_images():
-    own = report()
-    own["focus"] = [{"blur_px": [2.5, 1.5]}]
-    told = judgement_of(own)
-    assert told.limit.startswith("The sharpness: edges are blurred by 2.0 px")
-    assert "Nothing has to be done" not in told.next
-    own["focus"] = [{"blur_px": [0.9, 0.8]}]
-    assert "sharpness" not in judgement_of(own).limit
 
 
 def test_a_difference_from_the_native_program_calls_for_care():
