@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.json import Part, Pose, ResultFile
+from stcal.io.json import Named, ResultFile
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.report.text import join, number, text_table
@@ -482,30 +482,13 @@ def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
     return CentreNoise.expected(), "what corners of tags have in rendered photographs" if of_corners else of_circles
 
 
-class ViewRow(Part):
-    group: str
-    middle: str
-    azimuth_deg: float
-    elevation_deg: float
-    roll_deg: float
-    distance_mm: float
-    tilts_deg: dict[str, float]
-    nearest: str
-    nearest_deg: float
-    camera_from_target: Pose
-    labels: list[str]
-
-
-class ChoiceRow(Part):
-    view: ViewRow = Field(
-        description="`group`; `middle`, the photograph in the middle of the group's views; `azimuth_deg` to the right "
-        "and `elevation_deg` up from there as that photograph shows them (longitude and latitude about the middle of "
-        "board and faces), `roll_deg` of the camera about its axis, `distance_mm` to that middle; `tilts_deg` by face "
-        "and `board`, between normal and line of sight; `nearest` photograph and `nearest_deg` to it; "
-        "`camera_from_target` 4×4; `labels` in view"
-    )
-    face: str
-    sigma_mm: float
+Choice = Annotated[
+    AdvisedView,
+    Named(
+        "view.group view.middle view.azimuth_deg view.elevation_deg view.roll_deg view.distance_mm view.tilts_deg "
+        "view.nearest view.nearest_deg view.camera_from_target view.labels face sigma_mm"
+    ),
+]
 
 
 class AdviceFile(ResultFile):
@@ -513,9 +496,13 @@ class AdviceFile(ResultFile):
 
     format: Literal["stcal advice 1"] = Field(description="the file's form and its version")
     now: ForecastPart = Field(description=FORECAST)
-    choices: list[ChoiceRow] = Field(
+    choices: list[Choice] = Field(
         description="further photographs, one after the other: `view`, and the worst `face` with its `sigma_mm` with "
-        "this view and those before"
+        "this view and those before. A view has `group`; `middle`, the photograph in the middle of the group's views; "
+        "`azimuth_deg` to the right and `elevation_deg` up from there as that photograph shows them (longitude and "
+        "latitude about the middle of board and faces), `roll_deg` about the camera's axis, `distance_mm` to that "
+        "middle; `tilts_deg` by face and `board`, between normal and line of sight; `nearest` photograph and "
+        "`nearest_deg` to it; `camera_from_target` 4×4; `labels` in view"
     )
     new_groups: tuple[NewGroup, ...] = Field(
         description="pairs of `faces` that no group shows together, the best first: the worst `face` and its "
@@ -532,7 +519,7 @@ class AdviceFile(ResultFile):
         return cls(
             format="stcal advice 1",
             now=ForecastPart.of(advice.now, advice.shares),
-            choices=[ChoiceRow.model_validate(choice) for choice in advice.choices],
+            choices=list(advice.choices),
             new_groups=advice.new_groups,
             board_dominates=advice.board_dominates,
             half_board_sigma_um=MICRO * advice.better_board.worst()[1],
