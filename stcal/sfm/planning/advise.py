@@ -529,12 +529,8 @@ class AdviceFile(ResultFile):
 
 HOW_TO_GO = (
     "go right and up as seen in the photograph named, about the middle of board and faces, which is to be in the "
-    "middle of the image, mm away; degrees of board and faces are from their normal. If board or target have been "
-    "moved since, photograph a new group"
-)
-HOW_TO_TURN = (
-    "go right and up as seen in the photograph named, about the middle of the body, or turn the body the other way; it "
-    "must be in the middle of the image, mm away; degrees of faces are from their normal"
+    "middle of the image, mm away; degrees of board and faces are from their normal. A body without a board may be "
+    "turned the other way instead; if board or target have been moved since, photograph a new group"
 )
 
 
@@ -551,7 +547,7 @@ def advice_text(advice: Advice) -> str:
     lines += text_table([["<group", "<from", "<go", "mm", "<sees", "<nearest", "<worst face, µm"], *_views(advice)])
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")
-    lines.append(HOW_TO_GO if advice.has_board else HOW_TO_TURN)
+    lines.append(HOW_TO_GO)
     ways = [(better_um, "a board of half the σ" if advice.has_board else "print and size of half the σ")]
     if count := len(advice.choices):
         ways.append(

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import Any
@@ -30,7 +29,7 @@ from stcal.report.document import (
 )
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import run_figures
-from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, TestedValue, count_verdicts
+from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
 from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, photographs, space_parts
@@ -43,20 +42,9 @@ SOLVES = {
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
-    """Words for what was photographed."""
-
-    point: str  # circle, corner or, where faces have either, point
-    points: str  # the plural
-    board: bool  # whether a board of dots gives the scale
-
-    @classmethod
-    def of(cls, report: dict) -> "Words":
-        """Returns the words for a run."""
-        printed = {face in report["summary"].get("printed_faces", []) for face in report["faces"]}
-        point = "point" if len(printed) > 1 else "corner" if True in printed else "circle"
-        return cls(point, f"{point}s", "board" in report["summary"].get("scale_from", ["board"]))
+def has_board(report: dict) -> bool:
+    """Returns whether a board of dots gives the scale."""
+    return "board" in report["summary"].get("scale_from", ["board"])
 
 
 PUBLISHED = (
@@ -82,26 +70,26 @@ def report_html(
         report = without_sigma(report)
     report = _with_named_groups(report)
     colours = run_figures.group_colours([group["name"] for group in report["groups"]])
-    summary, words, options = report["summary"], Words.of(report), report["options"]
+    summary, options = report["summary"], report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
     pictures = [
-        macro("photographs", shown, rest, words) if shown["each"] else "" if gone else "There are none",
+        macro("photographs", shown, rest) if shown["each"] else "" if gone else "There are none",
         f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
         if gone
         else "",
     ]
     answers = macro("answers", judgement.answers(), tone_of(judgement.verdict))
     sections = [
-        Section("Faces", _answer(report, colours, words)),
+        Section("Faces", _answer(report, colours)),
         Section("May I use it?", [answers, *checks_section(report.get("checks", []))], name="use"),
-        Section("How far to trust it", trust(report, judgement, words), name="trust"),
-        Section("Faces in detail", _faces_in_detail(report, words), name="detail"),
-        Section("Scale", _scale(report, words)),
+        Section("How far to trust it", trust(report, judgement), name="trust"),
+        Section("Faces in detail", _faces_in_detail(report), name="detail"),
+        Section("Scale", _scale(report)),
         Section("Residuals", _residuals(report, colours)),
-        Section("Left out", _left_out(report, words)),
+        Section("Left out", _left_out(report)),
         *(Section(title, make(report[key]), name=key) for key, (title, make) in others.items() if key in report),
-        Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")]),
+        Section("Settings", [Table(["<Setting", "<Value"], settings(report), css="text facts")]),
         Section("Overlays", pictures),
     ]
     counts = (
@@ -158,11 +146,10 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
     return Table(["<Face"] + ["x", "y", "z"] * 3, rows, [("", 1), ("mm", 3), ("σ µm", 3), ("σ mdeg", 3)])
 
 
-def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
+def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
     """Returns the faces with σ, the target in space, and how to use the result."""
     others = [face for face in report["faces"] if face != report["reference_face"]]
-    with_it = "boards and cameras" if words.board else "cameras"
-    origin = "origin circle" if words.point == "circle" else "origin"
+    with_it = "boards and cameras" if has_board(report) else "cameras"
     parts = space_parts(report, colours)
     space = [
         macro(
@@ -177,12 +164,12 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     use = [
         subheading("How to use it"),
         "faces.json beside this page has the pose of each face as a 4×4 matrix, the covariance of each, and the "
-        f"{words.points} in the target frame; `stcal-sfm export RUN` writes it for other programs",
+        "points in the target frame; `stcal-sfm export RUN` writes it for other programs",
         macro("verbatim", HOW_TO_USE.replace("{face}", others[0] if others else "")),
     ]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
-        f"is that of the face's {origin}, σ are one standard deviation, of the position along and of the rotation "
+        f"is that of the face's origin, σ are one standard deviation, of the position along and of the rotation "
         "about an axis"
         if report["faces"]
         else "",
@@ -191,7 +178,7 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     ]
 
 
-def _faces_in_detail(report: dict, words: Words) -> list[Block]:
+def _faces_in_detail(report: dict) -> list[Block]:
     """Returns what each face rests on, distances between faces, and the ways to each face."""
     rests = [
         [name, *cells(face, "circles circles_of_design plane_rms_um:1 images"), join(face["groups"])]
@@ -207,7 +194,7 @@ def _faces_in_detail(report: dict, words: Words) -> list[Block]:
             off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
             ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
-    found = [f"{words.points.capitalize()} found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
+    found = ["Points found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     return [
         Table(["<Face", *found], rests),
         columns(
@@ -229,14 +216,14 @@ def _faces_in_detail(report: dict, words: Words) -> list[Block]:
     ]
 
 
-def _scale(report: dict, words: Words) -> list[Block]:
+def _scale(report: dict) -> list[Block]:
     """Returns λ and the board's residuals of each group."""
     by_rows = [("λ, by rows (mm/unit)", "mm_per_unit_rows:6"), ("Rows", ""), ("Difference (ppm)", "difference_ppm:1")]
     columns_of = [
         ("λ, least squares (mm/unit)", "mm_per_unit:6"),
-        *(by_rows if words.board else ()),
+        *(by_rows if has_board(report) else ()),
         ("σ (ppm)", "sigma_ppm:1"),
-        ("Dots" if words.board else "Points", "dots"),
+        ("Dots" if has_board(report) else "Points", "dots"),
         ("Residual, mean (µm)", "board_mean_um:1"),
         ("± (µm)", "board_spread_um:1"),
         ("Residual, RMS (µm)", "board_rms_um:1"),
@@ -262,11 +249,11 @@ def _scale(report: dict, words: Words) -> list[Block]:
     return [
         "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
         "(first and last row, all pairs). σ is that of λ from the board's stated σ"
-        if words.board
+        if has_board(report)
         else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
         "distances between points. σ is that of λ from their stated σ",
         Table(["<Group", *(head for head, _ in columns_of), "Residual, max (µm)"], rows),
-        without if words.board and len(pictures) < len(report["groups"]) else "",
+        without if has_board(report) and len(pictures) < len(report["groups"]) else "",
         *(of_boards if pictures else []),
     ]
 
@@ -328,11 +315,10 @@ def _by_label(planes: dict[str, list]) -> Block:
     return columns(*([subheading(name), Table(heads, rows)] for name, rows in planes.items()), css="columns small")
 
 
-def _left_out(report: dict, words: Words) -> list[Block]:
+def _left_out(report: dict) -> list[Block]:
     """Returns all that was left out, with reasons, and the notes."""
     left, unseen = report["left_out"], report["summary"]["faces_not_seen"]
     blocks: list[Block] = []
-    points = words.points.capitalize()
     circles: dict[tuple[str, str], list[str]] = {}
     for circle in left["circles"]:
         circles.setdefault((circle["image"], circle["reason"]), []).append(circle["label"])
@@ -340,7 +326,7 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     for title, heads, rows in (
         ("Files", ["<File", "<Reason"], [cells(row, "name reason") for row in left["files"]]),
         ("Images", ["<Image", "<Reason"], [cells(row, "name reason") for row in left["images"]]),
-        (points, ["<Image", "Number", f"<{points}", "<Reason"], of_circles),
+        ("Points", ["<Image", "Number", "<Points", "<Reason"], of_circles),
         ("Notes on images", ["<Image", "<Note"], [cells(row, "image note") for row in left["notes"]]),
         ("Notes on the whole run", ["<No.", "<Note"], [[i, note["note"]] for i, note in enumerate(report["notes"], 1)]),
     ):
@@ -351,11 +337,10 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     return blocks or ["Nothing was left out"]
 
 
-def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
+def trust(report: dict, judgement: Judgement) -> list[Block]:
     """Returns for what σ hold, and the worst value of each kind."""
     summary, options = report["summary"], report["options"]
-    sources = summary.get("scale_from", ["board"])
-    size = " and ".join(SIZES[source] for source in sources)
+    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
     if options["solve"] != "joint":
         scope = (
             "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
@@ -365,14 +350,12 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
         scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
     else:
         refined = options.get("refine_camera", False)
-        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
-        scope += "; the intrinsics were adjusted, and their σ are in them" if refined else ""
-        scope += ". The σ stated of the size are in them" if {"faces", "distances"} & set(sources) else ""
         absent = [] if refined else ["the camera calibration"]
-        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if words.board else []
-        if absent:
-            errors = ", or of ".join(absent) + "," * (len(absent) > 1)
-            scope += f". An error of {errors} is not in them, and residuals hardly show it"
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if has_board(report) else []
+        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
+        scope += (
+            f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
+        )
     factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
     larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
     of_groups = f"group by group, residuals are {larger} the centres' own σ"
@@ -387,12 +370,12 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     return [scope, of_groups, f"{one_way} {join(single)}" if single else ""]
 
 
-def settings(report: dict, words: Words) -> list[list[str]]:
+def settings(report: dict) -> list[list[str]]:
     summary, options, camera = report["summary"], report["options"], report["camera"]
     left_out, last_move = report["left_out"], summary["last_move_px"]
     sizes = " × ".join(str(size) for size in camera["size_px"])
     solve, frame = str(options["solve"]), str(options["frame"])
-    round_ = words.point != "corner"
+    round_ = not report["faces"] or not report["faces"].keys() <= set(summary.get("printed_faces", []))
     single = sum(row.get("gate") == "views" for row in left_out["circles"])
     eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
     rows = [
@@ -408,7 +391,7 @@ def settings(report: dict, words: Words) -> list[list[str]]:
         [
             "Left out",
             f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
-            f"{len(left_out['circles']) - single} {words.points}; {single} more that one image of a group alone shows",
+            f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows",
         ],
         ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
         [
@@ -423,32 +406,13 @@ def settings(report: dict, words: Words) -> list[list[str]]:
     return [[name, value] for name, value in rows if value]
 
 
-LIMITS = (
-    ("mapped_sigma", "σ", "of faces and circles between the programs"),
-    ("sigma", "σ", "of these adjusted"),
-    ("face_um", "µm", "of faces"),
-    ("face_mdeg", "mdeg", "of faces"),
-    ("circle_um", "µm", "of circles"),
-    ("camera_um", "µm", "of cameras"),
-    ("camera_mdeg", "mdeg", "of cameras"),
-)
-
-
 def crosscheck_section(check: dict) -> list[Block]:
     """Returns the section on the cross-check with the native COLMAP."""
-    limits, mapping = check["tolerances"], check["mapping"]
-    allowed = [f"{limits[key]:g} {unit} {what}" for key, unit, what in LIMITS if limits[key] is not None]
-    faces: dict[str, list[tuple[float, str]]] = {}
-    for label, value in mapping["circles_um"].items():
-        faces.setdefault(parse_label(label).plane, []).append((value, label))
+    mapping = check["mapping"]
     names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
     models = [
         [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
         for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
-    ]
-    circles = [
-        [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
-        for face, rows in sorted(faces.items())
     ]
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
@@ -466,12 +430,8 @@ def crosscheck_section(check: dict) -> list[Block]:
         subheading("Faces"),
         "Differences in the target frame: the two programs' models as COLMAP adjusts them; the native models against "
         "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
-        f"deviations. Allowed in the first two: {', '.join(allowed)}; the third shows what weights and the joint "
-        "adjustment are worth",
+        "deviations. The third has no tolerance: it shows what weights and the joint adjustment are worth",
         Table(["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3, rows, over),
-        subheading("Circles"),
-        "Native against pycolmap",
-        Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
         subheading("Cameras"),
         "Native against pycolmap, against the target, and in σ of the camera in its group. They matter only if faces "
         f"move with them, which the table of faces shows{largest}",
@@ -490,7 +450,7 @@ def checks_section(rows: list[dict]) -> list[Block]:
     is_open = [check.verdict in ("failed", "suspicious") for check in checks]
     open_, others = ([_check_row(c) for c, own in zip(checks, is_open, strict=True) if own is k] for k in (True, False))
     measured = [
-        [check.title, m.name, *_number(m), NONE if m.probability is None else f"{m.probability:.1g}"]
+        [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
         for check in checks
         for m in check.measured
     ]
@@ -511,18 +471,8 @@ def checks_section(rows: list[dict]) -> list[Block]:
 def _check_row(check: Check) -> list:
     surplus = len(check.names) - FIRST_NAMES
     names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
-    value = _number(check.measured[0]) if check.measured else [NONE, NONE]
+    value = check.measured[0].texts() if check.measured else [NONE, NONE]
     return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
-
-
-def _number(measured: TestedValue) -> list[str]:
-    """Returns value and limit with their unit."""
-
-    def short(value: float) -> str:
-        return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
-
-    unit = f" {measured.unit}" if measured.unit else ""
-    return [short(measured.value) + unit, NONE if measured.limit is None else short(measured.limit) + unit]
 
 
 def published_section(comparison: dict) -> list[Block]:
