@@ -194,8 +194,8 @@ class _Way:
 
 def _ways(part: Part, paper: str) -> list[_Way]:
     """Return the layouts of a part: portrait and landscape, with dimensions, or bare on one sheet."""
-    ways, boxes = [], np.array([shape.box() for shape in part.pattern()])
-    for bare, size in product((False, True), (PAPERS[paper], PAPERS[paper][::-1])):
+    ways, boxes, (width, height) = [], np.array([shape.box() for shape in part.pattern()]), PAPERS[paper]
+    for bare, size in product((False, True), ((width, height), (height, width))):
         shapes = framed(part, bare)
         box, room = extent(shapes), np.array(size) - FURNITURE
         across, down = (

@@ -376,9 +376,9 @@ class BudgetFile(ResultFile):
             )
         distances = []
         for row in budget.of_kind("distance"):
-            names, length = list(row.measurand.circles), row.measurand.length_mm or 0.0
+            length = row.measurand.length_mm or 0.0
             own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
-            distances.append(DistanceUncertainty(circles=names, **own))
+            distances.append(DistanceUncertainty(circles=list(row.measurand.circles), **own))
         circles, variance = {}, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
         for label, own in zip(budget.joint.labels, variance, strict=True):
             xyz = enlarged * np.asarray(run.faces.circles[label])

@@ -382,7 +382,10 @@ def _ideal_views(
     place = {image.image_id: i for i, image in enumerate(images)}
     xy_px = np.concatenate([[images[place[i]].points2D[k].xy for i, k in point.views] for point in points])
     ideal = iter((focal_px * camera.normalised_from_pixel(from_colmap_px(xy_px))).tolist())
-    return [[(place[i], k, *next(ideal)) for i, k in point.views] for point in points]
+    return [
+        [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, ideal, strict=False)]  # which goes on
+        for point in points
+    ]
 
 
 def _nvm(

@@ -249,7 +249,7 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
         near = int(cosine.argmax())
         axes = axes_of(model.camera_from_model[near], stand.directions[near])
         right, up, ahead = (axes @ direction).tolist()
-        angles = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
+        azimuth, elevation = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
         position = stand.centre + stand.distance_mm * direction
         tilts = {face: tilt_deg(normals[face], middles[face], position) for face in sorted(normals)}
         tilts = {face: tilt for face, tilt in tilts.items() if tilt < MAX_TILT_DEG}
@@ -257,7 +257,7 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
         pose = stand.pose(direction, axes[1], roll)
         own = single(model, f"view {one} {two} {share} {roll}", pose, labels, setup, noise)
         nearest = model.images[near], model.images[near], angle_deg(cosine[near])
-        views.append(PlannedView(model.group, own, *angles, roll, stand.distance_mm, tilts, *nearest))
+        views.append(PlannedView(model.group, own, azimuth, elevation, roll, stand.distance_mm, tilts, *nearest))
     return views
 
 

@@ -78,7 +78,7 @@ class TestedValue:
     def texts(self) -> list[str]:
         """Returns the value with its unit, and the limit, to three digits, large ones without an exponent."""
         value, limit = (
-            "" if each is None else f"{each:.0f}" if abs(each) >= 999.5 else f"{each:.3g}"
+            "" if each is None else f"{float(f'{each:.3g}'):.0f}" if abs(each) >= 999.5 else f"{each:.3g}"
             for each in (self.value, self.limit)
         )
         return [f"{value} {self.unit}".strip(), limit]
