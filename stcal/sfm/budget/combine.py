@@ -1,7 +1,7 @@
 """Uncertainty budget of a run: sources with the conditions stated for them, and how they combine to expanded
 uncertainties of faces and of the target's largest distances."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date, time
 from itertools import combinations, combinations_with_replacement
@@ -140,145 +140,114 @@ def sources_of(
     camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[BudgetSource, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
-    joint, covariance, sigma_px = contributions.joint, contributions.covariance_mm2, contributions.centre_sigma_px
-    corners = bool(faces_of_known_shape(board))
-    title, by_residuals = "corners and centres of faces" if corners else "centres of circles", "residuals; RMS per axis"
-    points = ("estimated", by_residuals, sigma_px[CIRCLES], "px", covariance[CIRCLES])
-    rows = [BudgetSource("circle_centres", title, "A", *points)]
+    adjusted = _of_adjustment(contributions, board, flatness_mm)
+    intrinsics = _intrinsics(contributions, camera, refined, camera_given)
+    return (*adjusted, intrinsics, *(_of_statement(contributions, statement) if board.rows else ()))
+
+
+def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float | None) -> Iterator[BudgetSource]:
+    """Yields the rows of what the adjustment takes as observations, but the intrinsics."""
+    joint, factor, sigma_px = found.joint, found.joint.sigma_scale, found.centre_sigma_px
+    faces, known = faces_of_known_shape(board), known_distances(board)
+    stated: tuple[Origin, str] = "estimated", "residuals; RMS per axis"
+
+    def row(key: str, title: str, kind: str, own: tuple[Origin, str], sigma: float | None, unit="µm") -> BudgetSource:
+        evaluation = "A" if own[0] == "estimated" else "B"
+        return BudgetSource(key, title, evaluation, *own, sigma, unit, found.covariance_mm2[kind])
+
+    def or_default(words: str, default: bool) -> tuple[Origin, str]:
+        return ("assumed", words + DEFAULT) if default else ("stated", words)
+
+    title = "corners and centres of faces" if faces else "centres of circles"
+    yield row("circle_centres", title, CIRCLES, stated, sigma_px[CIRCLES], "px")
     if board.rows:
-        dots = ("estimated", by_residuals, sigma_px[DOTS], "px", covariance[DOTS])
-        rows.append(BudgetSource("dot_centres", "centres of dots", "A", *dots))
-        shape = f"{100 * joint.board_common:.0f} % of it common to all groups"
-        origin, words = _stated_or_default(
-            f"sigma_mm of board.toml × σ₀ {joint.sigma_scale:.3f}; "
-            f"{shape if joint.board_common else 'each group its own'}",
-            board.sigma_mm == DOTS_SIGMA_MM,
-        )
-        sigma_um = 1e3 * board.sigma_mm * joint.sigma_scale
-        rows.append(BudgetSource("board_dots", "places of dots", "B", origin, words, sigma_um, "µm", covariance[BOARD]))
-    rows += _own_size(contributions, board)
-    if not corners or covariance[FLATNESS].any():
-        rows.append(_flatness(contributions, flatness_mm))
-    rows.append(_intrinsics(contributions, camera, refined, camera_given))
-    if board.rows:
-        by_scale, grown = contributions.by_scale, joint.xyz_model - joint.xyz_model.mean(0)
-        name, sigma = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm
-        absent, words = [name] * (sigma is None), f"{name} of {statement.origin['board', name]}"
-        rows.append(_stated("board_pitch", "board's pitch", "ppm", absent, words, sigma, (sigma or 0.0) * by_scale))
-        bodies = (("board", statement.board, by_scale), ("target", statement.target, -grown.ravel()))
-        for body, stated, effect in bodies:
-            rows += _expansion(body, stated, effect, statement)
-        if statement.one_thermometer:
-            rows.append(_one_thermometer(bodies))
-    return tuple(rows)
-
-
-def _stated_or_default(words: str, default: bool) -> tuple[Origin, str]:
-    """Returns the origin of a σ, and the words on it: assumed where nobody has changed the default."""
-    return ("assumed", words + DEFAULT) if default else ("stated", words)
-
-
-def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[BudgetSource]:
-    """Yields the rows of faces of known shape and of known distances."""
-    factor = contributions.joint.sigma_scale
-    if faces := faces_of_known_shape(board):
-        print_factor = contributions.joint.print_factor
-        within_stated = max(face.sigma_mm or 0.0 for face in faces)
-        within = within_stated * print_factor * factor
-        origin, words = _stated_or_default(
-            f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness",
-            within_stated == TAG_SIGMA_MM,
-        )
-        yield BudgetSource(
-            "print", "print of faces", "B", origin, words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
-        )
+        yield row("dot_centres", "centres of dots", DOTS, stated, sigma_px[DOTS], "px")
+        common = f"{100 * joint.board_common:.0f} % of it common to all groups"
+        words = f"sigma_mm of board.toml × σ₀ {factor:.3f}; {common if joint.board_common else 'each group its own'}"
+        stated = or_default(words, board.sigma_mm == DOTS_SIGMA_MM)
+        yield row("board_dots", "places of dots", BOARD, stated, 1e3 * board.sigma_mm * factor)
+    if faces:
+        own, within = joint.print_factor * factor, max(face.sigma_mm or 0.0 for face in faces)
+        words = f"sigma_mm of target.toml × {own:.2f}, in the plane; off it --flatness"
+        yield row("print", "print of faces", PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own)
         largest = max(faces, key=lambda face: face.size_sigma)
-        sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
-        stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
-        edges = "a common displacement of the edges of all tags"
-        words = f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
-        if by_statement:
-            words = "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
-        ppm = 1e6 * sigma if sigma else None
-        yield BudgetSource(
-            "print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES]
-        )
-    if known := known_distances(board):
-        sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
-        words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
-        covariance = contributions.covariance_mm2[DISTANCES]
-        if known[0].drawn:
-            words = "nothing of known size was in view: only the shape is known"
-            yield BudgetSource("distances", "size", "B", "not known", words, None, "µm", covariance)
-            return
-        yield BudgetSource("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
-
-
-def _flatness(contributions: Contributions, flatness_mm: float | None) -> BudgetSource:
-    words, factor = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}", contributions.joint.sigma_scale
-    row: tuple[Origin, str, float | None] = ("not stated", "--flatness off: faces need not be flat", None)
-    if flatness_mm is not None:
-        row = "stated", words, 1e3 * flatness_mm * factor
-        if flatness_mm == FLATNESS_MM:
-            row = "assumed", f"the default of {words}", row[2]
-    return BudgetSource("flatness", "flatness of faces", "B", *row, "µm", contributions.covariance_mm2[FLATNESS])
+        sigma, edges = largest.size_sigma, "a common displacement of the edges of all tags"
+        stated = "assumed" if sigma else "not stated", f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
+        if sigma > 0 and largest.edge_share < 1:
+            stated = "stated", "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
+        yield row("print_size", "size of print", SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
+    if known and known[0].drawn:
+        stated = "not known", "nothing of known size was in view: only the shape is known"
+        yield row("distances", "size", DISTANCES, stated, None)
+    elif known:
+        stated = "stated", f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
+        largest_mm = max(each.sigma_mm for each in known)
+        yield row("distances", "known distances", DISTANCES, stated, 1e3 * largest_mm * factor)
+    if not faces or found.covariance_mm2[FLATNESS].any():
+        words, sigma_um = f"--flatness of the run × σ₀ {factor:.3f}", None
+        stated = "not stated", "--flatness off: faces need not be flat"
+        if flatness_mm is not None:
+            is_default, sigma_um = flatness_mm == FLATNESS_MM, 1e3 * flatness_mm * factor
+            stated = ("assumed", f"the default of {words}") if is_default else ("stated", words)
+        yield row("flatness", "flatness of faces", FLATNESS, stated, sigma_um)
 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
-    adjusted = contributions.covariance_mm2[INTRINSICS]
-    row: tuple[Literal["A", "B"], Origin, str, np.ndarray]
+    covariance = contributions.covariance_mm2[INTRINSICS]
+    origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
     if not camera_given:
-        row = "A", "estimated", "found from these photographs, without a camera file; adjusted with all else", adjusted
-    elif refined and camera.covariance is not None:
-        row = "B", "stated", "adjusted; σ before that of the camera file", adjusted
+        origin, words = "estimated", "found from these photographs, without a camera file; adjusted with all else"
     elif refined:
-        row = "B", "assumed", "adjusted; σ before that of a calibration of some age", adjusted
-    elif camera.covariance is not None:
-        effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
-        row = "B", "stated", "fixed; σ of the camera file", effect @ camera.covariance @ effect.T
+        known = "the camera file" if origin == "stated" else "a calibration of some age"
+        words = f"adjusted; σ before that of {known}"
     else:
-        row = "B", "not stated", "fixed; no σ in the camera file", np.zeros_like(adjusted)
-    return BudgetSource("intrinsics", "intrinsics", *row[:3], None, "", row[3])
+        words = "fixed; σ of the camera file" if origin == "stated" else "fixed; no σ in the camera file"
+        effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+        covariance = np.zeros_like(covariance) if camera.covariance is None else effect @ camera.covariance @ effect.T
+    evaluation = "A" if origin == "estimated" else "B"
+    return BudgetSource("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
 
 
-def _stated(
-    key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, effect_ppm: np.ndarray
-) -> BudgetSource:
-    """Returns the row of an input that the user states; where keys are absent from the statement, it is exact.
-    ``effect_ppm``: (3c,) of one σ on the circles, times a million."""
-    covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)
-    if absent:
-        return BudgetSource(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
-    return BudgetSource(key, title, "B", "stated", words, sigma, unit, covariance)
+def _of_statement(found: Contributions, statement: Statement) -> Iterator[BudgetSource]:
+    """Yields the rows of what the user states; an input of which something is not stated is exact."""
 
+    def row(key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma, effect_ppm) -> BudgetSource:
+        covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)  # of one σ on the circles
+        if absent:
+            return BudgetSource(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
+        return BudgetSource(key, title, "B", "stated", words, sigma, unit, covariance)
 
-def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[BudgetSource]:
-    """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
-    warmer = warmer_k(stated)
-    for key, name, needed, factor, unit in (
-        ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
-        ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer, "ppm/K"),
+    def said(body: str, name: str) -> str:
+        return f"{name} of {statement.origin[body, name]}"
+
+    name, sigma, grown = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm, found.joint.xyz_model
+    absent, effect = [name] * (sigma is None), (sigma or 0.0) * found.by_scale
+    yield row("board_pitch", "board's pitch", "ppm", absent, said("board", name), sigma, effect)
+    together: list[tuple[str, StatedSize, np.ndarray]] = []  # with the effect of both temperatures
+    for body, stated, by_size in (
+        ("board", statement.board, found.by_scale),
+        ("target", statement.target, -(grown - grown.mean(0)).ravel()),
     ):
-        if key == "temperature" and statement.one_thermometer:
-            continue
-        sigma = getattr(stated, name)
-        absent = [name] * (sigma is None) + [needed] * (factor is None)
-        words = f"{name} of {statement.origin[body, name]}"
-        by_sigma = (sigma or 0.0) * (factor or 0.0) * effect
-        yield _stated(f"{body}_{key}", f"{body}'s {key}", unit, absent, words, sigma, by_sigma)
-
-
-def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> BudgetSource:
-    """Row of an error common to both temperatures (JCGM 100, 5.2.2, r = 1), nearly nil if bodies expand alike."""
-    total, absent, sigmas = np.zeros(1), [], set()
-    for body, stated, effect in bodies:
-        keys = {"temperature_sigma_k": stated.temperature_sigma_k, "expansion_ppm_per_k": stated.expansion_ppm_per_k}
-        absent += [f"{key} of [{body}]" for key, value in keys.items() if value is None]
-        sigmas.add(stated.temperature_sigma_k)
-        total = total + (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * effect
-    sigma = sigmas.pop() if len(sigmas) == 1 else None
-    title, words = "temperature of board and target", "temperature_sigma_k of both, one_thermometer: fully correlated"
-    return _stated("temperature", title, "K", absent, words, sigma, total)
+        together.append(
+            (body, stated, (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size)
+        )
+        for key, name, needed, factor, unit in (
+            ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
+            ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer_k(stated), "ppm/K"),
+        ):
+            if key == "temperature" and statement.one_thermometer:
+                continue
+            sigma = getattr(stated, name)
+            absent = [name] * (sigma is None) + [needed] * (factor is None)
+            effect = (sigma or 0.0) * (factor or 0.0) * by_size
+            yield row(f"{body}_{key}", f"{body}'s {key}", unit, absent, said(body, name), sigma, effect)
+    if statement.one_thermometer:  # an error common to both (JCGM 100, 5.2.2, r = 1), nearly nil if both expand alike
+        names = ("temperature_sigma_k", "expansion_ppm_per_k")
+        absent = [f"{name} of [{body}]" for body, own, _ in together for name in names if getattr(own, name) is None]
+        sigmas = {stated.temperature_sigma_k for _, stated, _ in together}
+        words = "temperature_sigma_k of both, one_thermometer: fully correlated"
+        title, sigma = "temperature of board and target", sigmas.pop() if len(sigmas) == 1 else None
+        yield row("temperature", title, "K", absent, words, sigma, sum(effect for *_, effect in together))
 
 
 def warmer_k(stated: StatedSize) -> float | None:
