@@ -39,15 +39,6 @@ class _Report(Part):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photograph:
-    """A mapped photograph with its group and the pose of its camera."""
-
-    name: str
-    group: str
-    target_from_camera: Rigid
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Circle:
     """A circle of the target, target frame."""
 
@@ -72,7 +63,7 @@ class Content:
     faces: dict[str, Rigid]  # target_from_face
     covariances: dict[str, np.ndarray]  # of the faces, 6×6, empty if the run states none
     circles: tuple[Circle, ...]
-    photographs: tuple[Photograph, ...]
+    photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
     rgb: dict[str, tuple[int, int, int]]  # by face
 
     def of_face(self, face: str) -> list[Circle]:
@@ -160,9 +151,9 @@ def content_of(run: SavedRun, root: str) -> Content:
         faces=faces.poses(),
         covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
         circles=circles,
-        photographs=tuple(
-            Photograph(each.image, each.group, Rigid(np.array(each.axes).T, each.position_mm)) for each in scene.cameras
-        ),
+        photographs={
+            (each.image, each.group): Rigid(np.array(each.axes).T, each.position_mm) for each in scene.cameras
+        },
         rgb=colours(run),
     )
     names = [root, *(each.child for each in content.statics())]
@@ -424,7 +415,7 @@ def _tree(content: Content) -> tuple[dict, bytes]:
 
 def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
     camera, places = content.camera, [circle.xyz_mm for circle in content.circles]
-    places += [photograph.target_from_camera.translation for photograph in content.photographs]
+    places += [pose.translation for pose in content.photographs.values()]
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
     rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
@@ -433,10 +424,10 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
     parts = buffer.add(MM_M * shape @ GL_FROM_CV, VERTICES), buffer.add(lines, INDICES)
     frustum = mesh("image at depth", parts, len(content.faces) + 1, LINES)
     nodes = []
-    for photograph in content.photographs:
-        pose = Rigid(photograph.target_from_camera.rotation @ GL_FROM_CV, photograph.target_from_camera.translation)
-        extras = {"group": photograph.group, "target_from_camera_mm": photograph.target_from_camera.matrix().tolist()}
-        nodes.append(node(name=photograph.name, camera=0, mesh=frustum, **_placed(pose), extras=extras))
+    for (name, group), pose in content.photographs.items():
+        placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
+        nodes.append(node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
     return nodes
 
 
