@@ -212,11 +212,29 @@ def plan(
     else:
         board = reference_board() if board is None else board
         make = partial(_beside_board, target=target, board=board, nominal=poses)
-    more = _remedy(make, replace(options, images=2 * options.images), "twice the images")
-    wider = [] if printed else [_wider(make, options)]
-    near = _remedy(make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %")
-    now = _as_asked(make, options)
-    return replace(now, remedies=(more, *wider, *now.remedies, near))
+    scene, models, setup = make(options)
+    now = forecast(models, setup)
+    better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
+    if isinstance(setup.board, ScaleReference):
+        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
+    remedies = (
+        _remedy(make, replace(options, images=2 * options.images), "twice the images"),
+        *([] if printed else [_wider(make, options)]),
+        *(Remedy(what, forecast(models, own, now.derivatives).worst()[1]) for what, own in better.items()),
+        _remedy(make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %"),
+    )
+    return Plan(
+        options=options,
+        setup=setup,
+        groups=tuple(model.group for model in models),
+        observations=round(sum(setup.centres(model).sum() for model in models)),
+        centre_sigma_px=rms(np.concatenate([model.sigma_px() for model in models])),
+        aperture_mm=widest_aperture_mm(models, setup.camera),
+        forecast=now,
+        shares=variance_shares(now, models, setup),
+        remedies=remedies,
+        hardly_seen=scene.hardly_seen() if isinstance(scene, BodyScene) else "",
+    )
 
 
 def _kept_dots(board: BoardDesign) -> set[DotLabel]:
@@ -227,26 +245,6 @@ def _kept_dots(board: BoardDesign) -> set[DotLabel]:
         for count in (board.rows, board.columns)
     )
     return {DotLabel(row, column) for row in rows for column in columns}
-
-
-def _as_asked(make: Photographs, options: PlanOptions) -> Plan:
-    scene, models, setup = make(options)
-    now = forecast(models, setup)
-    better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
-    if isinstance(setup.board, ScaleReference):
-        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
-    return Plan(
-        options,
-        setup,
-        tuple(model.group for model in models),
-        round(sum(setup.centres(model).sum() for model in models)),
-        rms(np.concatenate([model.sigma_px() for model in models])),
-        widest_aperture_mm(models, setup.camera),
-        now,
-        variance_shares(now, models, setup),
-        tuple(Remedy(what, forecast(models, own, now.derivatives).worst()[1]) for what, own in better.items()),
-        scene.hardly_seen() if isinstance(scene, BodyScene) else "",
-    )
 
 
 def _with_distance(setup: Setup, size: ScaleReference, model: MetricModel) -> Setup:
@@ -288,30 +286,23 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
     return float(min(widest))
 
 
-def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
-    """Returns the scene with the nominal geometry, in which nothing is misplaced."""
+def _beside_board(
+    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal
+) -> tuple[Scene, list[MetricModel], Setup]:
+    """Returns the photographs of a plan with a board: scene with the nominal geometry, in which nothing is misplaced,
+    models with their σ, input of a forecast."""
     shape = SceneOptions(
         seed=options.seed,
-        centre_sigma=0.0,
         distance_mm=options.distance_mm,
         spread_deg=options.spread_deg,
         images_per_group=options.images,
         groups=options.groups,
-        circle_sigma_mm=0.0,
-        face_shift_mm=0.0,
-        face_turn_deg=0.0,
         width=options.width,
         height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
+        **dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0),
     )
-    return make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
-
-
-def _beside_board(
-    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal
-) -> tuple[Scene, list[MetricModel], Setup]:
-    """Returns the photographs of a plan with a board: scene, models with their σ, input of a forecast."""
-    scene = _scene(options, target, board, nominal)
+    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
     run = options.run.adjustment(scene.target)
     kept = _kept_dots(board)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
@@ -334,8 +325,8 @@ def _beside_board(
     )
     every = observe(scene, 0.0, np.random.default_rng(0))
     seen = [image.select([k for k, x in enumerate(image.labels) if x in kept or x.plane != BOARD]) for image in every]
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    return scene, [options.noise.applied(m, scene.camera, radius) for m in true_models(scene, seen)], setup
+    radius_mm = setup.radius_mm()
+    return scene, [options.noise.applied(m, scene.camera, radius_mm) for m in true_models(scene, seen)], setup
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
@@ -384,14 +375,10 @@ def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservati
     images: list[ImageObservations] = []
     place: dict[CircleLabel, np.ndarray] = {}
     for i, (faces, pose) in enumerate(zip(shown, scene.camera_from_target, strict=True)):
-        own = {
-            label: xyz
-            for face in faces
-            if often[face.id] > 1
-            for label, xyz in zip(
-                face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True
-            )
-        }
+        own: dict[CircleLabel, np.ndarray] = {}
+        for face in (face for face in faces if often[face.id] > 1):
+            xyz = scene.target_from_face[face.id] @ face.places_mm(face.ids)
+            own |= dict(zip(face.labels(), xyz, strict=True))
         xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
         covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
         images.append(ImageObservations(f"{i:04d}", GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
