@@ -407,17 +407,15 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     except InputError as error:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
-            "the pair may share too few labels, or be too near to each other; add images from further apart",
+            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; the pair may "
+            "share too few labels, or be too near to each other; add images from further apart",
         ) from error
     try:
         path = max(models, key=lambda model: open_model(model).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
     except InputError as error:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: what native COLMAP {native.version} made from the run's database cannot be used: {error}",
-        ) from error
+        made = f"what native COLMAP {native.version} made from the run's database cannot be used"
+        raise MappingError("E-COLMAP-NO-MODEL", f"group {group}: {made}: {error}") from error
 
 
 def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
@@ -533,37 +531,36 @@ def comparison_text(check: Crosscheck) -> str:
 
 
 def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, tolerances: Tolerances
+    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
 ) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:
             others = f" and {len(names) - 1} more" if len(names) > 1 else ""
             clauses.append(f"image {names[0]}{others}: registered by {program} only")
-    largest = []  # what, its largest value, unit, and limit
+    largest: list[tuple[str, dict[str, float], str, float | None]] = []  # what, values by name, unit, and limit
     for compared, source, sigma in (
-        (mapping, "mapped by both", tolerances.mapped_sigma),
-        (result, "from the native model against faces.json", tolerances.sigma),
+        (mapping, "mapped by both", limits.mapped_sigma),
+        (result, "from the native model against faces.json", limits.sigma),
     ):
         for face, row in compared.faces.items():
             if row is None:
                 clauses.append(f"face {face} ({source}): only one of the two has it")
                 continue
-            each = (row.translation_um, tolerances.face_um, "µm"), (row.rotation_mdeg, tolerances.face_mdeg, "mdeg")
-            each = (*each, (row.sigmas, sigma, "σ"))
-            if limits := [f"{most:g} {unit}" for v, most, unit in each if v and most is not None and v > most]:
-                sigma_text = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
-                clauses.append(
-                    f"face {face} ({source}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{sigma_text}; "
-                    f"{', '.join(limits)} allowed"
-                )
-        circles = (compared.circles_um, "µm", tolerances.circle_um), (compared.circles_sigmas, "σ", sigma)
-        largest += [("circle {} " + f"({source})", *each) for each in circles]
-    position, attitude = (
-        {c.image: getattr(c, key) for c in mapping.cameras} for key in ("position_um", "rotation_mdeg")
-    )
-    largest.append(("camera {}: position", position, "µm", tolerances.camera_um))
-    largest.append(("camera {}: attitude", attitude, "mdeg", tolerances.camera_mdeg))
+            um, mdeg, own = row.translation_um, row.rotation_mdeg, row.sigmas
+            each = (um, limits.face_um, "µm"), (mdeg, limits.face_mdeg, "mdeg"), (own, sigma, "σ")
+            if allowed := [f"{most:g} {unit}" for v, most, unit in each if v and most is not None and v > most]:
+                in_sigma = "" if own is None else f", {own:.2f} σ"
+                measured = f"{um:.1f} µm, {mdeg:.2f} mdeg{in_sigma}"
+                clauses.append(f"face {face} ({source}) {measured}; {', '.join(allowed)} allowed")
+        largest += [
+            (f"circle {{}} ({source})", compared.circles_um, "µm", limits.circle_um),
+            (f"circle {{}} ({source})", compared.circles_sigmas, "σ", sigma),
+        ]
+    largest += [
+        ("camera {}: position", {c.image: c.position_um for c in mapping.cameras}, "µm", limits.camera_um),
+        ("camera {}: attitude", {c.image: c.rotation_mdeg for c in mapping.cameras}, "mdeg", limits.camera_mdeg),
+    ]
     for what, values, unit, limit in largest:
         name, worst = max(values.items(), key=lambda item: item[1], default=("", 0.0))
         if limit is not None and worst > limit:

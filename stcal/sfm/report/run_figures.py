@@ -55,21 +55,6 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     return drawing
 
 
-LEAST_UPRIGHT = 0.5
-"""Length of the mean of the cameras' upward directions from which on the photographs say where up is."""
-
-
-def upright(parts: list[dict], cameras: list[dict]) -> list[dict]:
-    """Returns the parts of the scene as they stood for upright photographs, else with the target's Z up."""
-    from scipy.spatial.transform import Rotation
-
-    up = -np.mean([camera["axes"][1] for camera in cameras] or [np.zeros(3)], axis=0)
-    if np.linalg.norm(up) < LEAST_UPRIGHT:
-        return parts
-    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]
-    return [part | {"xyz": np.round(turn.apply(part["xyz"]), DIGITS).tolist()} for part in parts]
-
-
 def _points(places: Iterable) -> np.ndarray:
     """Returns places as an array (n, 3), also if there are none."""
     return np.array(list(places), float).reshape(-1, 3)

@@ -4,9 +4,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from itertools import product
-from typing import Any
 
-from stcal.io.images import TOP_GROUP
 from stcal.labels import BOARD, parse_label
 from stcal.report.document import (
     Block,
@@ -68,7 +66,6 @@ def report_html(
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)
-    report = _with_named_groups(report)
     colours = run_figures.group_colours([group["name"] for group in report["groups"]])
     summary, options = report["summary"], report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
@@ -106,33 +103,6 @@ def report_html(
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
-def _with_named_groups(report: dict) -> dict:
-    """Returns the report with a word in place of the dot for the group of the folder itself."""
-    if all(group["name"] != TOP_GROUP for group in report["groups"]):
-        return report
-    word = "all" if len(report["groups"]) == 1 else "top folder"
-
-    def named(value: Any, key: str) -> Any:
-        if isinstance(value, dict):
-            return {word if k == TOP_GROUP and key == "boards" else k: named(v, k) for k, v in value.items()}
-        if isinstance(value, list):
-            return [named(v, key) for v in value]
-        return word if value == TOP_GROUP and key in ("group", "groups", "name") else value
-
-    return named(report, "")
-
-
-HOW_TO_USE = """import json, numpy as np
-
-faces = json.load(open("faces.json"))
-pose = np.array(faces["target_from_face"]["{face}"])  # 4x4, mm
-xyz_target = pose @ [x, y, 0, 1]  # of a point on face {face}
-
-# 6x6, rotation (rad) before translation (mm)
-covariance = faces["target_from_face_covariance"]["{face}"]"""
-"""Program that reads the result."""
-
-
 def faces_table(faces: dict[str, dict], reference: str) -> Table:
     """Returns the poses of the faces in the target frame, with σ."""
     rows = []
@@ -147,34 +117,22 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
 
 
 def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
-    """Returns the faces with σ, the target in space, and how to use the result."""
-    others = [face for face in report["faces"] if face != report["reference_face"]]
+    """Returns the faces with σ, and the target in space."""
     with_it = "boards and cameras" if has_board(report) else "cameras"
-    parts = space_parts(report, colours)
-    space = [
-        macro(
-            "turned",
-            lambda: run_figures.upright(parts, report["scene"]["cameras"]),
-            f"Target, {with_it} in space",
-            [("target", "Target"), ("all", f"With {with_it}")],
-        ),
-        "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
-        legend(colours, "Groups:"),
-    ]
-    use = [
-        subheading("How to use it"),
-        "faces.json beside this page has the pose of each face as a 4×4 matrix, the covariance of each, and the "
-        "points in the target frame; `stcal-sfm export RUN` writes it for other programs",
-        macro("verbatim", HOW_TO_USE.replace("{face}", others[0] if others else "")),
-    ]
+    views = [("target", "Target"), ("all", f"With {with_it}")]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
-        f"is that of the face's origin, σ are one standard deviation, of the position along and of the rotation "
-        "about an axis"
+        "is that of the face's origin, σ are one standard deviation, of the position along and of the rotation about "
+        "an axis. faces.json beside this page has poses, covariances and points; `stcal-sfm export RUN` writes them "
+        "for other programs"
         if report["faces"]
         else "",
         faces_table(report["faces"], report["reference_face"]),
-        columns(space, use) if others else page_only(*space),
+        page_only(
+            macro("turned", partial(space_parts, report, colours), f"Target, {with_it} in space", views),
+            "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
+            legend(colours, "Groups:"),
+        ),
     ]
 
 
