@@ -238,12 +238,12 @@ class SourceRow(Part):
 class Uncertainty(Part):
     """Uncertainty of one measurand."""
 
-    axes: list[float]
-    contributions: dict[str, float]
-    standard: float
-    expanded: float
-    coverage: float
-    degrees_of_freedom: Finite
+    axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
+    contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
+    standard: float = Field(description="combined standard uncertainty of all of them together")
+    expanded: float = Field(description="expanded uncertainty")
+    coverage: float = Field(description="of `expanded`, by simulation")
+    degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
 
     @classmethod
     def of(cls, row: Row, unit: float) -> "Uncertainty":
@@ -333,13 +333,11 @@ class BudgetFile(ResultFile):
     )
     faces: dict[ByName, FaceUncertainty] = Field(
         description="against the reference face: `position_mm` of the origin, corrected, and `rotation_vector_deg`; "
-        "`position_um` and `rotation_mdeg`, each with standard uncertainties of x, y, z (`axes`), `contributions` by "
-        "source, `standard` uncertainty of x, y, z together, `expanded` uncertainty, its simulated `coverage`, and "
-        "effective `degrees_of_freedom`, null for infinitely many"
+        "`position_um` and `rotation_mdeg`, their uncertainties"
     )
     distances: list[DistanceUncertainty] = Field(
         description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm`, and "
-        "`distance_um` with the keys of `position_um`"
+        "`distance_um`, its uncertainty"
     )
     circles: dict[ByName, CircleUncertainty] = Field(
         default={},

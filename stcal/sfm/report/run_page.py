@@ -9,7 +9,6 @@ from stcal.labels import BOARD, parse_label
 from stcal.report.document import (
     Block,
     Document,
-    Html,
     Section,
     Table,
     alarms,
@@ -175,29 +174,34 @@ def _faces_in_detail(report: dict) -> list[Block]:
 
 
 def _scale(report: dict) -> list[Block]:
-    """Returns λ and the board's residuals of each group."""
-    by_rows = [("λ, by rows (mm/unit)", "mm_per_unit_rows:6"), ("Rows", ""), ("Difference (ppm)", "difference_ppm:1")]
-    columns_of = [
-        ("λ, least squares (mm/unit)", "mm_per_unit:6"),
-        *(by_rows if has_board(report) else ()),
-        ("σ (ppm)", "sigma_ppm:1"),
-        ("Dots" if has_board(report) else "Points", "dots"),
-        ("Residual, mean (µm)", "board_mean_um:1"),
-        ("± (µm)", "board_spread_um:1"),
-        ("Residual, RMS (µm)", "board_rms_um:1"),
-    ]
-    rows = []
+    """Returns λ and the board's residuals of each group, the plots of all on one scale."""
+    rows, boards = [], {}
     for group in report["groups"]:
-        scale = group["scale"]
-        most = max((math.hypot(*v) for v in scale["board_residuals_um"].values()), default=None)
-        two = " and ".join(str(row) for row in scale["rows"])
-        own = [value for _, spec in columns_of for value in (cells(scale, spec) if spec else [two])]
-        rows.append([group["name"], *own, number(most, 1)])
-    pictures = _board_residuals(report["groups"])
-    without = (
-        "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
-        "between points: they stand for the dots in this table"
-    )
+        scale, by_rows = group["scale"], [NONE] * 3
+        if scale.get("source", "board") == "board":
+            boards[group["name"]] = scale
+            mm, off = cells(scale, "mm_per_unit_rows:6 difference_ppm:1")
+            by_rows = [mm, " and ".join(str(row) for row in scale["rows"]), off]
+        (least, *own), vectors = (
+            cells(scale, "mm_per_unit:6 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1"),
+            scale["board_residuals_um"].values(),
+        )
+        most = max((math.hypot(*vector) for vector in vectors), default=None)
+        rows.append([group["name"], least, *by_rows, *own, number(most, 1)])
+    heads = ["<Group", "λ, least squares (mm/unit)", "λ, by rows (mm/unit)", "Rows", "Difference (ppm)", "σ (ppm)",
+             "Points", "Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]  # fmt: skip
+    residuals = [vector for scale in boards.values() for vector in scale["board_residuals_um"].values()]
+    reach = max((math.hypot(*vector[:2]) for vector in residuals), default=0.0)
+    height = max((abs(vector[2]) for vector in residuals), default=0.0)
+    pictures = [
+        plot(
+            partial(run_figures.board_residuals, scale["board_residuals_um"], reach, height),
+            f"Residual vectors of the board, group {name}",
+            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
+            "",
+        )
+        for name, scale in boards.items()
+    ]
     of_boards = [
         subheading("Board residuals"),
         "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
@@ -205,31 +209,11 @@ def _scale(report: dict) -> list[Block]:
         plots(*pictures),
     ]
     return [
-        "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
-        "(first and last row, all pairs). σ is that of λ from the board's stated σ"
-        if has_board(report)
-        else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
-        "distances between points. σ is that of λ from their stated σ",
-        Table(["<Group", *(head for head, _ in columns_of), "Residual, max (µm)"], rows),
-        without if has_board(report) and len(pictures) < len(report["groups"]) else "",
+        "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published (first "
+        "and last row, all pairs); without a board, over the corners of printed faces or the known distances between "
+        "points. σ is that of λ from their stated σ",
+        Table(heads, rows),
         *(of_boards if pictures else []),
-    ]
-
-
-def _board_residuals(groups: list[dict]) -> list[Html]:
-    """Returns the plots of the boards' residuals, all on one scale."""
-    scales = {each["name"]: each["scale"] for each in groups if each["scale"].get("source", "board") == "board"}
-    vectors = [vector for scale in scales.values() for vector in scale["board_residuals_um"].values()]
-    reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
-    height = max((abs(vector[2]) for vector in vectors), default=0.0)
-    return [
-        plot(
-            partial(run_figures.board_residuals, scale["board_residuals_um"], reach, height),
-            f"Residual vectors of the board, group {name}",
-            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
-            "",
-        )
-        for name, scale in scales.items()
     ]
 
 

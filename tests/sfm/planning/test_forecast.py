@@ -310,7 +310,7 @@ def test_a_plan_takes_a_camera_as_its_file():
     camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
     target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
     for given in (camera, model_of(camera)):
-        assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
+        assert session._beside_board(PlanOptions(images=2, camera=given), target, board, None)[0].camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
         assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
 
