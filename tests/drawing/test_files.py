@@ -157,17 +157,13 @@ def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
     assert len(list(files.iterdir())) == 3
 
 
-def test_a_design_that_is_not_there_is_said(files):
-    with fails_with("E-DRAW-DESIGN … nothing.toml … target.toml"):
-        draw(files / "nothing.toml", files / "a.svg")
-
-
-def test_too_many_sheets_and_circles_without_a_radius_are_refused(files):
+def test_designs_that_cannot_be_drawn_are_refused(files):
+    """One that is not there, one of too many sheets, and circles without a radius."""
+    refuses("E-DRAW-DESIGN … nothing.toml … target.toml", draw, files / "nothing.toml", files / "a.svg")
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
     refuses("E-DRAW-SHEETS … --paper … A4 … 500", draw, files / "board.toml", files / "board.pdf")
     refuses("E-DRAW-SHEETS … 5000", draw, files / "board.toml", files / "board.pdf", "own")
     (files / "grid.yaml").write_text(
         "target_type: circlegrid\ntargetCols: 4\ntargetRows: 5\nspacingMeters: 0.02\nasymmetricGrid: true\n"
     )
-    with fails_with("E-BOARD-RADIUS … radius_mm"):
-        draw(files / "grid.yaml", files / "grid.pdf")
+    refuses("E-BOARD-RADIUS … radius_mm", draw, files / "grid.yaml", files / "grid.pdf")

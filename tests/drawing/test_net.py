@@ -114,14 +114,6 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         net_part(TargetDesign("book", "dark", tuple(pages)))
 
 
-def test_plates_that_touch_do_not_overlap():
-    square = np.array([[0.0, 0], [10, 0], [10, 10], [0, 10]])
-    assert _is_clear(square, [square + np.array([10, 0])])
-    assert _is_clear(square, [square + np.array([10, 10])])
-    assert not _is_clear(square, [square + np.array([9.9, 3])])
-    assert not _is_clear(square, [0.1 * square + 4])
-
-
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
     refuses("E-DRAW-NET … --net … 1 … outline_mm", draw, tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
@@ -129,16 +121,3 @@ def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     refuses("E-DRAW-NET … --net … front … rough_pose", net_part, TargetDesign("box", "dark", nowhere))
     (tmp_path / "board.toml").write_text('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n')
     refuses("E-DRAW-DESIGN", draw, tmp_path / "board.toml", tmp_path / "net.pdf", net=True)
-
-
-def test_plates_apart_are_refused():
-    """A pair of sides that share an edge, and another pair elsewhere."""
-    four = make_pattern(sides_of(SIZE)[:4], 9, 4.0, "dark", 3, "box").target
-    away = Rigid(np.eye(3), np.array([500.0, 0, 0]))
-    moved = []
-    for number, face in enumerate(four.faces):
-        assert face.rough_target_from_face is not None
-        pose = away @ face.rough_target_from_face if number > 1 else face.rough_target_from_face
-        moved.append(replace(face, rough_target_from_face=pose))
-    with fails_with("E-DRAW-NET … --net"):
-        net_part(TargetDesign("two", "dark", tuple(moved)))

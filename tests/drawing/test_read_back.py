@@ -89,7 +89,6 @@ TAGS = TagLayout((("DICT_5X5_50", 3), ("DICT_5X5_50", 7)), [[[0, 0], [20, 0], [2
                  [[40, 5], [60, 0], [65, 20], [45, 25]]])  # fmt: skip
 BOARDS = {
     "chessboard": ChessboardDesign(5, 8, 12.0),
-    "charuco": CharucoDesign(5, 8, 12.0, 9.0, "DICT_4X4_50"),
     "charuco of even rows": CharucoDesign(6, 5, 12.0, 9.0, "DICT_5X5_50", first_id=4),
     "charuco before 4.6": CharucoDesign(6, 5, 12.0, 9.0, "DICT_4X4_50", legacy=True),
     "aprilgrid": AprilGridDesign(3, 4, 20.0, 0.3, 2),

@@ -274,36 +274,28 @@ def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
     """Returns the temperature for which lengths hold, and their correction for the expansion of the board and, only
     with it, of the target: that starts from the length at the photographs' temperature. A size stated of the target
     itself holds at its reference temperature (ISO 1), so that no expansion enters."""
-    target = statement.target
     if any(known.drawn for known in known_distances(board)):
         words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"
         return StatedConditions(False, 0.0, None, words)
-    wanted = reference_temperature_c(target)
+    target, holds = statement.target, "Lengths and positions hold at"
+    wanted, photographed = reference_temperature_c(target), target.temperature_c
     if not board.rows:
-        words = (
-            f"Lengths and positions hold at {wanted:g} °C, as the sizes stated of the target do (ISO 1); they are its "
-            "own, so that no expansion enters"
-        )
-        return StatedConditions(True, 0.0, wanted, words)
+        own = "as the sizes stated of the target do (ISO 1); they are its own, so that no expansion enters"
+        return StatedConditions(True, 0.0, wanted, f"{holds} {wanted:g} °C, {own}")
     of_board, of_target = _growth(statement.board), _growth(target)
+    total = (of_board or 0.0) - (of_target or 0.0 if of_board is not None else 0.0)
+    corrected = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
     if of_board is not None and of_target is not None:
-        total = of_board - of_target
-        words = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
-        return StatedConditions(True, total, wanted, f"Lengths and positions hold at {wanted:g} °C{words}")
-    photographed = "the temperature at which the target was photographed"
-    if target.temperature_c is not None:
-        photographed = f"{target.temperature_c:g} °C, at which the target was photographed"
-    words = f"Lengths and positions hold at {photographed}"
-    if of_board is not None:
-        words += f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
-        words += ": expansion and temperature of the target are not both stated"
-    else:
-        words += (
-            ", as far as the board's grid had the size of its file there: its expansion and temperature are not both "
-            "stated"
+        return StatedConditions(True, total, wanted, f"{holds} {wanted:g} °C{corrected}")
+    there = "the temperature" if photographed is None else f"{photographed:g} °C,"
+    why = ": expansion and temperature of the target are not both stated"
+    if of_board is None:
+        why = (
+            ", as far as the board's grid had the size of its file there: expansion and temperature of the board are "
+            "not both stated, and without them the target's are not corrected for"
         )
-        words += ", and without them the target's are not corrected for" if of_target is not None else ""
-    return StatedConditions(True, of_board or 0.0, target.temperature_c, words)
+    words = f"{holds} {there} at which the target was photographed{corrected}{why}"
+    return StatedConditions(True, total, photographed, words)
 
 
 def _growth(stated: StatedSize) -> float | None:
