@@ -300,7 +300,7 @@ FLOAT, UNSIGNED = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 LINES, TRIANGLES = 1, 4
 NEAR_M = 0.01
-RINGS, SEGMENTS = 8, 12  # numbers of rings and segments of the ball that shows σ
+POINTS = 96  # of the ball that shows σ
 Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
@@ -330,6 +330,10 @@ class _Buffer:
         self.data += raw.tobytes()
         return len(self.accessors) - 1
 
+    def shape(self, points: np.ndarray, indices: np.ndarray) -> dict:
+        """Adds points and the indices of lines or triangles between them."""
+        return {"attributes": {"POSITION": self.add(points, VERTICES)}, "indices": self.add(indices.ravel(), INDICES)}
+
 
 def gltf(content: Content) -> str:
     """Returns glTF as JSON with its buffer inside."""
@@ -351,12 +355,10 @@ def glb(content: Content) -> bytes:
 def _tree(content: Content) -> tuple[dict, bytes]:
     buffer, meshes, nodes = _Buffer(), [], []
     factor = _exaggeration(content)
-    ball, around = _ball()
-    sphere = buffer.add(ball, VERTICES), buffer.add(around, INDICES)
+    ball, disc = buffer.shape(*_ball()), buffer.shape(*_disc())
 
-    def mesh(name: str, parts: tuple[int, int], colour: int, mode: int = TRIANGLES) -> int:
-        primitive = {"attributes": {"POSITION": parts[0]}, "indices": parts[1], "material": colour, "mode": mode}
-        meshes.append({"name": name, "primitives": [primitive]})
+    def mesh(name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
+        meshes.append({"name": name, "primitives": [shape | {"material": colour, "mode": mode}]})
         return len(meshes) - 1
 
     def node(**own) -> int:
@@ -365,25 +367,20 @@ def _tree(content: Content) -> tuple[dict, bytes]:
 
     below = []
     for place, (face, pose) in enumerate(content.faces.items()):
-        grey = mesh(f"sigma of face {face}", sphere, len(content.faces))
+        grey, own = (
+            mesh(f"sigma of face {face}", ball, len(content.faces)),
+            mesh(f"circles of face {face}", disc, place),
+        )
         circles = []
         for circle in content.of_face(face):
-            points, triangles = _disc(circle.radius_mm * MM_M)
-            parts = buffer.add(points, VERTICES), buffer.add(triangles.ravel(), INDICES)
-            own = mesh(str(circle.label), parts, place)
-            balls = [node(**_sigma(circle, pose, factor), mesh=grey)] if circle.covariance_mm2 is not None else []
+            radius_m = MM_M * circle.radius_mm
+            children = [node(name=str(circle.label), mesh=own, scale=[radius_m, radius_m, 1.0])]
             extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
             if circle.covariance_mm2 is not None:
+                children.append(node(**_sigma(circle, pose, factor), mesh=grey))
                 extras["covariance_mm2"] = circle.covariance_mm2.tolist()
-            circles.append(
-                node(
-                    name=content.circle_frame(circle.label),
-                    mesh=own,
-                    translation=(MM_M * (pose.inverse() @ circle.xyz_mm)).tolist(),
-                    children=balls,
-                    extras=extras,
-                )
-            )
+            name, at = content.circle_frame(circle.label), (MM_M * (pose.inverse() @ circle.xyz_mm)).tolist()
+            circles.append(node(name=name, translation=at, children=children, extras=extras))
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
         if face in content.covariances:
             extras["covariance_rad_mm"] = content.covariances[face].tolist()
@@ -421,8 +418,7 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
     rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
     shape = np.vstack([np.zeros(3), CAMERA_SHARE * np.ptp(np.array(places), axis=0).max() * rays])
     lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
-    parts = buffer.add(MM_M * shape @ GL_FROM_CV, VERTICES), buffer.add(lines, INDICES)
-    frustum = mesh("image at depth", parts, len(content.faces) + 1, LINES)
+    frustum = mesh("image at depth", buffer.shape(MM_M * shape @ GL_FROM_CV, lines), len(content.faces) + 1, LINES)
     nodes = []
     for (name, group), pose in content.photographs.items():
         placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
@@ -434,22 +430,12 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
 def _lens(content: Content) -> dict:
     """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
     camera = content.camera
-    return {
-        "name": "camera",
-        "type": "perspective",
-        "perspective": {
-            "yfov": 2 * float(np.arctan(camera.height / 2 / camera.focal[1])),
-            "aspectRatio": float(camera.width / camera.focal[0] / (camera.height / camera.focal[1])),
-            "znear": NEAR_M,
-        },
-        "extras": {
-            "model": camera.colmap_model,
-            "size_px": [camera.width, camera.height],
-            "focal_px": camera.focal.tolist(),
-            "centre_px": camera.centre.tolist(),
-            "distortion": camera.distortion.tolist(),
-        },
-    }
+    across, up = (np.array([camera.width, camera.height]) / camera.focal).tolist()
+    perspective = {"yfov": 2 * float(np.arctan(up / 2)), "aspectRatio": across / up, "znear": NEAR_M}
+    lens = {"focal_px": camera.focal, "centre_px": camera.centre, "distortion": camera.distortion}
+    extras = {"model": camera.colmap_model, "size_px": [camera.width, camera.height]}
+    extras |= {name: values.tolist() for name, values in lens.items()}
+    return {"name": "camera", "type": "perspective", "perspective": perspective, "extras": extras}
 
 
 def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
@@ -461,10 +447,10 @@ def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
     return {"name": f"sigma of {circle.label}, times {factor:g}", "rotation": turned, "scale": size}
 
 
-def _disc(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (EDGES + 1, 3), the centre first, and triangles (EDGES, 3), counter-clockwise seen from +Z."""
+def _disc() -> tuple[np.ndarray, np.ndarray]:
+    """Returns points (EDGES + 1, 3) of the unit disc, the centre first, and triangles, counter-clockwise from +Z."""
     angle = 2 * np.pi * np.arange(EDGES) / EDGES
-    rim = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
     around = 1 + np.arange(EDGES)
     return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
 
@@ -483,16 +469,14 @@ def _placed(pose: Rigid) -> dict:
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (n, 3) of the unit sphere, and the corners of its triangles (3t,)."""
-    polar, turn = np.pi * np.arange(RINGS + 1) / RINGS, 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
-    p, t = (v.ravel() for v in np.meshgrid(polar, turn, indexing="ij"))
-    points = np.column_stack([np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)])
-    ring, segment = (v.ravel() for v in np.meshgrid(np.arange(RINGS), np.arange(SEGMENTS), indexing="ij"))
-    corner, next_corner = ring * SEGMENTS + segment, ring * SEGMENTS + (segment + 1) % SEGMENTS
-    quads = np.column_stack(
-        [corner, corner + SEGMENTS, next_corner, next_corner, corner + SEGMENTS, next_corner + SEGMENTS]
-    )
-    return points, quads.ravel()
+    """Returns points of the unit sphere on a spiral, and triangles between them; both sides of these are drawn."""
+    from scipy.spatial import ConvexHull
+
+    place = np.arange(POINTS) + 0.5
+    height, turn = 1 - 2 * place / POINTS, np.pi * (1 + 5**0.5) * place
+    across = np.sqrt(1 - height**2)
+    points = np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    return points, ConvexHull(points).simplices
 
 
 ROOT = "target"  # default name of the target frame
