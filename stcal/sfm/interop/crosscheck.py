@@ -323,7 +323,7 @@ def _compared(
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
     native_models, own_models, adjusted = [], [], []
     with scratch_folder("crosscheck") as folder:
-        write_copy(run, folder / "native.db", find_schema(schema))
+        write_copy(run, folder / "native.db", schema)
         write_copy(run, folder / "ours.db", find_schema("4.2"))
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
@@ -371,7 +371,7 @@ def _compared(
     return Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
-        schema=schema,
+        schema=schema.name,
         tolerances=tolerances,
         images=images,
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),

@@ -11,7 +11,7 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -42,10 +42,6 @@ class Schema:
     tables: dict[str, str]  # declaration by name
     indices: dict[str, str]  # table and columns of unique indices by name
 
-    def following(self, name: str, tables: dict[str, str], indices: dict[str, str] | None = None) -> "Schema":
-        """Returns the schema of a later version, with tables and indices added or replaced."""
-        return replace(self, name=name, tables=self.tables | tables, indices=self.indices | (indices or {}))
-
     def statements(self) -> list[str]:
         """Returns the SQL statements that make an empty database."""
         return [
@@ -70,57 +66,61 @@ _IMAGES = (
 _PRIOR_POSES = "".join(f", prior_{name} REAL" for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz"))
 _PRIORS = f"{_IMAGE_KEY}, position BLOB, coordinate_system INTEGER NOT NULL"
 
-_3_8 = Schema(
-    "3.8",
-    3800,
-    {
-        "cameras": "camera_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, model INTEGER NOT NULL, "
-        "width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL",
-        "images": _IMAGES.format(_PRIOR_POSES),
-        "keypoints": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
-        "descriptors": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
-        "matches": _PAIRS,
-        "two_view_geometries": _GEOMETRIES,
-    },
-    {"index_name": "images (name)"},
-)
-_3_9 = replace(_3_8, name="3.9", user_version=3900)
-_3_10 = _3_9.following("3.10", {"images": _IMAGES.format(""), "pose_priors": f"{_PRIORS}, {_OF_IMAGE}"})
-_3_11 = _3_10.following("3.11", {"pose_priors": f"{_PRIORS}, position_covariance BLOB, {_OF_IMAGE}"})
-_3_12 = _3_11.following(
-    "3.12",
-    {
-        "rigs": "rig_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, ref_sensor_id INTEGER NOT NULL, "
-        "ref_sensor_type INTEGER NOT NULL",
-        "rig_sensors": f"rig_id INTEGER NOT NULL, {_SENSOR}, sensor_from_rig BLOB, {_OF_RIG}",
-        "frames": f"frame_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, rig_id INTEGER NOT NULL, {_OF_RIG}",
-        "frame_data": f"frame_id INTEGER NOT NULL, data_id INTEGER NOT NULL, {_SENSOR}, "
-        "FOREIGN KEY (frame_id) REFERENCES frames (frame_id) ON DELETE CASCADE",
-    },
-    {
-        "rig_ref_sensor_assignment": "rigs (ref_sensor_id, ref_sensor_type)",
-        "rig_sensor_assignment": "rig_sensors (sensor_id, sensor_type)",
-        "frame_sensor_assignment": "frame_data (data_id, sensor_type)",
-    },
-)
-_4_0 = replace(_3_12, user_version=4_00_00_00).following(
-    "4.0",
-    {
-        "descriptors": f"{_IMAGE_KEY}, type INTEGER NOT NULL, {_MATRIX}, {_OF_IMAGE}",
-        "pose_priors": "pose_prior_id INTEGER NOT NULL PRIMARY KEY, corr_data_id INTEGER NOT NULL, "
-        "corr_sensor_id INTEGER NOT NULL, corr_sensor_type INTEGER NOT NULL, position BLOB, position_covariance BLOB, "
-        "gravity BLOB, coordinate_system INTEGER NOT NULL",
-    },
-    {"pose_prior_data_assignment": "pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type)"},
-)
-_4_2 = replace(_4_0, user_version=4_02_00_00).following(
-    "4.2", {"two_view_geometries": f"{_GEOMETRIES}, camera1 BLOB, camera2 BLOB"}
-)
+_CHANGES: dict[str, tuple[int, dict[str, str], dict[str, str]]] = {
+    "3.8": (
+        3800,
+        {
+            "cameras": "camera_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, model INTEGER NOT NULL, "
+            "width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL",
+            "images": _IMAGES.format(_PRIOR_POSES),
+            "keypoints": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
+            "descriptors": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
+            "matches": _PAIRS,
+            "two_view_geometries": _GEOMETRIES,
+        },
+        {"index_name": "images (name)"},
+    ),
+    "3.9": (3900, {}, {}),
+    "3.10": (3900, {"images": _IMAGES.format(""), "pose_priors": f"{_PRIORS}, {_OF_IMAGE}"}, {}),
+    "3.11": (3900, {"pose_priors": f"{_PRIORS}, position_covariance BLOB, {_OF_IMAGE}"}, {}),
+    "3.12": (
+        3900,
+        {
+            "rigs": "rig_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, ref_sensor_id INTEGER NOT NULL, "
+            "ref_sensor_type INTEGER NOT NULL",
+            "rig_sensors": f"rig_id INTEGER NOT NULL, {_SENSOR}, sensor_from_rig BLOB, {_OF_RIG}",
+            "frames": f"frame_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, rig_id INTEGER NOT NULL, {_OF_RIG}",
+            "frame_data": f"frame_id INTEGER NOT NULL, data_id INTEGER NOT NULL, {_SENSOR}, "
+            "FOREIGN KEY (frame_id) REFERENCES frames (frame_id) ON DELETE CASCADE",
+        },
+        {
+            "rig_ref_sensor_assignment": "rigs (ref_sensor_id, ref_sensor_type)",
+            "rig_sensor_assignment": "rig_sensors (sensor_id, sensor_type)",
+            "frame_sensor_assignment": "frame_data (data_id, sensor_type)",
+        },
+    ),
+    "3.13": (3900, {}, {}),
+    "4.0": (
+        4_00_00_00,
+        {
+            "descriptors": f"{_IMAGE_KEY}, type INTEGER NOT NULL, {_MATRIX}, {_OF_IMAGE}",
+            "pose_priors": "pose_prior_id INTEGER NOT NULL PRIMARY KEY, corr_data_id INTEGER NOT NULL, "
+            "corr_sensor_id INTEGER NOT NULL, corr_sensor_type INTEGER NOT NULL, position BLOB, "
+            "position_covariance BLOB, gravity BLOB, coordinate_system INTEGER NOT NULL",
+        },
+        {"pose_prior_data_assignment": "pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type)"},
+    ),
+    "4.1": (4_01_00_00, {}, {}),
+    "4.2": (4_02_00_00, {"two_view_geometries": f"{_GEOMETRIES}, camera1 BLOB, camera2 BLOB"}, {}),
+}
+"""Stamp of each version's first release, and the tables and indices that it added or changed, the oldest first."""
 
-SCHEMAS = {schema.name: schema for schema in (_3_8, _3_9, _3_10, _3_11, _3_12, replace(_3_12, name="3.13"), _4_0, _4_2)}
+SCHEMAS: dict[str, Schema] = {}
 """All published schemas by name, the oldest first."""
-
-_SAME_TABLES = {"4.1": "4.0"}  # versions that have the tables of another version
+_tables, _indices = {}, {}
+for _name, (_stamp, _new_tables, _new_indices) in _CHANGES.items():
+    _tables, _indices = _tables | _new_tables, _indices | _new_indices
+    SCHEMAS[_name] = Schema(_name, _stamp, _tables, _indices)
 
 
 def find_schema(name: str) -> Schema:
@@ -130,17 +130,15 @@ def find_schema(name: str) -> Schema:
     return SCHEMAS[name]
 
 
-def schema_of_version(version: str) -> str:
+def schema_of_version(version: str) -> Schema:
     """Returns the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and writes."""
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
-    minor = release[1] if release else version
-    name = _SAME_TABLES.get(minor, minor)
-    if name not in SCHEMAS:
-        versions = ", ".join([*SCHEMAS, *_SAME_TABLES])
+    if release is None or release[1] not in SCHEMAS:
+        versions = ", ".join(SCHEMAS)
         raise InputError(
             "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {versions}"
         )
-    return name
+    return SCHEMAS[release[1]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,14 +6,12 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_colmap import export_model
 from tests.outcome import fails_with
@@ -216,24 +214,6 @@ def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keyp
     # The lens stretches residuals by a few per cent.
     assert np.sqrt(np.mean(np.square(residuals))) == pytest.approx(own["residual_rms_px"], rel=0.1)
     assert own["residual_rms_px"] < 0.02
-
-
-def test_two_focal_lengths_become_one(own, tmp_path, keypoints):
-    model = read_camera(own / "inputs/cameras.txt")
-    camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
-    write_cameras_txt(own / "inputs/cameras.txt", camera)
-    native = pycolmap.Reconstruction(str(own / "colmap/target_model"))
-    native.camera(1).params = camera.colmap_params()
-    native.write_binary(str(own / "colmap/target_model"))
-    written = export_model(own, tmp_path / "model.nvm", "nvm")
-    assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
-    cameras, points = read_nvm(tmp_path / "model.nvm")
-    for _, _, views in points:
-        for i, k, x, y in views:
-            name, focal, *_ = cameras[i]
-            assert focal == written.focal_px
-            seen = camera.pixel_from_normalised(np.array([x, y]) / focal)
-            assert np.abs(seen - keypoints[name, k][1]).max() < AGAIN_PX
 
 
 def test_a_model_that_was_changed_is_refused(small_run, tmp_path):
