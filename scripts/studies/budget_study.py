@@ -33,8 +33,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
-from stcal.sfm.budget.combine import Budget, budget
-from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of
+from stcal.sfm.budget.combine import FIELDS, Budget, Statement, budget, conditions_of
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions

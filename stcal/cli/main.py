@@ -62,7 +62,7 @@ def _version(
 
 def environment() -> dict[str, str]:
     """Returns versions by name: stcal, Python, system, libraries, and the native COLMAP on the PATH."""
-    from stcal.sfm.interop.native import find_colmap
+    from stcal.sfm.interop.crosscheck import find_colmap
 
     version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
     for name, module in LIBRARIES.items():

@@ -1,23 +1,273 @@
-"""Drawing of a target or a board from its file, as SVG or PDF in mm."""
+"""Drawing of a target or a board from its file, on pages of its own size or on sheets of paper, as SVG or PDF in mm."""
 
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from html import escape
+from itertools import compress, product
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.boards.board_designs import BoardSet, FlatBoard
 from stcal.boards.board_file import board_content
 from stcal.boards.target_file import load_boards, load_target
 from stcal.design import BoardDesign, TargetDesign
-from stcal.drawing.net import net_part
-from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, corners_of, parts_of, said_mm
-from stcal.drawing.sheets import FURNITURE, MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
+from stcal.drawing.parts import (
+    LAYERS,
+    Disc,
+    Part,
+    Shape,
+    Text,
+    box_of,
+    corners_of,
+    extent,
+    line,
+    moved,
+    net_part,
+    parts_of,
+    said_mm,
+)
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import save
+
+APART = 6.0  # distance from a part to its first dimension, and between dimensions, mm
+ARROW = 1.5
+CUT_FROM, CUT_TO = 1.5, 5.0  # distances from the outline at which cut marks begin and end, mm
+LETTERS = 2.0
+BAR, SHORT_BAR = 100.0, 50.0  # lengths of scale bars, mm
+
+
+def framed(part: Part, bare: bool = False) -> list[Shape]:
+    """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions."""
+    box = box_of(part.outline)
+    shapes: list[Shape] = [*part.shapes, *(part.lines or [line(part.outline, "CUT", width=0.1, closed=True)])]
+    if bare:
+        return shapes
+    for right, above, axis in product((0, 1), (0, 1), (0, 1)) if not part.lines else ():
+        outwards = np.where(np.arange(2) == axis, [2 * right - 1, 2 * above - 1], 0)
+        ends = np.array([box[right, 0], box[above, 1]]) + np.array([[CUT_FROM], [CUT_TO]]) * outwards
+        shapes.append(line(ends, "CUT", width=0.1))
+    for axis in (0, 1):
+        spans = [span for span in part.spans if span[0] == axis]
+        outer = (axis, float(box[0, axis]), float(box[1, axis]), said_mm(box[1, axis] - box[0, axis]))
+        for place, (_, low, high, words) in enumerate([*spans, outer]):
+            shapes += _dimension(axis, low, high, words, float(box[0, 1 - axis]), APART * (place + 1))
+    shapes.append(Text(float(box[0, 0]), float(box[1, 1]) + CUT_TO + 1.5, part.name, LETTERS))
+    return shapes
+
+
+def scale_bars(width: float, height: float) -> list[Shape]:
+    """Return scale bars along the lower and the left edge of a field from (0, 0), each with its true length."""
+    shapes: list[Shape] = []
+    for axis, room in ((0, width), (1, height)):
+        length = BAR if room >= BAR + 2 else SHORT_BAR
+        if room < length + 2:
+            continue
+        ends = np.zeros((2, 2))
+        ends[1, axis] = length
+        shapes.append(line(ends + 1.0, "DIMENSIONS", width=0.2))
+        for place in range(0, round(length) + 1, 10):
+            tick = np.ones((2, 2))
+            tick[:, axis] += place
+            tick[1, 1 - axis] += 3.0 if place % 50 == 0 else 1.8
+            shapes.append(line(tick, "DIMENSIONS", width=0.2))
+        middle = 1 + length / 2 + 8
+        at = (middle, 3.5) if axis == 0 else (3.0 + LETTERS, middle)
+        shapes.append(Text(*at, f"{said_mm(length)} mm", LETTERS, "middle", turned=axis == 1, layer="DIMENSIONS"))
+    return shapes
+
+
+def _dimension(axis: int, low: float, high: float, words: str, edge: float, away: float) -> list[Shape]:
+    """Return the dimension of a length along X below ``edge``, or along Y to the left of it."""
+    level = edge - away
+
+    lines = [[(low, level), (high, level)]]
+    for end, sign in ((low, 1), (high, -1)):
+        lines.append([(end, edge - 1.0), (end, level - 1.0)])
+        lines.append([(end + sign * ARROW, level + 0.5), (end, level), (end + sign * ARROW, level - 0.5)])
+    shapes: list[Shape] = [line(np.array(xy)[:, :: 1 - 2 * axis], "DIMENSIONS", width=0.1) for xy in lines]
+    middle, above = (low + high) / 2, level + 0.8
+    at = (middle, above) if axis == 0 else (above - 1.6, middle)
+    return [*shapes, Text(*at, words, LETTERS, "middle", turned=axis == 1, layer="DIMENSIONS")]
+
+
+PAPERS = {
+    "A5": (148.0, 210.0),
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "Letter": (215.9, 279.4),
+    "Legal": (215.9, 355.6),
+    "Tabloid": (279.4, 431.8),
+}
+"""Width and height, mm."""
+EDGE = 8.0  # width of the border that printers leave white, mm
+SIDE, FOOT = 10.0, 14.0  # widths at the left and the bottom of a page for the scale bars and their text, mm
+FURNITURE = np.array([2 * EDGE + SIDE, 2 * EDGE + FOOT])
+"""Part of a page's width and height that is not available for parts, mm."""
+OVERLAP = 10.0  # overlap of neighbouring sheets, mm
+CROSS = 2.5  # half the length of a registration mark, mm
+CLEAR = 1.0  # distance from a seam to the circles and squares that it passes, mm
+BETWEEN = 12.0  # distance of parts on one sheet, mm
+MOST_SHEETS = 500
+MOST_MM = 5000.0  # largest side of a page in a PDF, mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Shapes in the sheet's frame, clipped to the box ``clip`` (2, 2) if it is given."""
+
+    shapes: tuple[Shape, ...]
+    clip: np.ndarray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """A page with its origin at the bottom left."""
+
+    title: str
+    width: float
+    height: float
+    placed: tuple[Placed, ...]
+    cuts: bool = False  # whether a seam runs through the pattern of its part
+    bare: bool = False  # whether the part is without dimensions, with which it would take more sheets
+
+
+def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
+    """Return one sheet with all parts, as large as needed."""
+    drawn = [framed(part) for part in parts]
+    boxes = [extent(shapes) for shapes in drawn]
+    widest = max(np.sqrt(sum(np.prod(box[1] - box[0] + BETWEEN) for box in boxes)), *(np.ptp(b, 0)[0] for b in boxes))
+    placed: list[Shape] = []
+    x, top, lowest = 0.0, 0.0, 0.0
+    for shapes, box in zip(drawn, boxes, strict=True):
+        width, height = (box[1] - box[0]).tolist()
+        if x > 0 and x + width > widest:
+            x, top = 0.0, lowest - BETWEEN
+        placed += [moved(shape, [x - box[0, 0], top - box[1, 1]]) for shape in shapes]
+        x, lowest = x + width + BETWEEN, min(lowest, top - height)
+    box = extent(placed)
+    width, height = (np.ptp(box, 0) + FURNITURE).tolist()
+    return _sheet(title, width, height, placed, [EDGE + SIDE - box[0, 0], EDGE + FOOT - box[0, 1]])
+
+
+def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
+    """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
+
+    A part that is larger than a sheet only by its dimensions is drawn without them.
+    """
+    split = [min(_ways(part, paper), key=lambda way: (way.cuts, way.count, way.bare)) for part in parts]
+    total = sum(way.count for way in split)
+    if total > MOST_SHEETS:
+        raise InputError(
+            "E-DRAW-SHEETS", f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none"
+        )
+    return [
+        sheet
+        for part, way in zip(parts, split, strict=True)
+        for sheet in _tiles(way, f"{title}, {part.name}" if len(parts) > 1 else title)
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """A layout of a part on a paper."""
+
+    shapes: list[Shape]
+    box: np.ndarray  # extent of the shapes
+    size: tuple[float, float]  # of the paper
+    seams: tuple[list[float], list[float]]  # along X and Y
+    cuts: bool  # whether a seam runs through a circle, square or tag
+    bare: bool
+
+    @property
+    def count(self) -> int:
+        """Number of sheets."""
+        return (len(self.seams[0]) + 1) * (len(self.seams[1]) + 1)
+
+
+def _ways(part: Part, paper: str) -> list[_Way]:
+    """Return the layouts of a part: portrait and landscape, with dimensions, or bare on one sheet."""
+    ways, boxes, (width, height) = [], np.array([shape.box() for shape in part.pattern()]), PAPERS[paper]
+    for bare, size in product((False, True), ((width, height), (height, width))):
+        shapes = framed(part, bare)
+        box, room = extent(shapes), np.array(size) - FURNITURE
+        across, down = (
+            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k]) for k in (0, 1)
+        )
+        low, high = np.moveaxis(boxes, 1, 0)
+        cuts = any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in (across, down)[k])
+        way = _Way(shapes, box, size, (across, down), cuts, bare)
+        if not bare or (way.count == 1 and not part.lines):  # the pieces of a net need their names
+            ways.append(way)
+    return ways
+
+
+def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
+    """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
+    Seams avoid the intervals ``taken`` (n, 2) if they can."""
+    seams, start = [], low
+    while high - start > room:
+        place = last = start + room - OVERLAP / 2
+        while len(hit := taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]):
+            place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
+        seams.append(place if place > start + OVERLAP else last)
+        start = seams[-1] - OVERLAP / 2
+    return seams
+
+
+def _tiles(way: _Way, title: str) -> list[Sheet]:
+    if way.count == 1:
+        shift = [EDGE + SIDE - way.box[0, 0], way.size[1] - EDGE - way.box[1, 1]]
+        return [replace(_sheet(title, *way.size, way.shapes, shift), bare=way.bare)]
+    pieces = [  # start and end of each piece along X, and along Y
+        [*zip([low, *(at - OVERLAP / 2 for at in seams)], [*(at + OVERLAP / 2 for at in seams), high], strict=True)]
+        for seams, low, high in zip(way.seams, *way.box.tolist(), strict=True)
+    ]
+    shapes = [*way.shapes, *_registration(way)]
+    boxes = [shape.box() for shape in shapes]
+    sheets = []
+    for row, (below, above) in enumerate(reversed(pieces[1]), 1):
+        for column, (left, right) in enumerate(pieces[0], 1):
+            shift = [EDGE + SIDE - left, EDGE + FOOT - below]
+            clip = np.array([[left, below], [right, above]])
+            inside = [(box[0] <= clip[1]).all() and (box[1] >= clip[0]).all() for box in boxes]
+            place = f"sheet {len(sheets) + 1} of {way.count}: row {row}, column {column}"
+            content = compress(shapes, inside), shift, clip + shift, way.cuts
+            sheets.append(_sheet(f"{title}; {place}", *way.size, *content))
+    return sheets
+
+
+def _registration(way: _Way) -> list[Shape]:
+    """Return crosses where seams meet each other and the border; they appear on both sheets."""
+    places = []
+    for k in (0, 1):
+        crossings = [way.box[0, 1 - k] + CROSS, *way.seams[1 - k], way.box[1, 1 - k] - CROSS]
+        places += [(seam, crossing)[:: 1 - 2 * k] for seam in way.seams[k] for crossing in crossings]
+    marks: list[Shape] = []
+    for x, y in dict.fromkeys(places):
+        for step in ([CROSS, 0.0], [0.0, CROSS]):
+            ends = np.array([[x, y]]) + np.array([[-1.0], [1.0]]) * step
+            marks += [line(ends, "DIMENSIONS", "white", 0.6), line(ends, "DIMENSIONS", width=0.1)]
+    return marks
+
+
+def _sheet(
+    title: str, width: float, height: float, shapes: Iterable[Shape], shift: ArrayLike, clip=None, cuts=False
+) -> Sheet:
+    bars = [moved(shape, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
+    instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
+    if clip is not None:
+        instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
+    words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
+    placed = Placed(tuple(moved(shape, shift) for shape in shapes), clip)
+    return Sheet(title, width, height, (placed, Placed((*bars, *words))), cuts)
+
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
 CAPITAL_SHARE = 0.72  # height of a capital as a share of the font's size
@@ -34,11 +284,10 @@ def svg(sheet: Sheet) -> str:
         f"<title>{escape(sheet.title)}</title>",
     ]
     for number, placed in enumerate(sheet.placed):
+        clip = ""
         if placed.clip is not None:
-            lines.append(
-                f'<clipPath id="clip{number}"><path d="{_path(corners_of(placed.clip), sheet.height)}"/></clipPath>'
-            )
-        clip = "" if placed.clip is None else f' clip-path="url(#clip{number})"'
+            path, clip = _path([corners_of(placed.clip)], sheet.height), f' clip-path="url(#clip{number})"'
+            lines.append(f'<clipPath id="clip{number}"><path d="{path}"/></clipPath>')
         for layer in LAYERS:
             if shapes := [shape for shape in placed.shapes if shape.layer == layer]:
                 lines += [f'<g class="{layer}"{clip}>', *(_element(shape, sheet.height) for shape in shapes), "</g>"]
@@ -57,17 +306,16 @@ def _element(shape: Shape, height: float) -> str:
         font = f'font-family="sans-serif" font-size="{_number(shape.height / CAPITAL_SHARE)}"'
         attributes = f'{font} text-anchor="{shape.anchor}" fill="{colour}"{turn}'
         return f'<text x="{x}" y="{y}" {attributes}>{escape(shape.words)}</text>'
-    if isinstance(shape, Area):
-        path = " ".join(_path(line, height) for line in shape.lines)
+    path = _path(shape.lines, height, shape.closed)
+    if not shape.width:
         return f'<path d="{path}" fill="{colour}" fill-rule="evenodd"/>'
     dash = f' stroke-dasharray="{DASH}"' if shape.dashed else ""
-    path = _path(shape.points, height, shape.closed)
     return f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="{_number(shape.width)}"{dash}/>'
 
 
-def _path(points: np.ndarray, height: float, closed: bool = True) -> str:
-    places = " L".join(f"{_number(x)},{_number(height - y)}" for x, y in points.tolist())
-    return f"M{places}{' Z' if closed else ''}"
+def _path(lines: Sequence[np.ndarray], height: float, closed: bool = True) -> str:
+    places = (" L".join(f"{_number(x)},{_number(height - y)}" for x, y in line.tolist()) for line in lines)
+    return " ".join(f"M{place}{' Z' if closed else ''}" for place in places)
 
 
 def _number(value: float) -> str:
@@ -124,20 +372,20 @@ def _add(canvas, shape: Shape) -> None:
             path.curveTo(*np.concatenate(arc).tolist())
         path.close()
         canvas.drawPath(path, stroke=0, fill=1)
-    elif isinstance(shape, Area):
+    elif not shape.width:
         canvas.drawPath(_outline(canvas, shape.lines), stroke=0, fill=1, fillMode=0)  # even-odd
     else:
         canvas.setStrokeColor(colour)
         canvas.setLineWidth(shape.width)
         canvas.setDash([20 * shape.width, 10 * shape.width] if shape.dashed else [])
-        canvas.drawPath(_outline(canvas, [shape.points], shape.closed))
+        canvas.drawPath(_outline(canvas, shape.lines, shape.closed))
 
 
 def _outline(canvas, lines: Sequence[np.ndarray], closed: bool = True):
     path = canvas.beginPath()
-    for line in lines:
-        path.moveTo(*line[0].tolist())
-        for point in line[1:].tolist():
+    for start, *points in (points.tolist() for points in lines):
+        path.moveTo(*start)
+        for point in points:
             path.lineTo(*point)
         if closed:
             path.close()
@@ -190,43 +438,43 @@ def draw(
     InputError
         The design cannot be read or drawn, the file has another suffix, or the paper does not suit the form.
     """
-    path = Path(out)
+    path, is_pdf = Path(out), Path(out).suffix.lower() == ".pdf"
     if margin_mm < 0:
         raise InputError("E-OPTION-RANGE", f"draw: margin_mm {margin_mm:g}: 0 or more needed")
     given, paper = paper, _paper(path, paper)
     name, loaded = (design, load_design(design)) if isinstance(design, str | Path) else (type(design).__name__, design)
-    if net and not isinstance(loaded, TargetDesign):
+    if not net:
+        parts = parts_of(loaded, margin_mm)
+    elif not isinstance(loaded, TargetDesign):
         raise InputError("E-DRAW-DESIGN", f"--net: {name} is a board; nets are of targets")
-    if net and isinstance(loaded, TargetDesign):
+    else:
         parts = [net_part(loaded)]
-        fitting = paper_for(parts)
-        paper = paper if given or paper == OWN else fitting or OWN
+        fitting = paper_for(parts) or OWN
+        paper = paper if given or paper == OWN else fitting
         if paper != OWN and len(paper_sheets(parts, paper, "")) > 1:
             raise InputError(
                 "E-DRAW-SHEETS",
                 f"--net: {_size(parts[0])}, and a sheet of {paper} has room for {_room(paper)}; take --paper "
-                f"{fitting or OWN}, or draw the plates one by one without --net",
+                f"{fitting}, or draw the plates one by one without --net",
             )
-    else:
-        parts = parts_of(loaded, margin_mm)
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     if paper != OWN:
         sheets = paper_sheets(parts, paper, title)
-    elif path.suffix.lower() == ".pdf":
+    elif is_pdf:
         sheets = [one_sheet([part], f"{title}, {part.name}" if len(parts) > 1 else title) for part in parts]
     else:
         sheets = [one_sheet(parts, title)]
-    if path.suffix.lower() == ".svg" and len(sheets) > 1:
+    if not is_pdf and len(sheets) > 1:
         raise InputError(
             "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
         )
     largest = max(max(sheet.width, sheet.height) for sheet in sheets)
-    if path.suffix.lower() == ".pdf" and largest > MOST_MM:
+    if is_pdf and largest > MOST_MM:
         raise InputError(
             "E-DRAW-SHEETS",
             f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg",
         )
-    save(path, pdf(sheets) if path.suffix.lower() == ".pdf" else svg(sheets[0]))
+    save(path, pdf(sheets) if is_pdf else svg(sheets[0]))
     return Drawn(path, parts, sheets, paper)
 
 
@@ -243,8 +491,7 @@ def _size(part: Part) -> str:
 
 def _room(paper: str) -> str:
     """Return the room that a sheet has for parts and their dimensions."""
-    room = [said_mm(side - margin) for side, margin in zip(PAPERS[paper], FURNITURE, strict=True)]
-    return f"{' × '.join(room)} mm"
+    return f"{' × '.join(said_mm(side) for side in PAPERS[paper] - FURNITURE)} mm"
 
 
 def load_design(path: str | Path) -> Design:
@@ -290,7 +537,7 @@ def drawn_text(drawn: Drawn) -> str:
     lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
-        lines.append(f"{which} without dimensions and table, which would take more sheets")
+        lines.append(f"{which} without dimensions, which would take more sheets")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"

@@ -1,10 +1,11 @@
-"""Plates of a target's faces and sheets of boards as discs, areas, lines and words; mm, X to the right, Y upwards."""
+"""Plates of a target's faces, their net to fold, and sheets of boards, as discs, paths and words; mm, Y upwards."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.boards.board_designs import (
     AprilGridDesign,
@@ -17,7 +18,9 @@ from stcal.boards.board_designs import (
     black_areas,
     clear_mm,
 )
+from stcal.boards.target_file import ROUGH_KEYS
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 
 Ink = Literal["black", "white", "grey"]
@@ -25,6 +28,7 @@ Layer = Literal["GROUND", "PATTERN", "CUT", "FOLD", "DIMENSIONS", "LABELS"]
 LAYERS: tuple[Layer, ...] = ("GROUND", "PATTERN", "CUT", "FOLD", "DIMENSIONS", "LABELS")
 """Layers. ``GROUND`` : ink behind a bright pattern; ``CUT`` : outlines and cut marks; ``DIMENSIONS`` : dimensions,
 scale bars, registration marks; ``LABELS`` : words beside the parts."""
+NO_TURN = np.eye(2)
 WIDTH_PER_HEIGHT = 0.85
 """Approximate width of a letter over its height: for reserving space, not for typesetting."""
 
@@ -46,30 +50,18 @@ class Disc:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Area:
-    """A filled area between closed ``lines`` (k, 2); lines inside others are holes."""
+class Outline:
+    """Lines (k, 2) each: thin ones, or, with a ``width`` of 0, the edges of an area, in which inner lines are holes."""
 
     lines: tuple[np.ndarray, ...]
-    ink: Ink
     layer: Layer = "PATTERN"
-
-    def box(self) -> np.ndarray:
-        return box_of(np.concatenate(self.lines))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Line:
-    """A thin line through ``points`` (k, 2)."""
-
-    points: np.ndarray
-    layer: Layer
     ink: Ink = "black"
-    width: float = 0.15
-    closed: bool = False
+    width: float = 0.0
+    closed: bool = True
     dashed: bool = False
 
     def box(self) -> np.ndarray:
-        return box_of(self.points)
+        return box_of(np.concatenate(self.lines))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +86,7 @@ class Text:
         return box + np.array([self.x, self.y])
 
 
-Shape: TypeAlias = Disc | Area | Line | Text
+Shape: TypeAlias = Disc | Outline | Text
 
 
 def box_of(points: np.ndarray) -> np.ndarray:
@@ -108,31 +100,23 @@ def extent(shapes: Iterable[Shape]) -> np.ndarray:
     return box_of(np.array([shape.box() for shape in shapes]))
 
 
-def moved(shape: Shape, x: float, y: float) -> Shape:
-    """Return the shape shifted by (x, y)."""
-    if isinstance(shape, Disc | Text):
-        return replace(shape, x=shape.x + x, y=shape.y + y)
-    if isinstance(shape, Area):
-        return replace(shape, lines=tuple(line + np.array([x, y]) for line in shape.lines))
-    return replace(shape, points=shape.points + np.array([x, y]))
+def line(points, layer: Layer, ink: Ink = "black", width: float = 0.15, closed=False, dashed=False) -> Outline:
+    """Return a thin line through points (k, 2)."""
+    return Outline((np.asarray(points, float),), layer, ink, width, closed, dashed)
+
+
+def moved(shape: Shape, shift: ArrayLike, turn: np.ndarray = NO_TURN) -> Shape:
+    """Return the shape after a turn (2, 2), which words do not follow, and a shift (2,)."""
+    if isinstance(shape, Outline):
+        return replace(shape, lines=tuple(line @ turn.T + shift for line in shape.lines))
+    x, y = (np.array([shape.x, shape.y]) @ turn.T + shift).tolist()
+    return replace(shape, x=x, y=y)
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:
     """Return the corners (4, 2) of a box (2, 2) of smallest and largest coordinates, anticlockwise."""
     (left, below), (right, above) = box.tolist()
     return np.array([[left, below], [right, below], [right, above], [left, above]])
-
-
-def words_with_room(places: np.ndarray, words: Iterable[str], height: float, taken: Iterable[Text] = ()) -> list[Text]:
-    """Return words about their places (n, 2), without those that would overlap others before, or the ``taken`` ones."""
-    found, boxes = [], [text.box() for text in taken]
-    for (x, y), word in zip(places.tolist(), words, strict=True):
-        text = Text(x, y - height / 2, word, height, "middle")
-        low, high = text.box()
-        if all((low >= box[1]).any() or (high <= box[0]).any() for box in boxes):
-            found.append(text)
-            boxes.append(text.box())
-    return found
 
 
 def said_mm(value: float) -> str:
@@ -153,8 +137,7 @@ class Part:
     outline: np.ndarray  # (k, 2) cutting line
     shapes: tuple[Shape, ...]
     spans: Spans = ()  # lengths that are dimensioned
-    table: tuple[tuple[str, ...], ...] = ()  # rows of words, the first a note, the second the heads
-    lines: tuple[Line, ...] = ()  # to cut and fold, if they replace the outline, which then only encloses the part
+    lines: tuple[Outline, ...] = ()  # to cut and fold, if they replace the outline, which then only encloses the part
 
     def pattern(self) -> list[Shape]:
         """Return the shapes of the pattern, without the ground."""
@@ -168,13 +151,7 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
         outline = as_seen(face).outline_mm
         return part if outline is None else replace(part, outline=outline)
     shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
-    rows = [
-        (circle, said_mm(x), said_mm(y), said_mm(2 * r))
-        for circle, (x, y), r in zip(face.ids, face.xy_mm.tolist(), face.radius_mm.tolist(), strict=True)
-    ]
-    frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
-    table = (frame, ("circle", "x", "y", "diameter"), *rows)
-    return _part(f"face {face.id}", shapes, polarity, margin_mm, table=table, outline=face.outline_mm)
+    return _part(f"face {face.id}", shapes, polarity, margin_mm, outline=face.outline_mm)
 
 
 def as_seen(face: FaceDesign) -> FaceDesign:
@@ -198,7 +175,7 @@ def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> P
     """Return the sheet of a board; the board's Y, which points down, is inverted."""
     if isinstance(board, BoardDesign | AsymmetricCirclesDesign):
         return _dots(board, name, margin_mm)
-    areas = [Area(tuple(line * [1, -1] for line in lines), "black") for lines in black_areas(board)]
+    areas = [Outline(tuple(line * [1, -1] for line in lines)) for lines in black_areas(board)]
     description, spans = _squares_said(board)
     return _part(f"{name}: {description}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
 
@@ -266,9 +243,178 @@ def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
     return [Disc(x, y, radius, ink, name=str(name)) for (x, y), radius, name in rows]
 
 
-def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=(), outline=None) -> Part:
+def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), outline=None) -> Part:
     if outline is None:
         outline = corners_of(extent(pattern) + margin_mm * np.array([[-1.0], [1.0]]))
     outline = np.asarray(outline)
-    ground = [Area((outline,), "black", "GROUND")] if polarity == "bright" else []
-    return Part(name, outline, (*ground, *pattern), spans, table)
+    ground = [Outline((outline,), "GROUND")] if polarity == "bright" else []
+    return Part(name, outline, (*ground, *pattern), spans)
+
+
+TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
+"""Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
+TAB_MM, TAB_SHARE = 10.0, 0.25  # largest width of a tab, mm, and as a share of its edge
+SKETCH = 1 / 8  # scale of the sketch that names the faces
+BESIDE = 15.0  # distance of the sketch from the net, mm
+LETTERS = 2.0  # height of names, mm
+IN_CORNER = 3.0
+"""Distance of the name of a printed face from the corner of its plate, mm: in the white about a tag."""
+TOUCH = 1e-3  # overlap of plates that counts as rounding, mm
+Edge: TypeAlias = tuple[str, int]
+"""A face, and the number of an edge of its outline, anticlockwise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plate:
+    """A face with net_from_face; ``corners`` : (k, 2) of its outline in the net's plane."""
+
+    face: FaceDesign
+    turn: np.ndarray  # (2, 2)
+    shift: np.ndarray  # (2,)
+    corners: np.ndarray
+
+    @classmethod
+    def of(cls, face: FaceDesign, turn: np.ndarray, shift: np.ndarray) -> "_Plate":
+        return cls(face, turn, shift, np.asarray(face.outline_mm) @ turn.T + shift)
+
+    def edges(self) -> Iterator[tuple[Edge, np.ndarray]]:
+        """Yield the edges with their ends (2, 2)."""
+        for edge, ends in enumerate(zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True)):
+            yield (self.face.id, edge), np.array(ends)
+
+
+def net_part(target: TargetDesign) -> Part:
+    """Return the net of all plates: those that share an edge in space, by ``outline_mm`` at rough poses, unfolded into
+    one plane."""
+    for face in target.faces:
+        if face.outline_mm is None or face.rough_target_from_face is None:
+            raise InputError(
+                "E-DRAW-NET",
+                f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}; add it to "
+                "the target file, or draw plates one by one without --net",
+            )
+    faces = {face.id: _against_the_clock(as_seen(face)) for face in target.faces}
+    shared = _shared_edges(faces.values())
+    first = max(faces, key=lambda face: sum(face == own for own, _ in shared))
+    plates, free = [_Plate.of(faces[first], NO_TURN, np.zeros(2))], faces.keys() - {first}
+    folds: set[Edge] = set()
+    for plate in plates:  # grows
+        for edge, ends in plate.edges():
+            partner = shared.get(edge)
+            if partner is None or partner[0] not in free:
+                continue
+            unfolded = _unfolded(ends, faces[partner[0]], partner[1])
+            if _is_clear(unfolded.corners, [each.corners for each in plates]):
+                plates.append(unfolded)
+                free -= {partner[0]}
+                folds |= {edge, partner}
+    if free:
+        raise InputError(
+            "E-DRAW-NET",
+            f"--net: the plate of face {min(free)} shares no edge with the others, or would lie on one; correct "
+            "outline_mm and rough_pose, or draw plates one by one without --net",
+        )
+    return _folded(plates, target.polarity, shared, folds)
+
+
+def _against_the_clock(face: FaceDesign) -> FaceDesign:
+    outline = np.asarray(face.outline_mm)
+    ahead = np.roll(outline, -1, axis=0)
+    area = (outline[:, 0] * ahead[:, 1] - ahead[:, 0] * outline[:, 1]).sum()
+    return replace(face, outline_mm=outline if area > 0 else outline[::-1])
+
+
+def _shared_edges(faces: Iterable[FaceDesign]) -> dict[Edge, Edge]:
+    """Return pairs of edges that two plates share in space, in both directions."""
+    ends: dict[Edge, tuple[np.ndarray, np.ndarray]] = {}
+    for face in faces:
+        place = Rigid() if face.rough_target_from_face is None else face.rough_target_from_face
+        corners = place @ np.pad(np.asarray(face.outline_mm), ((0, 0), (0, 1)))
+        ends |= {(face.id, k): (corners[k], corners[(k + 1) % len(corners)]) for k in range(len(corners))}
+    nearest = {}
+    for edge, (a, b) in ends.items():
+        near = max(TOGETHER_MM, TOGETHER_SHARE * float(np.linalg.norm(b - a)))
+        for candidate, (c, d) in ends.items():
+            if edge[0] != candidate[0] and max(np.linalg.norm(a - d), np.linalg.norm(b - c)) < near:
+                nearest[edge] = candidate
+    return {edge: candidate for edge, candidate in nearest.items() if nearest.get(candidate) == edge}
+
+
+def _unfolded(ends: np.ndarray, face: FaceDesign, own: int) -> _Plate:
+    """Return the face as a plate of the net, with its edge ``own`` along an edge of another plate, reversed."""
+    outline = np.asarray(face.outline_mm)
+    last, first = outline[own], outline[(own + 1) % len(outline)]
+    angle = np.arctan2(*(ends[1] - ends[0])[::-1]) - np.arctan2(*(last - first)[::-1])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return _Plate.of(face, turn, (ends[0] + ends[1]) / 2 - turn @ (first + last) / 2)
+
+
+def _is_clear(one: np.ndarray, others: Iterable[np.ndarray]) -> bool:
+    """Return True if a polygon overlaps no other, by separating axes; concave polygons may count with their hulls."""
+
+    def overlaps(other: np.ndarray) -> bool:
+        for polygon in (one, other):
+            side = np.roll(polygon, -1, axis=0) - polygon
+            normals = np.column_stack([side[:, 1], -side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
+            a, b = one @ normals.T, other @ normals.T
+            if ((a.max(0) <= b.min(0) + TOUCH) | (b.max(0) <= a.min(0) + TOUCH)).any():
+                return False
+        return True
+
+    return not any(map(overlaps, others))
+
+
+def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], folds: set[Edge]) -> Part:
+    """Return the plates with what is to cut and fold, tabs under their partners, and a sketch with names."""
+    grounds: list[Shape] = []
+    shapes: list[Shape] = []
+    lines: list[Outline] = []
+    taken = [plate.corners for plate in plates]
+    for plate in plates:
+        for shape in face_part(plate.face, polarity, 0.0).shapes:
+            (shapes if isinstance(shape, Disc) else grounds).append(moved(shape, plate.shift, plate.turn))
+        if plate.face.printed:  # beside circles, a detector may take letters for circles
+            inwards = plate.corners.mean(0) - plate.corners[0]
+            x, y = (plate.corners[0] + IN_CORNER * inwards / np.linalg.norm(inwards)).tolist()
+            shapes.append(Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle"))
+        for edge, ends in plate.edges():
+            partner = shared.get(edge, edge)
+            fold = line(ends, "FOLD", "grey", dashed=True)
+            if edge in folds:
+                lines += [fold] if edge < partner else []
+                continue
+            tab = _tab(ends)
+            if edge >= partner or not _is_clear(tab, taken):
+                lines.append(line(ends, "CUT", width=0.1))
+                continue
+            taken.append(tab)
+            lines += [fold, line(tab, "CUT", width=0.1)]
+            x, y = tab.mean(0).tolist()
+            level = abs(ends[0, 1] - ends[1, 1]) < abs(ends[0, 0] - ends[1, 0])
+            at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
+            shapes.append(Text(*at, f"under {partner[0]}", LETTERS, "middle", turned=not level))
+    box = box_of(np.concatenate(taken))
+    sketch = _sketch(plates, np.array([box[1, 0] + BESIDE, box[1, 1]]))
+    return Part("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
+
+
+def _tab(ends: np.ndarray) -> np.ndarray:
+    """Return a trapezium (4, 2) to the right of an edge, its outer side; it is open at the edge."""
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along))
+    along = along / length
+    out = np.array([along[1], -along[0]])
+    width = min(TAB_MM, TAB_SHARE * length)
+    return np.array([ends[0], ends[0] + width * (along + out), ends[1] + width * (out - along), ends[1]])
+
+
+def _sketch(plates: list[_Plate], left_above: np.ndarray) -> list[Shape]:
+    """Return a small sketch of the plates, each with the name of its face."""
+    every = np.concatenate([plate.corners for plate in plates])
+    shift = left_above - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
+    shapes: list[Shape] = []
+    for plate in plates:
+        corners = SKETCH * plate.corners + shift
+        x, y = corners.mean(0).tolist()
+        shapes += [line(corners, "LABELS", closed=True), Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle")]
+    return shapes

@@ -117,20 +117,32 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Notes:
-    """Remarks: a list on the page, lines that begin with ``note:`` on the terminal."""
+class Printed:
+    """Lines for the terminal alone."""
 
-    texts: Sequence[str]
+    content: Sequence[str]
 
     def __bool__(self) -> bool:
-        return len(self.texts) > 0
+        return len(self.content) > 0
+
+    def lines(self) -> list[str]:
+        """Return the lines."""
+        return list(self.content)
+
+    def __html__(self) -> str:
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Notes(Printed):
+    """Remarks: a list on the page, lines that begin with ``note:`` on the terminal."""
 
     def lines(self) -> list[str]:
         """Return a line for each remark."""
-        return [f"note: {text}" for text in self.texts]
+        return [f"note: {text}" for text in self.content]
 
     def __html__(self) -> str:
-        return _macro("bullets", [sentence(text) for text in self.texts])
+        return _macro("bullets", [sentence(text) for text in self.content])
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,24 +214,7 @@ class Answer:
         return self.said or sentence(f"{self.word.capitalize()}: {self.why}")
 
 
-@dataclass(frozen=True, slots=True)
-class Printed:
-    """Lines for the terminal alone."""
-
-    content: Sequence[str]
-
-    def __bool__(self) -> bool:
-        return len(self.content) > 0
-
-    def lines(self) -> list[str]:
-        """Return the lines."""
-        return list(self.content)
-
-    def __html__(self) -> str:
-        return ""
-
-
-Block = str | Table | Notes | Answer | Printed | Html | None
+Block = str | Table | Answer | Printed | Html | None
 
 
 @dataclass(frozen=True, slots=True)

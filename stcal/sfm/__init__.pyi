@@ -4,11 +4,11 @@ from .checks.significance import Trial as Trial
 from .checks.significance import judge as judge
 from .detect.labelling import Detection as Detection
 from .detect.labelling import detect_circles as detect_circles
+from .interop.crosscheck import calibrate_models as calibrate_models
 from .interop.crosscheck import crosscheck as crosscheck
 from .interop.export import export_run as export_run
-from .interop.export_database import export_database as export_database
-from .interop.export_model import export_model as export_model
-from .interop.native import calibrate_models as calibrate_models
+from .interop.export_colmap import export_database as export_database
+from .interop.export_colmap import export_model as export_model
 from .make import DesignOptions as DesignOptions
 from .make import design_tag_body as design_tag_body
 from .make import design_target as design_target

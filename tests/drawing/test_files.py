@@ -12,18 +12,8 @@ from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, Chessboar
 from stcal.boards.board_file import board_toml
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
-from stcal.drawing.draw import POINT_MM, draw
-from stcal.drawing.parts import Disc, Line, Text, parts_of
-from stcal.drawing.sheets import (
-    EDGE,
-    FOOT,
-    OVERLAP,
-    PAPERS,
-    SIDE,
-    framed,
-    paper_sheets,
-    seams_between,
-)
+from stcal.drawing.draw import EDGE, FOOT, OVERLAP, PAPERS, POINT_MM, SIDE, draw, framed, paper_sheets, seams_between
+from stcal.drawing.parts import Disc, Outline, Text, parts_of
 from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -104,7 +94,7 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
                 whole.add(disc.name)
             cut = ((box[0] < inner[0]) & (box[1] > inner[0])) | ((box[0] < inner[1]) & (box[1] > inner[1]))
             assert not cut.any(), disc.name
-        marks = [s for s in tile.shapes if isinstance(s, Line) and s.ink == "white"]
+        marks = [s for s in tile.shapes if isinstance(s, Outline) and s.ink == "white"]
         assert len(marks) >= 6  # both strokes of at least three crosses
         covered += np.prod(high - low)
     assert whole == set(place)
@@ -166,17 +156,13 @@ def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
     assert len(list(files.iterdir())) == 3
 
 
-def test_a_design_that_is_not_there_is_said(files):
-    with fails_with("E-DRAW-DESIGN … nothing.toml … target.toml"):
-        draw(files / "nothing.toml", files / "a.svg")
-
-
-def test_too_many_sheets_and_circles_without_a_radius_are_refused(files):
+def test_designs_that_cannot_be_drawn_are_refused(files):
+    """One that is not there, one of too many sheets, and circles without a radius."""
+    refuses("E-DRAW-DESIGN … nothing.toml … target.toml", draw, files / "nothing.toml", files / "a.svg")
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
     refuses("E-DRAW-SHEETS … --paper … A4 … 500", draw, files / "board.toml", files / "board.pdf")
     refuses("E-DRAW-SHEETS … 5000", draw, files / "board.toml", files / "board.pdf", "own")
     (files / "grid.yaml").write_text(
         "target_type: circlegrid\ntargetCols: 4\ntargetRows: 5\nspacingMeters: 0.02\nasymmetricGrid: true\n"
     )
-    with fails_with("E-BOARD-RADIUS … radius_mm"):
-        draw(files / "grid.yaml", files / "grid.pdf")
+    refuses("E-BOARD-RADIUS … radius_mm", draw, files / "grid.yaml", files / "grid.pdf")

@@ -8,10 +8,8 @@ import pytest
 
 from stcal.boards.target_file import target_toml
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.draw import draw, net_text
-from stcal.drawing.net import _is_clear, net_part
-from stcal.drawing.parts import Disc, Text
-from stcal.drawing.sheets import one_sheet
+from stcal.drawing.draw import draw, net_text, one_sheet
+from stcal.drawing.parts import Disc, Text, _is_clear, net_part
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -56,9 +54,9 @@ def test_a_box_is_one_net(target):
     assert len(folds) == 8  # and all eight are folded
     corners = np.concatenate(list(plates.values()))
     for line in folds:
-        ends = [np.linalg.norm(corners - end, axis=1) < 1e-9 for end in line.points]
+        ends = [np.linalg.norm(corners - end, axis=1) < 1e-9 for end in line.lines[0]]
         assert all(end.any() for end in ends)
-    lengths = sorted(float(np.linalg.norm(np.diff(line.points, axis=0))) for line in folds)
+    lengths = sorted(float(np.linalg.norm(np.diff(line.lines[0], axis=0))) for line in folds)
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
 
 
@@ -116,14 +114,6 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         net_part(TargetDesign("book", "dark", tuple(pages)))
 
 
-def test_plates_that_touch_do_not_overlap():
-    square = np.array([[0.0, 0], [10, 0], [10, 10], [0, 10]])
-    assert _is_clear(square, [square + np.array([10, 0])])
-    assert _is_clear(square, [square + np.array([10, 10])])
-    assert not _is_clear(square, [square + np.array([9.9, 3])])
-    assert not _is_clear(square, [0.1 * square + 4])
-
-
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
     refuses("E-DRAW-NET … --net … 1 … outline_mm", draw, tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
@@ -131,16 +121,3 @@ def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     refuses("E-DRAW-NET … --net … front … rough_pose", net_part, TargetDesign("box", "dark", nowhere))
     (tmp_path / "board.toml").write_text('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n')
     refuses("E-DRAW-DESIGN", draw, tmp_path / "board.toml", tmp_path / "net.pdf", net=True)
-
-
-def test_plates_apart_are_refused():
-    """A pair of sides that share an edge, and another pair elsewhere."""
-    four = make_pattern(sides_of(SIZE)[:4], 9, 4.0, "dark", 3, "box").target
-    away = Rigid(np.eye(3), np.array([500.0, 0, 0]))
-    moved = []
-    for number, face in enumerate(four.faces):
-        assert face.rough_target_from_face is not None
-        pose = away @ face.rough_target_from_face if number > 1 else face.rough_target_from_face
-        moved.append(replace(face, rough_target_from_face=pose))
-    with fails_with("E-DRAW-NET … --net"):
-        net_part(TargetDesign("two", "dark", tuple(moved)))

@@ -23,7 +23,7 @@ from stcal.robot.kinematics.robot_file import robot_toml
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.data.group_model import detections_csv
-from stcal.sfm.interop.export_model import export_model
+from stcal.sfm.interop.export_colmap import export_model
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions

@@ -24,15 +24,14 @@ from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
-from stcal.sfm.budget.sources import sources_of, statement_of
+from stcal.sfm.budget.combine import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.measure_images import Tracker
-from stcal.sfm.planning.plan_report import plan_text
-from stcal.sfm.planning.session import PlanOptions, plan, planned_photographs
+from stcal.sfm.planning.session import PlanOptions, plan, plan_text, planned_photographs
 from stcal.sfm.report.compare import compare
 from stcal.sfm.report.judgement import TESTED_BY
 from stcal.sfm.runs.run_options import RunOptions

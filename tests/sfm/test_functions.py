@@ -14,7 +14,7 @@ from PIL import Image
 import stcal
 from stcal import sfm
 from stcal.io.files import json_text
-from stcal.sfm.planning.plan_report import plan_text
+from stcal.sfm.planning.session import plan_text
 from tests.outcome import fails_with, refuses
 from tests.shared import own_copy
 

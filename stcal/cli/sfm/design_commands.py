@@ -312,8 +312,7 @@ def design(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make import DesignOptions, design_tag_body, design_target, faces_of, made_text, size_of
-    from stcal.sfm.planning.plan_report import plan_text
-    from stcal.sfm.planning.session import PlanOptions
+    from stcal.sfm.planning.session import PlanOptions, plan_text
     from stcal.synthetic.designs import made_text as body_text
     from stcal.synthetic.designs import width_of
 

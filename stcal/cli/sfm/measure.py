@@ -46,8 +46,7 @@ def plan(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
     from stcal.sfm.planning.forecast import CentreNoise
-    from stcal.sfm.planning.plan_report import PlanFile, plan_text
-    from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
+    from stcal.sfm.planning.session import PlanFile, PlanOptions, pairs_of_faces, plan_text
     from stcal.sfm.planning.session import plan as planned
     from stcal.sfm.runs.run_options import RunOptions
     from stcal.sfm.runs.saved import load_run
@@ -94,9 +93,8 @@ def advise(
 ) -> None:
     """Compute which further photographs would lower the σ of the worst face of a run most."""
     shared.load_ahead(None)
+    from stcal.sfm.planning.advise import AdviceFile, advice_text, doubts, known_of
     from stcal.sfm.planning.advise import advise as advice_for
-    from stcal.sfm.planning.advise import doubts, known_of
-    from stcal.sfm.planning.plan_report import AdviceFile, advice_text
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)

@@ -204,7 +204,7 @@ def budget(
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
     from stcal.report.document import pdf_of, require_pdf
     from stcal.sfm.budget.budget_page import budget_in_brief, uncertainty_budget
-    from stcal.sfm.budget.sources import fields_of
+    from stcal.sfm.budget.combine import fields_of
 
     if pdf and page is None:
         raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")
@@ -233,8 +233,8 @@ def export_database(
     schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."],
 ) -> None:
     """Copy the run's database in the form of another version of COLMAP; ids, orders and values stay the same."""
-    from stcal.sfm.interop.crosscheck import database_text
-    from stcal.sfm.interop.export_database import export_database as export
+    from stcal.sfm.interop.export_colmap import database_text
+    from stcal.sfm.interop.export_colmap import export_database as export
 
     say(database_text(export(run, out, schema)))
 
@@ -246,8 +246,8 @@ def export_model(
     kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, nvm or bundler.", Opt("--format")],
 ) -> None:
     """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
-    from stcal.sfm.interop.crosscheck import model_text
-    from stcal.sfm.interop.export_model import export_model as export
+    from stcal.sfm.interop.export_colmap import export_model as export
+    from stcal.sfm.interop.export_colmap import model_text
 
     say(model_text(export(run, out, kind), kind))
 
@@ -265,8 +265,8 @@ def export_run(
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""
-    from stcal.sfm.interop.crosscheck import export_text
     from stcal.sfm.interop.export import export_run as export
+    from stcal.sfm.interop.export import export_text
 
     say(export_text(export(run, out, form, name)))
 
@@ -310,8 +310,7 @@ def faces(
     ] = "chain",
 ) -> None:
     """Find scale and faces of a COLMAP model made or edited elsewhere; its labels are found by image and keypoint."""
-    from stcal.sfm.interop.crosscheck import faces_text
-    from stcal.sfm.interop.native import calibrate_models
+    from stcal.sfm.interop.crosscheck import calibrate_models, faces_text
     from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():

@@ -1,24 +1,214 @@
-"""Form of the JSON file of ``budget``, which its page and PDF show too."""
+"""Form of the JSON file of ``budget``, which its page and PDF show too, and the length test in it: distances between
+circles against stated lengths, or against a second calibration.
+
+Terms of the length test are those of VDI/VDE 2634 part 1 and ISO 10360; E_n is of ISO 13528:2022, 9.7, at most 1 where
+both agree."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter
+from scipy.stats import norm
 
 import stcal
-from stcal.design import StatedSize
+from stcal.design import BoardDesign, StatedSize
+from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
-from stcal.report.text import join
-from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, GroupViews, Row
-from stcal.sfm.budget.length_test import LengthTest
-from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
+from stcal.io.table import LENGTHS, read_table
+from stcal.report.text import join, number
+from stcal.sfm.budget.combine import (
+    COVERAGE_FACTOR,
+    REFERENCE_C,
+    Budget,
+    GroupViews,
+    Origin,
+    Row,
+    Statement,
+    distance,
+    longest_of,
+    reference_temperature_c,
+)
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, judgement_of
 from stcal.sfm.runs.run_result import SavedRun
 from stcal.sfm.runs.saved import Verified
+
+BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
+"""Probability that one length that agrees is beyond U by chance, and that any length of a test is beyond the limit."""
+SHARED = ("board_pitch", "board_expansion", "target_expansion")
+"""Sources whose errors two calibrations of one target with one board share: they scale all lengths by one factor."""
+
+
+@dataclass(frozen=True, slots=True)
+class TestedLength:
+    """A measured length against a reference; U of their difference, and E_n with its sign, None where none holds."""
+
+    circles: tuple[str, ...]
+    measured_mm: float
+    reference_mm: float
+    error_um: float
+    expanded_um: float | None
+    e_n: Finite  # infinite if both lengths are exact and differ
+
+
+@dataclass(frozen=True, slots=True)
+class LengthTest:
+    """A length test. ``reference`` : what the lengths are compared with; ``notes`` : what the test cannot detect."""
+
+    reference: str
+    lengths: list[TestedLength]
+    largest_e_n: Finite
+    beyond: int | None
+    limit: float
+    agrees: bool | None
+    verdict: str
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, reference: str, lengths: Sequence[TestedLength], notes: tuple[str, ...]) -> "LengthTest":
+        """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
+        chance (Bonferroni)."""
+        count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
+        limit = float(norm.isf(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
+        if not e_n:
+            verdict = f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
+            return cls(reference, list(lengths), None, None, limit, None, verdict, notes)
+        largest, beyond = max(e_n), sum(each > 1 for each in e_n)
+        agrees = largest <= limit * (1 + 1e-9)
+        verdict = f"agrees: all {count} lengths within U, largest |E_n| {number(largest, 2)}"
+        if beyond:
+            verdict = (
+                f"{'may agree' if agrees else 'differs'}: {beyond} of {count} lengths beyond U, where 1 in 22 is by "
+                f"chance; largest |E_n| {number(largest, 2)}, which reaches {limit:.2f} by chance in one of 22 tests "
+                f"of {count}"
+            )
+        return cls(reference, list(lengths), largest, beyond, limit, agrees, verdict, notes)
+
+    def without_u(self) -> "LengthTest":
+        """Returns the test of a run that must not be used, of which no U holds: nothing is judged."""
+        return self.of(self.reference, [replace(own, expanded_um=None, e_n=None) for own in self.lengths], self.notes)
+
+
+def against_stated(budget: Budget, path: Path) -> LengthTest:
+    """Tests the run against a CSV of ``from``, ``to`` (``face:circle``), ``length_mm`` and perhaps ``sigma_mm``."""
+    _require_size(budget)
+    table = read_table(path, "lengths")
+    ends = list(zip(table.text("from"), table.text("to"), strict=True))
+    length = table.quantity("length", LENGTHS)
+    known = table.has("sigma", LENGTHS)
+    sigma = table.quantity("sigma", LENGTHS) if known else np.zeros(len(length))
+    tested, places = [], {str(label): i for i, label in enumerate(budget.joint.labels)}
+    for line, (a, b), value, sigma_mm in zip(table.lines, ends, length, sigma, strict=True):
+        where = f"{table.where}: line {line}"
+        if unknown := {a, b} - places.keys():
+            raise InputError(
+                "E-BUDGET-LENGTHS",
+                f"{where}: no circle {min(unknown)} in the run; give one such as {budget.joint.labels[0]}",
+            )
+        if a == b or value <= 0 or sigma_mm < 0:
+            raise InputError(
+                "E-BUDGET-LENGTHS",
+                f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, and a σ of 0 "
+                "or more",
+            )
+        tested.append(_length(budget, (places[a], places[b]), float(value), float(sigma_mm)))
+    notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
+    if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
+        notes += (
+            f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
+            "not corrected to another",
+        )
+    return LengthTest.of(str(path), tested, notes)
+
+
+def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[BoardDesign]) -> LengthTest:
+    """Tests the longest distances between circles that two calibrations of the same target share."""
+    _require_size(budget)
+    _require_size(other)
+    common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
+    rows, other_rows = ([each.joint.labels.index(label) for label in common] for each in (budget, other))
+    pairs = longest_of(common, budget.joint.xyz_model[rows])
+    if not pairs:
+        raise InputError(
+            "E-BUDGET-LENGTHS",
+            f"run {folder}: {len(common)} circles in common, 2 needed; give a run of the same target",
+        )
+    # The two runs may have used one board.
+    same = len({(board.rows, board.columns, board.pitch_mm, board.corner) for board in boards}) == 1
+    shared = SHARED if same else ("target_expansion",)
+    tested = []
+    for i, j in pairs:
+        reference = _length(other, (other_rows[i], other_rows[j]), 0.0, 0.0, shared)
+        sigma_mm = 1e-3 * (reference.expanded_um or 0.0) / COVERAGE_FACTOR
+        tested.append(_length(budget, (rows[i], rows[j]), reference.measured_mm, sigma_mm, shared))
+    note = (
+        "both calibrations rest on boards of the same description: if it is one board, what its pitch and expansion "
+        "are off is in both alike, cannot be seen here, and is not in U of the differences; a length from elsewhere "
+        "(--check-lengths) shows it"
+    )
+    notes = (note,) if same else ()
+    if budget.conditions.temperature_c != other.conditions.temperature_c:
+        notes += (
+            "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
+            "board and target for both",
+        )
+    return LengthTest.of(str(folder), tested, notes)
+
+
+SAME_VIEW_PX = 0.2
+"""Median distance of equal circles below which two photographs are of one view: no hand comes back to it."""
+
+
+def common_views(first: Sequence[ImageObservations], second: Sequence[ImageObservations]) -> tuple[str, ...]:
+    """Returns a note on photographs of which both runs have the same view; none if there are none."""
+    common = sum(any(_same_view(image, other) for other in second) for image in first)
+    if not common:
+        return ()
+    return (
+        f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px: the two "
+        "calibrations are not independent, and what both have wrong cannot be seen here; compare with a run of other "
+        "photographs",
+    )
+
+
+def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
+    place = {label: i for i, label in enumerate(other.labels)}
+    rows = [(i, place[label]) for i, label in enumerate(image.labels) if label in place]
+    if 2 * len(rows) <= max(len(image), len(other)):
+        return False
+    own, others = np.array(rows).T
+    apart = np.linalg.norm(image.centre_px[own] - other.centre_px[others], axis=1)
+    return bool(np.median(apart) < SAME_VIEW_PX)
+
+
+def _require_size(budget: Budget) -> None:
+    if not budget.conditions.size_known:
+        raise InputError(
+            "E-BUDGET-NO-SIZE",
+            "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared; "
+            "state one of the lengths with [[scale]] in target.toml, and run again",
+        )
+
+
+def _length(
+    budget: Budget, ends: tuple[int, int], reference_mm: float, sigma_mm: float, without: Sequence[str] = ()
+) -> TestedLength:
+    """Returns a corrected length of the run, with U by all sources except ``without`` and by the reference's σ."""
+    measurand = distance(budget.joint, *ends)
+    variance = sum(
+        float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
+    )
+    measured = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
+    expanded = 1e3 * COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm))
+    error = 1e3 * (measured - reference_mm)
+    e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
+    return TestedLength(measurand.circles, measured, reference_mm, error, expanded, e_n)
+
 
 MICRO = 1e3
 MILLIDEGREES = 1e3 * float(np.degrees(1.0))
@@ -49,12 +239,12 @@ class SourceRow(Part):
 class Uncertainty(Part):
     """Uncertainty of one measurand."""
 
-    axes: list[float]
-    contributions: dict[str, float]
-    standard: float
-    expanded: float
-    coverage: float
-    degrees_of_freedom: Finite
+    axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
+    contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
+    standard: float = Field(description="combined standard uncertainty of all of them together")
+    expanded: float = Field(description="expanded uncertainty")
+    coverage: float = Field(description="of `expanded`, by simulation")
+    degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
 
     @classmethod
     def of(cls, row: Row, unit: float) -> "Uncertainty":
@@ -106,79 +296,60 @@ class BudgetFile(ResultFile):
     format: Literal["stcal budget 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
     run: RunOfBudget = Field(
-        description="`folder`, `images` (its photographs), name of the `target`, `version` of stcal that made it, "
-        "`sha256` of its `stcal-run.json` (which has the hashes of all other files) and `faces_sha256` of "
-        "`faces.json`; `changed`: files that are not as the run left them"
+        description="`folder`, `images` (photographs), name of the `target`, `version` of stcal that made it, `sha256` "
+        "of its `stcal-run.json` (that of all files) and `faces_sha256`; `changed` files, not as the run left them"
     )
     fields: dict[ByName, str] = Field(
-        description="`number` (of the certificate), `laboratory`, `place` (of the calibration), `customer`, "
-        "`instrument`, `operator`, `date` (of the "
-        "calibration), `traceability` and others, as given; empty where not"
+        description="`number`, `laboratory`, `place`, `customer`, `instrument`, `operator`, `date`, `traceability` and "
+        "others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"')
     reserved: bool = Field(False, description="whether that answer is to use it with care, also as a part")
-    usable: bool = Field(
-        description="false where that answer is no or a check has failed: no uncertainty is given, `faces` and "
-        "`distances` are empty"
-    )
+    usable: bool = Field(description="false if the run must not be used: then no uncertainty is given")
     size_known: bool = Field(
-        description="false where nothing of known size was in view: only the shape is known, positions and their "
-        "uncertainties are null, and there are no `distances`"
+        description="false if nothing of known size was in view: then positions are null, and there are no `distances`"
     )
     reference_temperature_c: float | None = Field(
-        description="of the target: the temperature for which corrected lengths and positions hold, null where it is "
-        "not known; 20 °C (ISO 1) unless stated otherwise, or that of the photographs where the expansion of board or "
-        "target is not stated"
+        description="temperature of the target for which corrected lengths and positions hold; null if not known"
     )
     holds: str = Field(description="the same in words, and why; empty where `usable` is false")
     coverage_factor: float = Field(description="k of the expanded uncertainties")
-    sigma0: float = Field(
-        description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
-    )
+    sigma0: float = Field(description="residuals over σ of all observations, 1 if smaller; multiplies all σ")
     redundancy: int = Field(description="degrees of freedom of the adjustment")
     views: list[GroupViews] = Field(
         description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
     )
     sources: list[SourceRow] = Field(
-        description="inputs: `key`, `title`; `evaluation` of type A or B (JCGM 100, 4.2, 4.3); `origin`: `estimated` "
-        "from this run, `stated` by the user, `assumed` where none is stated, `not stated`: taken as exact, or `not "
-        "known`: of a size that nothing tells; "
-        "standard uncertainty `sigma` in `unit`, null where it is not one number; `words` on where it comes from"
+        description="inputs: `key`, `title`; `evaluation` (type A or B); `origin`: `estimated` from this run, `stated` "
+        "by the user, `assumed`, `not stated` (taken as exact) or `not known`; standard uncertainty `sigma` in `unit`, "
+        "null if it is not one number; `words` on where it comes from"
     )
     stated: list[StatedRow] = Field(
         description="sizes and temperatures: `body`, `key`, `value`, and the file of `origin`, or why it is assumed"
     )
     definitions: list[str] = Field(default=[], description="what positions, rotations and distances are of, in words")
     correction_ppm: float | None = Field(
-        description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply "
-        "it; null where the size is not known"
+        description="of the run's lengths for the stated expansion, not applied by the run; null without a size"
     )
     faces: dict[ByName, FaceUncertainty] = Field(
-        description="against the reference face: `position_mm`, x, y, z of the face's origin in the target frame, with "
-        "`correction_ppm`, and `rotation_vector_deg` of the run; `position_um` (root of the summed variances of x, y, "
-        "z) and `rotation_mdeg` likewise, each with the combined standard uncertainties of x, y, z (`axes`), "
-        "`contributions` by key of the source, combined `standard` and `expanded` uncertainty, `coverage` of the "
-        "latter by simulation, and effective `degrees_of_freedom`, null for infinitely many; all of positions null "
-        "without a known size"
+        description="against the reference face: `position_mm` of the origin, corrected, and `rotation_vector_deg`; "
+        "`position_um` and `rotation_mdeg`, their uncertainties"
     )
     distances: list[DistanceUncertainty] = Field(
-        description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm` with "
-        "`correction_ppm`, and `distance_um` with `axes`, `contributions`, `standard`, `expanded`, `coverage`, "
-        "`degrees_of_freedom` as of faces"
+        description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm`, and "
+        "`distance_um`, its uncertainty"
     )
     circles: dict[ByName, CircleUncertainty] = Field(
         default={},
-        description="by label, circles or corners of the target in its frame: `position_mm` with `correction_ppm`, and "
-        "combined standard uncertainties of x, y, z, `position_xyz_um`; empty where the size is not known or the run "
-        "must not be used",
+        description="by label: corrected `position_mm` in the target frame, and standard uncertainties of x, y, z, "
+        "`position_xyz_um`; empty without a size, or if the run must not be used",
     )
     length_tests: list[LengthTest] = Field(
-        description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
-        "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
-        "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); `largest_e_n`, how many "
-        "are `beyond` U, the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, the `verdict` in "
-        "words, and `notes`; U, `e_n`, `beyond` and `agrees` null where a run must not be used"
+        description="`reference` (file or run); `lengths` between `circles`: corrected `measured_mm`, `reference_mm`, "
+        "`error_um`, U of both `expanded_um`, and `e_n`, null if both are exact; `largest_e_n`, how many are `beyond` "
+        "U, the `limit` of the largest |E_n| of so many, whether all `agrees`, the `verdict` in words, and `notes`; "
+        "null where a run must not be used"
     )
     notes: list[str] = Field(description="what is not in the combined uncertainty, or not known")
 
@@ -187,32 +358,30 @@ class BudgetFile(ResultFile):
         cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
-        conditions, refused, known = budget.conditions, is_refused(run), budget.conditions.size_known
-        enlarged, sigma = 1 + conditions.correction, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
-        faces = {}
+        conditions, answer, refused, known = (
+            budget.conditions,
+            answer_of(run),
+            is_refused(run),
+            budget.conditions.size_known,
+        )
+        enlarged, poses, faces = 1 + conditions.correction, run.faces.poses(), {}
         for position, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
-            pose = run.faces.poses()[position.measurand.name]
+            pose = poses[position.measurand.name]
             faces[position.measurand.name] = FaceUncertainty(
                 position_mm=(enlarged * pose.translation).tolist() if known else None,
                 rotation_vector_deg=pose.as_scipy().as_rotvec(degrees=True).tolist(),
                 position_um=Uncertainty.of(position, MICRO) if known else None,
                 rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
             )
-        distances = [
-            DistanceUncertainty(
-                circles=list(row.measurand.circles),
-                length_mm=row.measurand.length_mm or 0.0,
-                corrected_mm=(row.measurand.length_mm or 0.0) * enlarged,
-                distance_um=Uncertainty.of(row, MICRO),
-            )
-            for row in budget.of_kind("distance")
-        ]
-        circles = {
-            str(label): CircleUncertainty(
-                (enlarged * np.asarray(run.faces.circles[label])).tolist(), (MICRO * np.sqrt(own)).tolist()
-            )
-            for label, own in zip(budget.joint.labels, sigma, strict=True)
-        }
+        distances = []
+        for row in budget.of_kind("distance"):
+            length = row.measurand.length_mm or 0.0
+            own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
+            distances.append(DistanceUncertainty(circles=list(row.measurand.circles), **own))
+        circles, variance = {}, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
+        for label, own in zip(budget.joint.labels, variance, strict=True):
+            xyz = enlarged * np.asarray(run.faces.circles[label])
+            circles[str(label)] = CircleUncertainty(xyz.tolist(), (MICRO * np.sqrt(own)).tolist())
         if any(is_refused(each) for each in (run, *others)):
             tests = [test.without_u() for test in tests]
         return cls(
@@ -229,7 +398,7 @@ class BudgetFile(ResultFile):
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
-            use=(answer := answer_of(run)).use,
+            use=answer.use,
             reserved=answer.reserved,
             usable=not refused,
             size_known=known,
@@ -273,7 +442,7 @@ def _definitions(run: SavedRun) -> list[str]:
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
-        "a distance a–b is that of the points with the labels a and b, face:circle, as draw numbers them",
+        "a distance a–b is that of the points with the labels a and b, face:circle, as target.toml names them",
         *(
             f"face {face.id}: the frame of its drawing, Z into the body"
             if face.printed is not None
@@ -306,26 +475,6 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTest]) -> list[str]
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
 
-USUAL_K, USUAL_SIGMA_K, USUAL_EXPANSION = 25.0, 10.0, 250.0
-"""Distance from 20 °C, σ of a temperature, K, and expansion, ppm/K, beyond which a statement is asked about: rooms are
-nearer, thermometers better, and plastics expand less."""
-
-
-def _unusual(statement: Statement) -> list[str]:
-    """Returns questions about statements that are possible, and as unusual as those in another unit."""
-    asked = []
-    for body, size in (("board", statement.board), ("target", statement.target)):
-        warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
-        if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
-            fahrenheit = (warm - 32) / 1.8
-            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {fahrenheit:.1f} °C?")
-        if sigma > USUAL_SIGMA_K:
-            asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")
-        if abs(rate) > USUAL_EXPANSION:
-            asked.append(f"the {body} expands by {rate:g} ppm/K, more than plastics do: is that so?")
-    return asked
-
-
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
@@ -355,7 +504,6 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     return [
         *notes,
         *(note for note, applies in told.items() if applies),
-        *_unusual(statement),
         *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
         "the frame is in the poses of the other faces",

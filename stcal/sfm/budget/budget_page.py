@@ -19,10 +19,17 @@ from stcal.report.document import (
     tiles,
 )
 from stcal.report.text import NONE, join, number, significant
-from stcal.sfm.budget.budget_file import BudgetFile, SourceRow, Uncertainty, refusals
-from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.length_test import LengthTest, against_run, against_stated, common_views
-from stcal.sfm.budget.sources import statement_of
+from stcal.sfm.budget.budget_file import (
+    BudgetFile,
+    LengthTest,
+    SourceRow,
+    Uncertainty,
+    against_run,
+    against_stated,
+    common_views,
+    refusals,
+)
+from stcal.sfm.budget.combine import Budget, budget_of_run, statement_of
 from stcal.sfm.runs.run_result import AnyRun
 from stcal.sfm.runs.saved import saved_run, verify
 
@@ -53,9 +60,8 @@ EXACT_UM = 1e-6
 """σ below which a value is exact by definition, as that of the frame's own origin is up to rounding, µm or mdeg."""
 NEGLIGIBLE = 1e-4
 """Share of u below which a contribution has no sensitivity in the tables."""
-IN_OTHERS = 0.05
-"""Share of u up to which intrinsics that the photographs determine are told as part of the other rows, and of the
-variance up to which a source is not among those that limit a result."""
+LIMITS = 0.05
+"""Share of the variance above which a source is among those that limit a result."""
 
 
 def budget_report(file: BudgetFile) -> Document:
@@ -70,7 +76,6 @@ def budget_report(file: BudgetFile) -> Document:
     ]
     heads = {name: name.replace("_", " ") for name in file.fields} | {"date": "date of calibration"}
     fields = [[heads[name], value or NONE] for name, value in file.fields.items()]
-    signature = Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")
     points = [[label, *_with_u(e.position_mm, e.position_xyz_um, file)] for label, e in file.circles.items()]
     tests = [block for test in file.length_tests for block in _length_test(test)]
     frame = f"In the frame of face {file.reference_face}" if points else ""
@@ -84,14 +89,15 @@ def budget_report(file: BudgetFile) -> Document:
             Section("Length test", tests, terminal=True),
             Section("Circles and corners", [frame, Table(_heads("point", "mm", "µm"), points)]),
             Section("What is measured", [bullets(file.definitions)]),
-            Section("What it rests on", [METHOD.format(file=file), Table(["<Of", "<"], hashes, css="text facts")]),
-            Section("Signature", [RELATES, signature] if certifies(file) else []),
+            Section("What it rests on", [METHOD.format(file=file), _facts(hashes)]),
+            Section("Signature", [RELATES, _facts([[name, ""] for name in SIGNED])] if certifies(file) else []),
         ],
-        banner=[
-            _answer(file),
-            Table(["<Field", "<"], fields, css="text facts"),
-        ],
+        banner=[_answer(file), _facts(fields)],
     )
+
+
+def _facts(rows: list[list[str]]) -> Table:
+    return Table(["<Of", "<"], rows, css="text facts")
 
 
 def budget_in_brief(file: BudgetFile) -> str:
@@ -102,7 +108,7 @@ def budget_in_brief(file: BudgetFile) -> str:
         *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
-        _no_certificate(file) if _is_valid(file) and not certifies(file) else "",
+        _no_certificate(file),
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
         f"inputs, contributions and {len(file.notes)} notes: -v, or --report FILE.html",
     ]
@@ -134,7 +140,7 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
         headline.append((value, "mdeg", f"U of the rotation of face {name}{which}; {together}"))
         shares = {row.title: (worst.position_um or worst.rotation_mdeg).share(row.key) for row in file.sources}
         first, *more = sorted(shares, key=lambda title: -shares[title])
-        then = "".join(f", {shares[title]:.0%} from {title}" for title in more[:2] if shares[title] > IN_OTHERS)
+        then = "".join(f", {shares[title]:.0%} from {title}" for title in more[:2] if shares[title] > LIMITS)
         headline.append((f"{100 * shares[first]:.0f}", "%", f"of the variance of face {name} is from {first}{then}"))
     for each in file.distances[:1]:
         length = as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
@@ -151,10 +157,14 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
 
 def _result(file: BudgetFile) -> list[Block]:
     """Returns headline, notes, and the tables of positions, rotations and distances with their U."""
-    lengths = []
-    for own in file.distances:
-        exact = [as_exact(v, 1e-3 * own.distance_um.expanded) for v in (own.length_mm, own.corrected_mm)]
-        lengths.append(["–".join(own.circles), *exact, significant(own.distance_um.expanded)])
+    lengths = [
+        [
+            "–".join(own.circles),
+            *(as_exact(v, 1e-3 * own.distance_um.expanded) for v in (own.length_mm, own.corrected_mm)),
+            significant(own.distance_um.expanded),
+        ]
+        for own in file.distances
+    ]
     positions = [
         [face, *_with_u(e.position_mm, e.position_um.axes, file)]
         for face, e in file.faces.items()
@@ -165,7 +175,7 @@ def _result(file: BudgetFile) -> list[Block]:
     return [
         tiles(_headline(file) + tests),
         WHAT_U_IS.format(k=file.coverage_factor) if file.faces else None,
-        Notes([*([_no_certificate(file)] if _is_valid(file) and not certifies(file) else []), *file.notes]),
+        Notes([*filter(None, [_no_certificate(file)]), *file.notes]),
         file.holds if file.size_known else None,
         Table(_heads("position of face", "mm", "µm"), positions),
         Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
@@ -230,14 +240,7 @@ def _source_row(source: SourceRow, unit: str, columns: dict[str, Uncertainty]) -
     first, slope = next(iter(columns.values())), NONE
     if source.sigma and first.standard and own[0] / first.standard > NEGLIGIBLE:
         slope = f"{own[0] / source.sigma:.3g} {unit}/{source.unit}"
-    parts = [number(contribution, 2) for contribution in own]
-    in_others = all(part <= IN_OTHERS * u.standard for part, u in zip(own, columns.values(), strict=True))
-    if source.origin == "not stated":
-        parts = [NONE] * len(parts)
-    elif (source.key, source.origin) == ("intrinsics", "estimated") and in_others:
-        # What they do is in the rows of the centres, with which they were adjusted.
-        parts = ["in the other rows"] * len(parts)
-    return [source.title, slope, *parts]
+    return [source.title, slope, *(NONE if source.origin == "not stated" else number(part, 2) for part in own)]
 
 
 def _length_test(test: LengthTest) -> list[Block]:
@@ -261,7 +264,7 @@ def _length_test(test: LengthTest) -> list[Block]:
 
 def certifies(file: BudgetFile) -> bool:
     """Returns whether the page is a certificate: the run may be used, inputs and required fields are stated."""
-    return _is_valid(file) and not _unstated(file) and not file.reserved
+    return not _no_certificate(file) and _is_valid(file)
 
 
 def _is_valid(file: BudgetFile) -> bool:
@@ -269,26 +272,25 @@ def _is_valid(file: BudgetFile) -> bool:
     return file.usable and file.size_known and all(test.agrees for test in file.length_tests)
 
 
-def _unstated(file: BudgetFile) -> list[str]:
-    """Returns what a certificate needs and nothing is stated of; faces that need not be flat need no statement."""
-    inputs = [row.title for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
-    return inputs + [name for name in REQUIRED if not file.fields.get(name, "").strip()]
-
-
 def _no_certificate(file: BudgetFile) -> str:
+    """Returns why a valid budget is no certificate; empty if it is one. Faces that need not be flat need no
+    statement."""
+    if not _is_valid(file):
+        return ""
     if file.reserved:
         return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
-    unstated = _unstated(file)
+    unstated = [row.title for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
+    unstated += [name for name in REQUIRED if not file.fields.get(name, "").strip()]
     camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
-    return f"this is not a certificate: nothing is stated of {join(unstated)}; state it with --statement{camera}"
+    remedy = f"this is not a certificate: nothing is stated of {join(unstated)}; state it with --statement{camera}"
+    return remedy if unstated else ""
 
 
 def title_of(file: BudgetFile) -> str:
-    """Returns the title, which calls the page a certificate only if it is one."""
+    """Returns the title, which calls the page a certificate only if it is one; it stands at the foot of every page."""
     if not certifies(file):
         return f"Uncertainty budget: {file.run.target}"
-    number_of_it = file.fields["number"].strip()  # it stands on every page, which has the title at its foot
-    return f"Certificate of calibration no. {number_of_it}, with uncertainty budget: {file.run.target}"
+    return f"Certificate of calibration no. {file.fields['number'].strip()}, with uncertainty budget: {file.run.target}"
 
 
 def as_exact(value: float, expanded: float) -> str:

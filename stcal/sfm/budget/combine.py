@@ -1,26 +1,316 @@
-"""Combination of the sources to combined and expanded uncertainties of faces and of the target's largest distances."""
+"""Uncertainty budget of a run: sources with the conditions stated for them, and how they combine to expanded
+uncertainties of faces and of the target's largest distances."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import date, time
 from itertools import combinations, combinations_with_replacement
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
+from stcal.boards.board_designs import TAG_SIGMA_MM
+from stcal.boards.board_file import BoardSizeEntry, SizeEntry
+from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.io.toml import Strict, load_toml
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.calibration import rim_covariance_mm2
+from stcal.sfm.adjust.calibration import FLATNESS_MM, rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
-from stcal.sfm.budget.sources import BudgetSource, StatedConditions, Statement, conditions_of, sources_of, statement_of
+from stcal.sfm.adjust.uncertainty import (
+    BOARD,
+    CIRCLES,
+    DISTANCES,
+    DOTS,
+    FLATNESS,
+    INTRINSICS,
+    PRINT,
+    SIZES,
+    Contributions,
+    Derivatives,
+    contributions_of,
+    derivatives,
+)
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.runs.run_result import SavedRun
 from stcal.sfm.runs.saved import adjusted_run
 
+FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
+"""Fields in the head of every budget, after those that are given, and empty if they are not."""
+LONGEST_TEXT = 500
+DEFAULT = "; the default, which `design` writes too: measure it and state it"
+"""Words for a σ that nobody has changed."""
+
+
+Text = Annotated[
+    str,
+    BeforeValidator(lambda value: str(value) if isinstance(value, date | time) else value),  # as TOML has them
+    Field(max_length=LONGEST_TEXT),
+]
+FieldName = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+class StatementFile(Strict):
+    """The file of ``--statement``."""
+
+    one_thermometer: bool = False
+    fields: dict[FieldName, Text] = Field(default_factory=dict)
+    board: BoardSizeEntry = BoardSizeEntry()
+    target: SizeEntry = SizeEntry()
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """What the user states."""
+
+    board: StatedSize
+    target: StatedSize
+    origin: dict[tuple[str, str], str]  # the file that states a value, by ``board`` or ``target`` and key
+    fields: dict[str, str]  # of the head by name
+    one_thermometer: bool = False  # True if the temperatures of both err alike
+
+
+def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
+    """Statement of a run: ``own`` of its ``board.toml``, overridden by the file, whose fields ``given`` overrides."""
+    file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
+    sizes: dict[str, StatedSize] = {}
+    origin: dict[tuple[str, str], str] = {}
+    for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
+        values, default = asdict(second), asdict(first)
+        sizes[body] = StatedSize(**{key: default[key] if own is None else own for key, own in values.items()})
+        origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
+    for name, value in (given or {}).items():
+        if not name or len(name) > 60 or len(value) > LONGEST_TEXT:
+            raise InputError(
+                "E-OPTION-VALUE",
+                f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST_TEXT} for a "
+                "value",
+            )
+    named = file.fields | dict(given or {})
+    named |= {name: "" for name in FIELDS if name not in named}
+    return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
+
+
+def fields_of(given: Sequence[str]) -> dict[str, str]:
+    """Parses ``NAME=VALUE`` into a dictionary; an error without ``=``, or for a name given twice."""
+    values: dict[str, str] = {}
+    for text in given:
+        name, sign, value = (word.strip() for word in text.partition("="))
+        if not sign or not name:
+            raise InputError("E-OPTION-VALUE", f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
+        if name in values:
+            raise InputError("E-OPTION-REPEATED", f"--field {name}: given twice; give it once")
+        values[name] = value
+    return values
+
+
+Origin = Literal["estimated", "stated", "assumed", "not stated", "not known"]
+PPM = 1e-6
+REFERENCE_C = 20.0
+"""Reference temperature of ISO 1:2022, used unless another one is stated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BudgetSource:
+    """A row of the budget."""
+
+    key: str  # name in files
+    title: str  # name in tables
+    evaluation: Literal["A", "B"]  # statistics of this run, or other knowledge
+    origin: Origin  # where the input's σ comes from, explained in ``words``
+    words: str
+    sigma: float | None  # in ``unit``, None if it is not one number
+    unit: str
+    covariance_mm2: np.ndarray  # (3c, 3c) of the circles due to this input alone
+
+    def __post_init__(self):
+        freeze(self, "covariance_mm2", (None, None), f"{self.key}: covariance")
+
+
+def sources_of(
+    contributions: Contributions,
+    camera: Camera,  # as given to the run, with the covariance that its file states
+    board: BoardDesign,
+    flatness_mm: float | None,
+    refined: bool,  # whether its intrinsics were adjusted
+    statement: Statement,
+    camera_given: bool = True,  # False if the camera was found from the photographs
+) -> tuple[BudgetSource, ...]:
+    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
+    adjusted = _of_adjustment(contributions, board, flatness_mm)
+    intrinsics = _intrinsics(contributions, camera, refined, camera_given)
+    return (*adjusted, intrinsics, *(_of_statement(contributions, statement) if board.rows else ()))
+
+
+def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float | None) -> Iterator[BudgetSource]:
+    """Yields the rows of what the adjustment takes as observations, but the intrinsics."""
+    joint, factor, sigma_px = found.joint, found.joint.sigma_scale, found.centre_sigma_px
+    faces, known = faces_of_known_shape(board), known_distances(board)
+    stated: tuple[Origin, str] = "estimated", "residuals; RMS per axis"
+
+    def row(key: str, title: str, kind: str, own: tuple[Origin, str], sigma: float | None, unit="µm") -> BudgetSource:
+        evaluation = "A" if own[0] == "estimated" else "B"
+        return BudgetSource(key, title, evaluation, *own, sigma, unit, found.covariance_mm2[kind])
+
+    def or_default(words: str, default: bool) -> tuple[Origin, str]:
+        return ("assumed", words + DEFAULT) if default else ("stated", words)
+
+    title = "corners and centres of faces" if faces else "centres of circles"
+    yield row("circle_centres", title, CIRCLES, stated, sigma_px[CIRCLES], "px")
+    if board.rows:
+        yield row("dot_centres", "centres of dots", DOTS, stated, sigma_px[DOTS], "px")
+        common = f"{100 * joint.board_common:.0f} % of it common to all groups"
+        words = f"sigma_mm of board.toml × σ₀ {factor:.3f}; {common if joint.board_common else 'each group its own'}"
+        stated = or_default(words, board.sigma_mm == DOTS_SIGMA_MM)
+        yield row("board_dots", "places of dots", BOARD, stated, 1e3 * board.sigma_mm * factor)
+    if faces:
+        own, within = joint.print_factor * factor, max(face.sigma_mm or 0.0 for face in faces)
+        words = f"sigma_mm of target.toml × {own:.2f}, in the plane; off it --flatness"
+        yield row("print", "print of faces", PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own)
+        largest = max(faces, key=lambda face: face.size_sigma)
+        sigma, edges = largest.size_sigma, "a common displacement of the edges of all tags"
+        stated = "assumed" if sigma else "not stated", f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
+        if sigma > 0 and largest.edge_share < 1:
+            stated = "stated", "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
+        yield row("print_size", "size of print", SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
+    if known and known[0].drawn:
+        stated = "not known", "nothing of known size was in view: only the shape is known"
+        yield row("distances", "size", DISTANCES, stated, None)
+    elif known:
+        stated = "stated", f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
+        largest_mm = max(each.sigma_mm for each in known)
+        yield row("distances", "known distances", DISTANCES, stated, 1e3 * largest_mm * factor)
+    if not faces or found.covariance_mm2[FLATNESS].any():
+        words, sigma_um = f"--flatness of the run × σ₀ {factor:.3f}", None
+        stated = "not stated", "--flatness off: faces need not be flat"
+        if flatness_mm is not None:
+            is_default, sigma_um = flatness_mm == FLATNESS_MM, 1e3 * flatness_mm * factor
+            stated = ("assumed", f"the default of {words}") if is_default else ("stated", words)
+        yield row("flatness", "flatness of faces", FLATNESS, stated, sigma_um)
+
+
+def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
+    covariance = contributions.covariance_mm2[INTRINSICS]
+    origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
+    if not camera_given:
+        origin, words = "estimated", "found from these photographs, without a camera file; adjusted with all else"
+    elif refined:
+        known = "the camera file" if origin == "stated" else "a calibration of some age"
+        words = f"adjusted; σ before that of {known}"
+    else:
+        words = "fixed; σ of the camera file" if origin == "stated" else "fixed; no σ in the camera file"
+        effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+        covariance = np.zeros_like(covariance) if camera.covariance is None else effect @ camera.covariance @ effect.T
+    evaluation = "A" if origin == "estimated" else "B"
+    return BudgetSource("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
+
+
+def _of_statement(found: Contributions, statement: Statement) -> Iterator[BudgetSource]:
+    """Yields the rows of what the user states; an input of which something is not stated is exact."""
+
+    def row(key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma, effect_ppm) -> BudgetSource:
+        covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)  # of one σ on the circles
+        if absent:
+            return BudgetSource(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
+        return BudgetSource(key, title, "B", "stated", words, sigma, unit, covariance)
+
+    def said(body: str, name: str) -> str:
+        return f"{name} of {statement.origin[body, name]}"
+
+    name, sigma, grown = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm, found.joint.xyz_model
+    absent, effect = [name] * (sigma is None), (sigma or 0.0) * found.by_scale
+    yield row("board_pitch", "board's pitch", "ppm", absent, said("board", name), sigma, effect)
+    together: list[tuple[str, StatedSize, np.ndarray]] = []  # with the effect of both temperatures
+    for body, stated, by_size in (
+        ("board", statement.board, found.by_scale),
+        ("target", statement.target, -(grown - grown.mean(0)).ravel()),
+    ):
+        together.append(
+            (body, stated, (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size)
+        )
+        for key, name, needed, factor, unit in (
+            ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
+            ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer_k(stated), "ppm/K"),
+        ):
+            if key == "temperature" and statement.one_thermometer:
+                continue
+            sigma = getattr(stated, name)
+            absent = [name] * (sigma is None) + [needed] * (factor is None)
+            effect = (sigma or 0.0) * (factor or 0.0) * by_size
+            yield row(f"{body}_{key}", f"{body}'s {key}", unit, absent, said(body, name), sigma, effect)
+    if statement.one_thermometer:  # an error common to both (JCGM 100, 5.2.2, r = 1), nearly nil if both expand alike
+        names = ("temperature_sigma_k", "expansion_ppm_per_k")
+        absent = [f"{name} of [{body}]" for body, own, _ in together for name in names if getattr(own, name) is None]
+        sigmas = {stated.temperature_sigma_k for _, stated, _ in together}
+        words = "temperature_sigma_k of both, one_thermometer: fully correlated"
+        title, sigma = "temperature of board and target", sigmas.pop() if len(sigmas) == 1 else None
+        yield row("temperature", title, "K", absent, words, sigma, sum(effect for *_, effect in together))
+
+
+def warmer_k(stated: StatedSize) -> float | None:
+    """Returns the temperature in the photographs minus the reference temperature, or None if it is not stated."""
+    return None if stated.temperature_c is None else stated.temperature_c - reference_temperature_c(stated)
+
+
+def reference_temperature_c(stated: StatedSize) -> float:
+    """Returns the temperature at which the size of a body is to be stated: the given one, or 20 °C."""
+    return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
+
+
+@dataclass(frozen=True, slots=True)
+class StatedConditions:
+    """The temperature for which lengths and positions hold, and what they are corrected by for that."""
+
+    size_known: bool  # False if nothing of known size was in view
+    correction: float  # relative, 0 for none
+    temperature_c: float | None  # of the target, None if it is not known
+    words: str  # the same as a sentence without its stop
+
+
+def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
+    """Returns the temperature for which lengths hold, and their correction for the expansion of the board and, only
+    with it, of the target: that starts from the length at the photographs' temperature. A size stated of the target
+    itself holds at its reference temperature (ISO 1), so that no expansion enters."""
+    if any(known.drawn for known in known_distances(board)):
+        words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"
+        return StatedConditions(False, 0.0, None, words)
+    target, holds = statement.target, "Lengths and positions hold at"
+    wanted, photographed = reference_temperature_c(target), target.temperature_c
+    if not board.rows:
+        own = "as the sizes stated of the target do (ISO 1); they are its own, so that no expansion enters"
+        return StatedConditions(True, 0.0, wanted, f"{holds} {wanted:g} °C, {own}")
+    of_board, of_target = _growth(statement.board), _growth(target)
+    total = (of_board or 0.0) - (of_target or 0.0 if of_board is not None else 0.0)
+    corrected = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
+    if of_board is not None and of_target is not None:
+        return StatedConditions(True, total, wanted, f"{holds} {wanted:g} °C{corrected}")
+    there = "the temperature" if photographed is None else f"{photographed:g} °C,"
+    why = ": expansion and temperature of the target are not both stated"
+    if of_board is None:
+        why = (
+            ", as far as the board's grid had the size of its file there: expansion and temperature of the board are "
+            "not both stated, and without them the target's are not corrected for"
+        )
+    words = f"{holds} {there} at which the target was photographed{corrected}{why}"
+    return StatedConditions(True, total, photographed, words)
+
+
+def _growth(stated: StatedSize) -> float | None:
+    """Returns the relative expansion of a body since its reference temperature; None if it is not known."""
+    warmer = warmer_k(stated)
+    if 0.0 in (warmer, stated.expansion_ppm_per_k):
+        return 0.0
+    if warmer is None or stated.expansion_ppm_per_k is None:
+        return None
+    return stated.expansion_ppm_per_k * PPM * warmer
+
+
 COVERAGE_FACTOR = 2.0
-LONGEST = 5
+LONGEST_DISTANCES = 5
 """Number of distances in a budget."""
 DRAWS = 100_000
 """Number of random draws for the coverage (JCGM 101:2008)."""
@@ -157,7 +447,7 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
         for kind, rows in kinds
         for face in other_faces
     ]
-    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
+    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]]
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:

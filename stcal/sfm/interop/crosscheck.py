@@ -1,24 +1,34 @@
-"""Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; result file and text."""
+"""Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; and scale and faces from
+models that were made or edited in it or in the GUI."""
 
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.rigid import Rigid, align_similarity
-from stcal.io.json import read_json
-from stcal.parallel import Progress, scratch_folder
+from stcal.io.files import json_text, save
+from stcal.io.json import read_json, require_result_written
+from stcal.parallel import Progress, one_thread, scratch_folder
 from stcal.report.text import number, text_table
-from stcal.sfm.adjust.calibration import Calibration, calibrate, on_luminous_surface, with_sigma
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, on_luminous_surface, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
-from stcal.sfm.interop.export import FORMS, ExportedRun
-from stcal.sfm.interop.export_database import Exported, write_copy
-from stcal.sfm.interop.export_model import ExportedModel
-from stcal.sfm.interop.native import NativeColmap, faces_from_models, find_colmap, map_natively, require_listable
-from stcal.sfm.interop.schema import find_schema, schema_of_version
+from stcal.sfm.data.group_model import WorldModel
+from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, write_copy
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
@@ -41,10 +51,204 @@ from stcal.sfm.runs.tolerances import (
 )
 from stcal.sfm.runs.transaction import AGAIN, added_results
 
+INSTALL = "install it with `sudo apt-get install colmap` (Debian, Ubuntu) or `brew install colmap` (macOS)"
+ASK_SECONDS = 60.0
+"""Time limit for an answer of the program about itself, s. Loading its libraries takes a second or two."""
+LAST_WORDS = 200
+MAX_OUTPUT = 1 << 20
+"""Number of bytes kept of a program's output. The last ones are kept, as a program may print without end."""
+
+
+@dataclass(frozen=True, slots=True)
+class NativeColmap:
+    """A native COLMAP program."""
+
+    program: Path
+    version: str  # as the program states it, like ``3.8``
+    mapper_options: frozenset[str]  # names
+
+
+def find_colmap(path: str | Path | None = None) -> NativeColmap:
+    """Returns the program at ``path``, or the one on the PATH."""
+    executable = shutil.which("colmap" if path is None else str(path))
+    if executable is None:
+        where = "on the PATH" if path is None else f"at {path} that can be executed"
+        raise InputError(
+            "E-COLMAP-PROGRAM", f"native COLMAP: no program {where}; {INSTALL}, or give its path with --colmap"
+        )
+    program = Path(executable)
+    text = _answer(program, "help")
+    version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", text)
+    if version is None:
+        raise InputError(
+            "E-COLMAP-PROGRAM",
+            f"native COLMAP: {program} does not say a COLMAP version; {INSTALL}, or give another --colmap",
+        )
+    options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
+    return NativeColmap(program, version[1], frozenset(options))
+
+
+def map_natively(
+    native: NativeColmap, database: Path, folder: Path, names: list[str], options: dict[str, str], timeout_s: float
+) -> None:
+    """Runs the mapper on the named images of a database and writes to ``models`` in a new folder.
+    ``options``: values by name without dashes, all of which this version must have."""
+    models, images = folder / "models", folder / "images"
+    for subfolder in (models, images):
+        subfolder.mkdir(parents=True)
+    listing = folder / "images.txt"
+    listing.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    fixed = {"database_path": database, "image_path": images, "image_list_path": listing, "output_path": models}
+    command = [str(native.program), "mapper"]
+    for name, value in (fixed | options).items():
+        command += [f"--{name}", str(value)]
+    code, output = _run(command, timeout_s, TMPDIR=str(folder))  # COLMAP writes its logs there
+    program = f"native COLMAP: `{native.program} mapper`"
+    if code is None:
+        raise MappingError(
+            "E-COLMAP-TIMEOUT",
+            f"{program} is still running after {timeout_s:g} s; raise --timeout, or check the program",
+        )
+    if code != 0:
+        raise MappingError("E-COLMAP-FAILED", f"{program} {_end(code, output)}; check the program")
+
+
+def _answer(program: Path, *words: str) -> str:
+    """Returns the output of the program for a question about itself."""
+    code, output = _run([str(program), *words], ASK_SECONDS)
+    if code != 0:
+        ending = f"does not end in {ASK_SECONDS:g} s" if code is None else _end(code, output)
+        raise InputError(
+            "E-COLMAP-PROGRAM",
+            f"native COLMAP: `{program} {' '.join(words)}` {ending}; {INSTALL}, or give another --colmap",
+        )
+    return output
+
+
+def _end(code: int, output: str) -> str:
+    ending = f"ended with code {code}" if code >= 0 else f"was ended by signal {-code}"
+    return f"{ending}: {' '.join(output.split())[-LAST_WORDS:] or 'no message'}"
+
+
+def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
+    """Exit code of a command, None after the time limit, and its last output; no child process outlives it."""
+    with tempfile.TemporaryFile() as output:  # no pipe, which a child of its own session may hold open
+        try:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise InputError(
+                "E-COLMAP-PROGRAM", f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}"
+            ) from error
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout_s)
+            code = process.returncode
+        finally:
+            with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted for an ended process
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        output.seek(max(0, output.seek(0, os.SEEK_END) - MAX_OUTPUT))
+        return code, output.read().decode(errors="replace")
+
+
+Chained = Literal["chain", "paper"]
+
+
+def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
+    options = replace(run.options, solve=solve, refine_camera=False)
+    if solve == "paper":
+        options = replace(options, frame="three-point", eccentricity=False)
+    return options.adjustment(run.target_design)
+
+
+def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
+    """Returns scale and faces of unchanged models of the run's groups, group by group and chained."""
+    models: dict[str, WorldModel] = {}
+    notes = []
+    for source in read:
+        if not source.camera.same_as(read[0].camera):
+            raise InputError(
+                "E-MODEL-CAMERAS",
+                f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
+                "or give one model at a time",
+            )
+        if not source.camera.same_as(run.camera):
+            ideal = np.concatenate([image.centre for image in run.observations])
+            off_px = np.abs(source.camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max()
+            notes.append(
+                f"model {source.path}: its camera is up to {off_px:.2g} px off the run's at the keypoints; the model's "
+                "is used"
+            )
+        counts = {
+            "points left out, since their keypoints name no one circle": source.unlabelled,
+            "circles that are several points each, longest tracks taken": source.split,
+            "points that keypoints name, but the model does not have": source.absent,
+        }
+        notes += [f"model {source.path}: {what}: {count}" for what, count in counts.items() if count]
+        for model in source.groups:
+            if model.group in models:
+                notes.append(f"group {model.group}: in several models; the one with the most images was taken")
+            if model.group not in models or len(model.images) > len(models[model.group].images):
+                models[model.group] = model
+    notes += [f"group {name}: in none of the models" for name in run.groups() if name not in models]
+    options = _options(run, solve)
+    models_in_order = [models[name] for name in run.groups() if name in models]
+    try:
+        calibration = calibrate(models_in_order, read[0].camera, run.target_design, run.board_design, options)
+    except MappingError as error:
+        raise MappingError(error.code, "; ".join([str(error), *notes])) from error
+    return replace(calibration, notes=(*notes, *calibration.notes))
+
+
+@require_arguments
+@one_thread()
+def calibrate_models(
+    model: str | Path, run: AnyRun, solve: Chained = "chain", out: str | Path | None = None
+) -> Calibration:
+    """Returns scale and faces from COLMAP models of a run's database that were made or edited elsewhere.
+
+    Parameters
+    ----------
+    model : str or Path
+        A COLMAP model, or the folder of several.
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    solve : {"chain", "paper"}
+        Every way to a face weighed; or as in Zhang & Wei (2017): λ by rows, three-point frames, single transforms.
+    out : str or Path, optional
+        File for the faces, as ``faces.json``; nothing is written if None.
+
+    Raises
+    ------
+    InputError
+        The models are not of the run's database, state different cameras, or ``out`` cannot be written.
+    ScaleError
+        The board of a group is not in its model.
+    MappingError
+        The reference face is in none of the models, or a face is not linked to it.
+    """
+    run, model = saved_run(run), Path(model)
+    ids = image_ids(run.observations)
+    read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
+    calibration = faces_from_models(read, run, solve)
+    if out is not None:
+        factor = calibration.sigma_factors.of_target
+        faces = FacesFile.of(calibration.target, run.target_design, _options(run, solve), factor)
+        save(Path(out), json_text(faces.content()))
+        require_result_written(out, faces)
+    return calibration
+
+
 MICRO = 1e3
 MIN_INLIERS = pycolmap.TwoViewGeometryOptions().min_num_inliers
-"""Least number of inliers of an initial pair, whatever `init_min_num_inliers` says: COLMAP estimates the pair with this
-default."""
+"""Least number of inliers of an initial pair, with whose default COLMAP estimates it."""
 TOLERANCES = Tolerances()
 FACE_FLOOR = np.array([1e-7] * 3 + [1e-4] * 3)
 """Negligible differences in rad and mm: 6 µdeg and 0.1 µm. Circles that carry the frame have no σ."""
@@ -117,11 +321,10 @@ def _compared(
     progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
-    require_listable([image.name for image in run.observations])
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
     native_models, own_models, adjusted = [], [], []
     with scratch_folder("crosscheck") as folder:
-        write_copy(run, folder / "native.db", find_schema(schema))
+        write_copy(run, folder / "native.db", schema)
         write_copy(run, folder / "ours.db", find_schema("4.2"))
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
@@ -169,7 +372,7 @@ def _compared(
     return Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
-        schema=schema,
+        schema=schema.name,
         tolerances=tolerances,
         images=images,
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
@@ -205,17 +408,15 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     except InputError as error:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
-            "the pair may share too few labels, or be too near to each other; add images from further apart",
+            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; the pair may "
+            "share too few labels, or be too near to each other; add images from further apart",
         ) from error
     try:
         path = max(models, key=lambda model: open_model(model).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
     except InputError as error:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: what native COLMAP {native.version} made from the run's database cannot be used: {error}",
-        ) from error
+        made = f"what native COLMAP {native.version} made from the run's database cannot be used"
+        raise MappingError("E-COLMAP-NO-MODEL", f"group {group}: {made}: {error}") from error
 
 
 def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
@@ -230,6 +431,12 @@ def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun
     written.mkdir()
     write_reconstruction(reconstruction, written)
     return read_model(written, run.observations, ids, run.corrected_px)
+
+
+def _off(difference: np.ndarray) -> tuple[float, float]:
+    """Returns the lengths of shift and turn, µm and millidegrees, of a difference (6,), rad and mm."""
+    shift, turn = float(np.linalg.norm(difference[3:])), float(np.degrees(np.linalg.norm(difference[:3])))
+    return MICRO * shift, MICRO * turn
 
 
 def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultCompared:
@@ -256,11 +463,10 @@ def face_differences(
     rows: dict[str, FaceDifference | None] = dict.fromkeys(sorted(a.keys() | b.keys()))
     for face in a.keys() & b.keys():
         difference = a[face].difference(b[face])
-        rows[face] = FaceDifference(
-            translation_um=MICRO * float(np.linalg.norm(difference[3:])),
-            rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(difference[:3]))),
-            sigmas=_sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
-        )
+        (um, mdeg), sigmas = _off(difference), None
+        if face in covariance:
+            sigmas = _sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR)
+        rows[face] = FaceDifference(translation_um=um, rotation_mdeg=mdeg, sigmas=sigmas)
     return rows
 
 
@@ -289,15 +495,9 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name not in poses:
                 continue
-            off = pose.inverse().difference(poses[name].inverse())
-            rows.append(
-                CameraDifference(
-                    image=name,
-                    position_um=MICRO * float(np.linalg.norm(off[3:])),
-                    rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(off[:3]))),
-                    sigmas=_sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6)),
-                )
-            )
+            um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
+            sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
+            rows.append(CameraDifference(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
     return sorted(rows, key=lambda row: row.image)
 
 
@@ -332,81 +532,41 @@ def comparison_text(check: Crosscheck) -> str:
 
 
 def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, tolerances: Tolerances
+    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
 ) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:
             others = f" and {len(names) - 1} more" if len(names) > 1 else ""
             clauses.append(f"image {names[0]}{others}: registered by {program} only")
-    largest = []  # what, its largest value, unit, and limit
+    largest: list[tuple[str, dict[str, float], str, float | None]] = []  # what, values by name, unit, and limit
     for compared, source, sigma in (
-        (mapping, "mapped by both", tolerances.mapped_sigma),
-        (result, "from the native model against faces.json", tolerances.sigma),
+        (mapping, "mapped by both", limits.mapped_sigma),
+        (result, "from the native model against faces.json", limits.sigma),
     ):
         for face, row in compared.faces.items():
             if row is None:
                 clauses.append(f"face {face} ({source}): only one of the two has it")
                 continue
-            each = (row.translation_um, tolerances.face_um, "µm"), (row.rotation_mdeg, tolerances.face_mdeg, "mdeg")
-            each = (*each, (row.sigmas, sigma, "σ"))
-            if limits := [f"{most:g} {unit}" for v, most, unit in each if v and most is not None and v > most]:
-                sigma_text = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
-                clauses.append(
-                    f"face {face} ({source}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{sigma_text}; "
-                    f"{', '.join(limits)} allowed"
-                )
-        circles = (compared.circles_um, "µm", tolerances.circle_um), (compared.circles_sigmas, "σ", sigma)
-        largest += [("circle {} " + f"({source})", *each) for each in circles]
-    position, attitude = (
-        {c.image: getattr(c, key) for c in mapping.cameras} for key in ("position_um", "rotation_mdeg")
-    )
-    largest.append(("camera {}: position", position, "µm", tolerances.camera_um))
-    largest.append(("camera {}: attitude", attitude, "mdeg", tolerances.camera_mdeg))
+            um, mdeg, own = row.translation_um, row.rotation_mdeg, row.sigmas
+            each = (um, limits.face_um, "µm"), (mdeg, limits.face_mdeg, "mdeg"), (own, sigma, "σ")
+            if allowed := [f"{most:g} {unit}" for v, most, unit in each if v and most is not None and v > most]:
+                in_sigma = "" if own is None else f", {own:.2f} σ"
+                measured = f"{um:.1f} µm, {mdeg:.2f} mdeg{in_sigma}"
+                clauses.append(f"face {face} ({source}) {measured}; {', '.join(allowed)} allowed")
+        largest += [
+            (f"circle {{}} ({source})", compared.circles_um, "µm", limits.circle_um),
+            (f"circle {{}} ({source})", compared.circles_sigmas, "σ", sigma),
+        ]
+    largest += [
+        ("camera {}: position", {c.image: c.position_um for c in mapping.cameras}, "µm", limits.camera_um),
+        ("camera {}: attitude", {c.image: c.rotation_mdeg for c in mapping.cameras}, "mdeg", limits.camera_mdeg),
+    ]
     for what, values, unit, limit in largest:
         name, worst = max(values.items(), key=lambda item: item[1], default=("", 0.0))
         if limit is not None and worst > limit:
             clauses.append(f"{what.format(name)} {worst:.1f} {unit}; {limit:g} {unit} allowed")
     return clauses
-
-
-def database_text(written: Exported) -> str:
-    """Returns a text on the contents of the copied database, and how to open it."""
-    return (
-        f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
-        f"camera model {', '.join(written.camera_models)}\n"
-        f"open it with: colmap gui --database_path {written.path} --image_path IMAGES"
-    )
-
-
-def model_text(written: ExportedModel, kind: str) -> str:
-    """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
-    lines = [
-        f"{written.images} images and {written.points} points; mm, target frame: {written.path}",
-        f"labels: {written.labels}",
-    ]
-    if written.focal_px is not None and written.centre_px is not None:
-        x, y = written.centre_px
-        lines.append(
-            f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "
-            f"camera without distortion, f = {written.focal_px:.4f} px, principal point ({x:g}, {y:g}) px; undistort "
-            "the photographs to it to match"
-        )
-    return "\n".join(lines)
-
-
-def export_text(written: ExportedRun) -> str:
-    """Returns a text on the contents of the file, and on the results that it lacks."""
-    content = written.content
-    lines = [
-        f"{len(content.faces)} faces and {len(content.circles)} circles, frame {content.root}, as {written.form}: "
-        f"{written.path}"
-    ]
-    if not content.covariances:
-        lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
-    if lost := FORMS[written.form].lost:
-        lines.append(f"not in it: {lost}")
-    return "\n".join(lines)
 
 
 def faces_text(calibration: Calibration, run: SavedRun) -> str:

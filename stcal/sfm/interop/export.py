@@ -1,7 +1,11 @@
 """Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
+import base64
+import json
+import os
+import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import indent
 from xml.sax.saxutils import quoteattr
@@ -9,16 +13,163 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import stcal
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
-from stcal.io.static_transforms import Static, fixed_joint, messages, ros1_launch, ros2_launch
+from stcal.io.json import Part
+from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, metres, ros1_launch, ros2_launch, xyzw
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
-from stcal.sfm.interop import gltf
-from stcal.sfm.interop.export_content import Content, content_of, require_new
-from stcal.sfm.runs.run_result import AnyRun
-from stcal.sfm.runs.saved import saved_run
+from stcal.labels import CircleLabel, parse_label
+from stcal.report.text import number
+from stcal.sfm.runs.report_file import ReportCamera, Space
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+
+FACES_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+"""Okabe and Ito's palette, which colour-blind people can tell apart, used in a cycle in the order of the faces."""
+BOARD_RGB = (150, 150, 150)
+
+
+class _Report(Part):
+    camera: ReportCamera
+    scene: Space
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circle:
+    """A circle of the target, target frame."""
+
+    label: CircleLabel
+    xyz_mm: np.ndarray  # (3,)
+    radius_mm: float
+    covariance_mm2: np.ndarray | None  # (3, 3)
+
+    @property
+    def sigma_mm(self) -> np.ndarray | None:
+        """σ of x, y, z, mm, or None without a covariance."""
+        return None if self.covariance_mm2 is None else np.sqrt(np.diag(self.covariance_mm2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Content:
+    """Content of an export."""
+
+    root: str  # name of the target frame
+    run: SavedRun
+    camera: Camera  # as the run refined it
+    faces: dict[str, Rigid]  # target_from_face
+    covariances: dict[str, np.ndarray]  # of the faces, 6×6, empty if the run states none
+    circles: tuple[Circle, ...]
+    photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
+    rgb: dict[str, tuple[int, int, int]]  # by face
+
+    def of_face(self, face: str) -> list[Circle]:
+        """Returns the circles of a face, in the order of the design."""
+        return [circle for circle in self.circles if circle.label.face == face]
+
+    def face_frame(self, face: str) -> str:
+        """Returns the name of the frame of a face."""
+        return f"{self.root}_{face}"
+
+    def circle_frame(self, label: CircleLabel) -> str:
+        """Returns the name of the frame at the centre of a circle, with the face's axes."""
+        return f"{self.root}_{label.face}_{label.circle}"
+
+    def statics(self) -> list[Static]:
+        """Returns the frames of faces relative to the target, and of circles relative to their faces."""
+        frames = []
+        for face, pose in self.faces.items():
+            frames.append(Static(self.root, self.face_frame(face), pose))
+            for circle in self.of_face(face):
+                face_from_circle = Rigid(np.eye(3), pose.inverse() @ circle.xyz_mm)
+                frames.append(Static(self.face_frame(face), self.circle_frame(circle.label), face_from_circle))
+        return frames
+
+    def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns σ of a face's rotation, rad, and position, mm, about and along the target's axes, or None."""
+        if face not in self.covariances:
+            return None
+        sigma = np.sqrt(np.maximum(np.diag(self.covariances[face]), 0))  # the reference face has 0 up to rounding
+        return sigma[:3], sigma[3:]
+
+    def said(self) -> list[str]:
+        """Returns lines for comments: the origin of the content, and σ of every face."""
+        faces = self.run.faces
+        lines = [
+            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(self.faces)} faces, "
+            f"{len(self.circles)} circles, {len(self.photographs)} photographs",
+            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
+            f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
+        ]
+        if not self.covariances:
+            return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
+        for face in self.faces:
+            turn, shift = self.face_sigma(face) or (np.zeros(3), np.zeros(3))
+            um = " ".join(number(1e3 * v, 2) for v in shift)
+            mdeg = " ".join(number(1e3 * v, 3) for v in np.degrees(turn))
+            text = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
+            lines.append(f"face {face}: {text}")
+        return lines
+
+
+def require_new(out: Path) -> None:
+    """Refuses a file that exists, or whose folder does not."""
+    require_free(out)
+    if not out.parent.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place")
+
+
+def require_free(out: Path, folder: bool = False) -> None:
+    """Refuses a place that is taken; ``folder`` : an empty folder there is as good as none."""
+    if os.path.lexists(out) and not (folder and out.is_dir() and not any(out.iterdir())):
+        new = "new or empty folder" if folder else "new file"
+        raise InputError("E-OUTPUT-EXISTS", f"{out}: exists, and nothing is overwritten; give a {new}")
+
+
+def content_of(run: SavedRun, root: str) -> Content:
+    """Returns the content of a run; ``root``: name of the target frame."""
+    if not root.isprintable() or root.split() != [root]:
+        raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
+    report = run.report_as(_Report)
+    faces, scene = run.faces, report.scene
+    circles = tuple(
+        Circle(
+            parse_label(label),  # type: ignore[arg-type]
+            np.array(xyz, float),
+            faces.radius_mm[label],
+            np.array(faces.circle_covariance_mm2[label]) if label in faces.circle_covariance_mm2 else None,
+        )
+        for label, xyz in faces.circles.items()
+    )
+    content = Content(
+        root=root,
+        run=run,
+        camera=run.adjusted_camera(report.camera),
+        faces=faces.poses(),
+        covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
+        circles=circles,
+        photographs={
+            (each.image, each.group): Rigid(np.array(each.axes).T, each.position_mm) for each in scene.cameras
+        },
+        rgb=colours(run),
+    )
+    names = [root, *(each.child for each in content.statics())]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            "E-FRAME-NAME",
+            f"frames: {twice[0]} would be the name of two frames; rename a face or a circle of the target",
+        )
+    return content
+
+
+def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
+    """Returns the colour of each face, by id."""
+    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target_design.faces)}
+
 
 COLUMNS = (
     *("kind", "face", "circle", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "nx", "ny", "nz", "radius_mm"),
@@ -77,7 +228,7 @@ def _list(texts) -> str:
 
 
 PLATE_M = 1e-4  # height of the cylinders that show circles. Their outer ends lie in the faces' planes.
-MM_M = 1e-3
+MM_M = 1 / METRE_MM
 
 
 def urdf(content: Content) -> str:
@@ -143,6 +294,191 @@ def _escaped(text: str) -> str:
     return text.replace("$(", "$$(").replace("${", "$${")
 
 
+EDGES = 48  # number of edges of a disc. Its triangles leave out 0.3 % of its area.
+CAMERA_SHARE = 0.06  # depth of a camera's pyramid as a share of the scene's extent
+FLOAT, UNSIGNED = 5126, 5125
+VERTICES, INDICES = 34962, 34963
+LINES, TRIANGLES = 1, 4
+NEAR_M = 0.01
+POINTS = 96  # of the ball that shows σ
+Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+"""Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
+"""Rotation from OpenCV's to glTF's camera axes. glTF's cameras look along −Z, with Y up."""
+UNLIT = "KHR_materials_unlit"
+
+
+@dataclass(slots=True, eq=False)
+class _Buffer:
+    """Numerical data of a file, to which arrays are added."""
+
+    data: bytearray = field(default_factory=bytearray)
+    views: list[dict] = field(default_factory=list)
+    accessors: list[dict] = field(default_factory=list)
+
+    def add(self, values: np.ndarray, target: int) -> int:
+        """Adds points (n, 3), m, or indices (n,), and returns the index of their accessor."""
+        points = target == VERTICES
+        raw = np.ascontiguousarray(values, "<f4" if points else "<u4")
+        accessor = {"bufferView": len(self.views), "componentType": FLOAT if points else UNSIGNED, "count": len(raw)}
+        accessor |= {"type": "VEC3" if points else "SCALAR"}
+        if points:
+            accessor |= {"min": raw.min(axis=0).tolist(), "max": raw.max(axis=0).tolist()}
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": raw.nbytes, "target": target}
+        self.views.append(view)
+        self.accessors.append(accessor)
+        self.data += raw.tobytes()
+        return len(self.accessors) - 1
+
+    def shape(self, points: np.ndarray, indices: np.ndarray) -> dict:
+        """Adds points and the indices of lines or triangles between them."""
+        return {"attributes": {"POSITION": self.add(points, VERTICES)}, "indices": self.add(indices.ravel(), INDICES)}
+
+
+def gltf(content: Content) -> str:
+    """Returns glTF as JSON with its buffer inside."""
+    tree, data = _tree(content)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode("ascii")
+    return json.dumps(tree | {"buffers": [{"uri": uri, "byteLength": len(data)}]}, ensure_ascii=False, indent=1) + "\n"
+
+
+def glb(content: Content) -> bytes:
+    """Returns glTF as one binary file."""
+    tree, data = _tree(content)
+    text = json.dumps(tree | {"buffers": [{"byteLength": len(data)}]}, ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _tree(content: Content) -> tuple[dict, bytes]:
+    buffer, meshes, nodes = _Buffer(), [], []
+    factor = _exaggeration(content)
+    ball, disc = buffer.shape(*_ball()), buffer.shape(*_disc())
+
+    def mesh(name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
+        meshes.append({"name": name, "primitives": [shape | {"material": colour, "mode": mode}]})
+        return len(meshes) - 1
+
+    def node(**own) -> int:
+        nodes.append({key: value for key, value in own.items() if value != []})
+        return len(nodes) - 1
+
+    below = []
+    for place, (face, pose) in enumerate(content.faces.items()):
+        grey, own = (
+            mesh(f"sigma of face {face}", ball, len(content.faces)),
+            mesh(f"circles of face {face}", disc, place),
+        )
+        circles = []
+        for circle in content.of_face(face):
+            radius_m = MM_M * circle.radius_mm
+            children = [node(name=str(circle.label), mesh=own, scale=[radius_m, radius_m, 1.0])]
+            extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
+            if circle.covariance_mm2 is not None:
+                children.append(node(**_sigma(circle, pose, factor), mesh=grey))
+                extras["covariance_mm2"] = circle.covariance_mm2.tolist()
+            name, at = content.circle_frame(circle.label), (MM_M * (pose.inverse() @ circle.xyz_mm)).tolist()
+            circles.append(node(name=name, translation=at, children=children, extras=extras))
+        extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
+        if face in content.covariances:
+            extras["covariance_rad_mm"] = content.covariances[face].tolist()
+        below.append(node(name=content.face_frame(face), **_placed(pose), children=circles, extras=extras))
+    if content.photographs:
+        below += _cameras(content, buffer, mesh, node)
+    below_up = node(name=content.root, children=below, extras={"said": content.said(), "sigma_drawn_times": factor})
+    up = node(name="y_up", rotation=Y_UP, children=[below_up])
+    materials = []
+    for rgb in (*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB):
+        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
+        surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        materials.append({"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}})
+    tree = {
+        "asset": {"version": "2.0", "generator": content.said()[0]},
+        "extensionsUsed": [UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [up]}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+    }
+    if content.photographs:
+        tree["cameras"] = [_lens(content)]
+    return tree, bytes(buffer.data)
+
+
+def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
+    camera, places = content.camera, [circle.xyz_mm for circle in content.circles]
+    places += [pose.translation for pose in content.photographs.values()]
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+    rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
+    shape = np.vstack([np.zeros(3), CAMERA_SHARE * np.ptp(np.array(places), axis=0).max() * rays])
+    lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
+    frustum = mesh("image at depth", buffer.shape(MM_M * shape @ GL_FROM_CV, lines), len(content.faces) + 1, LINES)
+    nodes = []
+    for (name, group), pose in content.photographs.items():
+        placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
+        nodes.append(node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
+    return nodes
+
+
+def _lens(content: Content) -> dict:
+    """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
+    camera = content.camera
+    across, up = (np.array([camera.width, camera.height]) / camera.focal).tolist()
+    perspective = {"yfov": 2 * float(np.arctan(up / 2)), "aspectRatio": across / up, "znear": NEAR_M}
+    lens = {"focal_px": camera.focal, "centre_px": camera.centre, "distortion": camera.distortion}
+    extras = {"model": camera.colmap_model, "size_px": [camera.width, camera.height]}
+    extras |= {name: values.tolist() for name, values in lens.items()}
+    return {"name": "camera", "type": "perspective", "perspective": perspective, "extras": extras}
+
+
+def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
+    """Returns the node that turns the unit ball into the ellipsoid of σ in the face's axes, times ``factor``."""
+    turn = np.array(pose.rotation)
+    values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
+    turned = xyzw(Rigid(axes * [np.sign(np.linalg.det(axes)), 1, 1], np.zeros(3)))
+    size = (factor * MM_M * np.sqrt(np.maximum(values, 0))).tolist()
+    return {"name": f"sigma of {circle.label}, times {factor:g}", "rotation": turned, "scale": size}
+
+
+def _disc() -> tuple[np.ndarray, np.ndarray]:
+    """Returns points (EDGES + 1, 3) of the unit disc, the centre first, and triangles, counter-clockwise from +Z."""
+    angle = 2 * np.pi * np.arange(EDGES) / EDGES
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
+    around = 1 + np.arange(EDGES)
+    return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
+
+
+def _exaggeration(content: Content) -> float:
+    """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
+    known = [(float(np.linalg.norm(c.sigma_mm)), c.radius_mm) for c in content.circles if c.sigma_mm is not None]
+    if not any(sigma for sigma, _ in known):
+        return 1.0
+    sigma, radius = np.median(known, axis=0)
+    return 10.0 ** np.floor(np.log10(radius / sigma))
+
+
+def _placed(pose: Rigid) -> dict:
+    return {"translation": metres(pose), "rotation": xyzw(pose)}
+
+
+def _ball() -> tuple[np.ndarray, np.ndarray]:
+    """Returns points of the unit sphere on a spiral, and triangles between them; both sides of these are drawn."""
+    from scipy.spatial import ConvexHull
+
+    place = np.arange(POINTS) + 0.5
+    height, turn = 1 - 2 * place / POINTS, np.pi * (1 + 5**0.5) * place
+    across = np.sqrt(1 - height**2)
+    points = np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    return points, ConvexHull(points).simplices
+
+
 ROOT = "target"  # default name of the target frame
 
 
@@ -164,8 +500,8 @@ FORMS = {
     "ros1": Form(".launch", lambda content: ros1_launch(content.statics(), _in_comments(content)), FRAMES_ONLY),
     "opencv": Form(".yml", opencv, "cameras"),
     "csv": Form(".csv", table, "cameras, correlations"),
-    "gltf": Form(".gltf", gltf.gltf, "the lens's distortion but as numbers in extras"),
-    "glb": Form(".glb", gltf.glb, "the lens's distortion but as numbers in extras"),
+    "gltf": Form(".gltf", gltf, "the lens's distortion but as numbers in extras"),
+    "glb": Form(".glb", glb, "the lens's distortion but as numbers in extras"),
 }
 """Forms by the value of ``--form``."""
 
@@ -216,3 +552,17 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     save(path, written)
     require_same(path, path.read_bytes, written.encode() if isinstance(written, str) else written)
     return ExportedRun(path, form, content)
+
+
+def export_text(written: ExportedRun) -> str:
+    """Returns a text on the contents of the file, and on the results that it lacks."""
+    content = written.content
+    lines = [
+        f"{len(content.faces)} faces and {len(content.circles)} circles, frame {content.root}, as {written.form}: "
+        f"{written.path}"
+    ]
+    if not content.covariances:
+        lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
+    if lost := FORMS[written.form].lost:
+        lines.append(f"not in it: {lost}")
+    return "\n".join(lines)

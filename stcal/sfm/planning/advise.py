@@ -3,16 +3,20 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import Named, ResultFile
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
+from stcal.report.text import join, number, text_table
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
@@ -20,10 +24,13 @@ from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
+    FORECAST,
     IMAGE_NOISE,
+    MICRO,
     PRACTICE,
     CentreNoise,
     Forecast,
+    ForecastPart,
     PositionsWith,
     Setup,
     forecast,
@@ -68,11 +75,13 @@ class PlannedView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
-    centre: np.ndarray  # (3,) middle of board and faces
-    axes: np.ndarray  # (3, 3) rows right, up, towards the cameras
+    """Where the cameras of a group stand."""
+
+    centre: np.ndarray  # (3,) middle of all points
     distance_mm: float  # median, of the cameras from the centre
     directions: np.ndarray  # (m, 3) unit vectors from the centre to the cameras
-    middle: str  # image in the middle of the views
+    middle: int  # image in the middle of the views
+    axes: np.ndarray  # (3, 3) rows right, up, towards the cameras, as that photograph shows them
 
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":
@@ -83,12 +92,12 @@ class _Stand:
         towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
         middle = int(np.argmax(directions @ towards))
         axes = axes_of(model.camera_from_model[middle], towards)
-        return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
+        return cls(centre, float(np.median(distance)), directions, middle, axes)
 
-    def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
-        azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
-        local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
-        return looking_at(self.centre, np.array(local) @ self.axes, self.axes[1], self.distance_mm, roll)
+    def pose(self, direction: np.ndarray, up: np.ndarray, roll_deg: float) -> Rigid:
+        """Returns camera_from_target of a camera that looks at the centre from a direction (3,)."""
+        rotation = look_along(-direction[None], up, np.array([-np.radians(roll_deg)]))[0]
+        return Rigid(rotation, -rotation @ (self.centre + self.distance_mm * direction))
 
 
 def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
@@ -97,12 +106,6 @@ def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
     right = np.cross(-camera_from_target.rotation[1], towards)
     right /= np.linalg.norm(right)
     return np.array([right, np.cross(towards, right), towards])
-
-
-def looking_at(centre: np.ndarray, direction: np.ndarray, up: np.ndarray, distance_mm: float, roll: float) -> Rigid:
-    """Returns camera_from_target of a camera that looks at the centre from a direction (3,), rolled by rad."""
-    rotation = look_along(-direction[None], up, np.array([-roll]))[0]
-    return Rigid(rotation, -rotation @ (centre + distance_mm * direction))
 
 
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
@@ -132,15 +135,13 @@ def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setu
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
     """Returns the views, on a grid about the present ones, that show the whole board and at least one whole face."""
-    stand = _Stand.of(model)
-    steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
-    places = [
-        (float(azimuth), float(elevation), roll)
-        for roll in ROLLS_DEG[: 1 if setup.prior is None else None]
-        for elevation in steps
-        for azimuth in steps
-    ]
-    poses = [stand.pose(*place) for place in places]
+    stand, steps = _Stand.of(model), np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG).tolist()
+    rolls = ROLLS_DEG[: 1 if setup.prior is None else None]
+    places = [(azimuth, elevation, roll) for roll, elevation, azimuth in product(rolls, steps, steps)]
+    poses = []
+    for *angles, roll in places:
+        (x, y), (right, ahead) = np.sin(np.radians(angles)), np.cos(np.radians(angles))
+        poses.append(stand.pose(np.array([ahead * x, y, ahead * right]) @ stand.axes, stand.axes[1], roll))
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
     limit = _largest_tilt(scene, model)
@@ -148,14 +149,13 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     views = []
     for i, place in enumerate(places):
         labels = set(model.labels) & shown(scene, model.group, i, limit)
-        if not (members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board")):
-            continue
-        position = poses[i].inverse().translation
-        cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
-        seen = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise)
-        tilts = _tilts_deg(scene, model.group, position, labels)
-        nearest = stand.middle, model.images[int(np.argmax(cosine))], angle_deg(cosine.max())
-        views.append(PlannedView(model.group, seen, *place, stand.distance_mm, tilts, *nearest))
+        if members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board"):
+            position = poses[i].inverse().translation
+            tilts = _tilts_deg(scene, model.group, position, labels)
+            cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
+            own = single(model, f"view {place}", poses[i], sorted(labels), setup, noise)
+            nearest = model.images[stand.middle], model.images[int(cosine.argmax())], angle_deg(cosine.max())
+            views.append(PlannedView(model.group, own, *place, stand.distance_mm, tilts, *nearest))
     return views
 
 
@@ -217,7 +217,7 @@ def single(
     points, n = np.array([model.labels.index(label) for label in labels]), len(labels)
     image = replace(
         model,
-        images=(name,),
+        images=(f"{model.group}/{name}",),
         camera_from_model=(pose,),
         image_index=np.zeros(n, int),
         point_index=points,
@@ -236,32 +236,29 @@ SHARES = (0.35, 0.5, 0.65)  # where candidates stand between the normals of two 
 
 def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
     """Returns candidates, each with two faces that one view can show, as a motion from the nearest photograph."""
-    target_from_face = setup.start.target_from_face
-    faces = [face for face in setup.target.faces if face.id in target_from_face]
-    normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}
-    middles = {face.id: target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
-    centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
-    towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
-    away = np.linalg.norm(towards, axis=1)
-    distance = float(np.median(away))
+    poses, stand = setup.start.target_from_face, _Stand.of(model)
+    faces = [face for face in setup.target.faces if face.id in poses]
+    normals = {face.id: face.outward * poses[face.id].rotation[:, 2] for face in faces}
+    middles = {face.id: poses[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
     views = []
     for (one, two), share, roll in product(combinations(normals, 2), SHARES, ROLLS_DEG):
         if normals[one] @ normals[two] < LEAST_COSINE:
             continue
         direction = share * normals[one] + (1 - share) * normals[two]
         direction /= np.linalg.norm(direction)
-        cosine = towards @ direction / away
+        cosine = stand.directions @ direction
         near = int(cosine.argmax())
-        axes = axes_of(model.camera_from_model[near], towards[near])
+        axes = axes_of(model.camera_from_model[near], stand.directions[near])
         right, up, ahead = (axes @ direction).tolist()
         azimuth, elevation = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
-        pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
-        tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
-        shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
-        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
-        seen = single(model, f"{model.group}/view {one} {two} {share} {roll}", pose, labels, setup, noise)
+        position = stand.centre + stand.distance_mm * direction
+        tilts = {face: tilt_deg(normals[face], middles[face], position) for face in sorted(normals)}
+        tilts = {face: tilt for face, tilt in tilts.items() if tilt < MAX_TILT_DEG}
+        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in tilts]
+        pose = stand.pose(direction, axes[1], roll)
+        own = single(model, f"view {one} {two} {share} {roll}", pose, labels, setup, noise)
         nearest = model.images[near], model.images[near], angle_deg(cosine[near])
-        views.append(PlannedView(model.group, seen, azimuth, elevation, roll, distance, shown, *nearest))
+        views.append(PlannedView(model.group, own, azimuth, elevation, roll, stand.distance_mm, tilts, *nearest))
     return views
 
 
@@ -408,14 +405,14 @@ def _greedy(
 ) -> Iterator[AdvisedView]:
     """Yields view after view, each time the one with which the worst face has the smallest σ."""
     models = {model.group: model for model in known.models}
-    for number in range(1, count + 1):
+    for place in range(1, count + 1):
         if not views:
             return
-        progress(f"view {number}", 0, len(views))
+        progress(f"view {place}", 0, len(views))
         positions = PositionsWith.of(list(models.values()), known.setup, now.derivatives)
         jobs = [(positions, views[i : i + AT_ONCE]) for i in range(0, len(views), AT_ONCE)]
         results = [sigma for part in run_in_order(_positions, jobs, 1) for sigma in part]
-        progress(f"view {number}", len(views), len(views))
+        progress(f"view {place}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         yield AdvisedView(views[best], *worst_of(results[best]))
         models[views[best].group] = models[views[best].group].plus(views[best].model)
@@ -484,3 +481,95 @@ def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
         f"{BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
     )
     return CentreNoise.expected(), "what corners of tags have in rendered photographs" if of_corners else of_circles
+
+
+Choice = Annotated[
+    AdvisedView,
+    Named(
+        "view.group view.middle view.azimuth_deg view.elevation_deg view.roll_deg view.distance_mm view.tilts_deg "
+        "view.nearest view.nearest_deg view.camera_from_target view.labels face sigma_mm"
+    ),
+]
+
+
+class AdviceFile(ResultFile):
+    """The JSON file of ``advise``: the present forecast, and further photographs."""
+
+    format: Literal["stcal advice 1"] = Field(description="the file's form and its version")
+    now: ForecastPart = Field(description=FORECAST)
+    choices: list[Choice] = Field(
+        description="further photographs, one after the other: `view`, and the worst `face` with its `sigma_mm` with "
+        "this view and those before. A view has `group`; `middle`, the photograph in the middle of the group's views; "
+        "`azimuth_deg` to the right and `elevation_deg` up from there as that photograph shows them (longitude and "
+        "latitude about the middle of board and faces), `roll_deg` about the camera's axis, `distance_mm` to that "
+        "middle; `tilts_deg` by face and `board`, between normal and line of sight; `nearest` photograph and "
+        "`nearest_deg` to it; `camera_from_target` 4×4; `labels` in view"
+    )
+    new_groups: tuple[NewGroup, ...] = Field(
+        description="pairs of `faces` that no group shows together, the best first: the worst `face` and its "
+        "`sigma_mm` with `images` of them and the board"
+    )
+    board_dominates: bool = Field(
+        description="more than half of the worst face's variance is the board's: more views help little"
+    )
+    half_board_sigma_um: float = Field(description="of the worst face with half the board's σ and no further view")
+    tried: int = Field(description="views that were compared")
+
+    @classmethod
+    def of_advice(cls, advice: Advice) -> "AdviceFile":
+        return cls(
+            format="stcal advice 1",
+            now=ForecastPart.of(advice.now, advice.shares),
+            choices=list(advice.choices),
+            new_groups=advice.new_groups,
+            board_dominates=advice.board_dominates,
+            half_board_sigma_um=MICRO * advice.better_board.worst()[1],
+            tried=advice.tried,
+        )
+
+
+HOW_TO_GO = (
+    "go right and up as seen in the photograph named, about the middle of board and faces, which is to be in the "
+    "middle of the image, mm away; degrees of board and faces are from their normal. A body without a board may be "
+    "turned the other way instead; if board or target have been moved since, photograph a new group"
+)
+
+
+def advice_text(advice: Advice) -> str:
+    """Returns what to photograph next, as a table that a photographer can follow."""
+    now, better_um = ForecastPart.of(advice.now, advice.shares), MICRO * advice.better_board.worst()[1]
+    lines = [*now.table(), f"worst is face {now.worst_face}, {now.worst_sigma_um:.2f} µm"]
+    if advice.board_dominates:
+        lines.append(
+            f"{100 * advice.shares[now.worst_face]['board']:.0f} % of its variance comes from the board: further views "
+            f"will help little; with a board of half the σ: {better_um:.2f} µm"
+        )
+    lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
+    lines += text_table([["<group", "<from", "<go", "mm", "<sees", "<nearest", "<worst face, µm"], *_views(advice)])
+    if not advice.choices:
+        lines.append("none: no other view within ±50° shows the whole board and a face")
+    lines.append(HOW_TO_GO)
+    ways = [(better_um, "a board of half the σ" if advice.has_board else "print and size of half the σ")]
+    if count := len(advice.choices):
+        ways.append(
+            (MICRO * advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view")
+        )
+    for pair in advice.new_groups:
+        words = f"{pair.images} images of faces {join(pair.faces)} with the board next to them, a new group"
+        ways.append((MICRO * pair.sigma_mm, words))
+    rows = [["<worst face afterwards, the best first", "µm"], *([words, number(um, 2)] for um, words in sorted(ways))]
+    return "\n".join([*lines, "", *text_table(rows)])
+
+
+def _views(advice: Advice) -> Iterator[list[str]]:
+    face, sigma = advice.now.worst()
+    for choice in advice.choices:
+        view = choice.view
+        turns = ((view.azimuth_deg, ("right", "left")), (view.elevation_deg, ("up", "down")))
+        parts = [f"{abs(angle):g}° {names[angle < 0]}" for angle, names in turns if angle]
+        go = ", ".join([*parts, *(["camera on end"] if view.roll_deg else [])]) or "the same place"
+        sees = join(f"{'' if key == 'board' else 'face '}{key} {tilt:.0f}°" for key, tilt in view.tilts_deg.items())
+        change = f"{face}: {MICRO * sigma:.2f} → {choice.face}: {MICRO * choice.sigma_mm:.2f}"
+        nearest = f"{view.nearest} {view.nearest_deg:.0f}°"
+        yield [view.group, view.middle, go, f"{view.distance_mm:.0f}", sees, nearest, change]
+        face, sigma = choice.face, choice.sigma_mm

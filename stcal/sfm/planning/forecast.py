@@ -6,18 +6,20 @@ from itertools import compress
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 from scipy.special import ellipe, ellipk
 
 from stcal.boards.target_file import ROUGH_KEYS
-from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, reference_target
+from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.io.json import read_result
+from stcal.io.json import ByFace, Part, read_result
 from stcal.labels import CircleLabel, DotLabel, Label
+from stcal.report.text import join, number, text_table
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.faces_file import FacePoses
@@ -33,8 +35,6 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
     """Returns the pose of every face in one frame, of a ``faces.json`` or, without one, by the design's rough poses."""
     if faces is None:
         rough = target.rough_poses()
-        if not rough and _is_reference(target):  # of files from before there were rough poses
-            return reference_target().rough_poses()
         if missing := [face.id for face in target.faces if face.id not in rough]:
             *more, last = missing
             named = f"faces {', '.join(more)} and {last} are" if more else f"face {last} is"
@@ -52,14 +52,6 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
             f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces",
         )
     return {face.id: poses[face.id] for face in target.faces}
-
-
-def _is_reference(target: TargetDesign) -> bool:
-    places, reference = (
-        {label: xy for face in each.faces for label, xy in zip(face.labels(), face.xy_mm, strict=True)}
-        for each in (target, reference_target())
-    )
-    return places.keys() == reference.keys() and all(np.allclose(places[k], reference[k], atol=0.5) for k in places)
 
 
 EXACT_SIGMA_PX = 0.005  # the σ that is stated for centres without noise
@@ -354,3 +346,59 @@ def variance_shares(now: Forecast, models: Sequence[MetricModel], setup: Setup) 
         for face, sigma in now.position_sigma_mm().items():
             shares[face][source] = (1 - (less[face] / sigma) ** 2) / (1 - SMALLER**2)
     return shares
+
+
+MICRO, PPM = 1e3, 1e6
+LEAST_SHARE = 0.005  # least share of a variance that is printed
+
+
+@dataclass(frozen=True, slots=True)
+class FaceForecast:
+    translation_sigma_um: list[float]
+    rotation_sigma_mdeg: list[float]
+    position_sigma_um: float
+    worst_circle: str
+    worst_circle_sigma_um: float
+    variance_shares: dict[str, float]
+
+
+class ForecastPart(Part):
+    """σ against the reference face, in the target frame."""
+
+    worst_face: str
+    worst_sigma_um: float
+    scale_sigma_ppm: float
+    faces: dict[ByFace, FaceForecast] = Field(
+        description="all faces but the reference: `translation_sigma_um` and `rotation_sigma_mdeg` (x, y, z), "
+        "`position_sigma_um` (root of the summed variances of x, y, z), `worst_circle` and its "
+        "`worst_circle_sigma_um` (likewise), `variance_shares`: by source (`image noise`, `board` or `print`, "
+        "`flatness` where stated, `intrinsics` where adjusted, `rims` where estimated) the share of the position's "
+        "variance that is due to the source; they add up to 1"
+    )
+
+    @classmethod
+    def of(cls, forecast: Forecast, shares: dict[str, dict[str, float]]) -> "ForecastPart":
+        faces, position_mm = {}, forecast.position_sigma_mm()
+        for face, covariance in forecast.face_covariance.items():
+            sigma = MICRO * np.sqrt(np.diag(covariance))
+            worst, circle_mm = worst_of({c: own for c, own in forecast.circle_sigma_mm.items() if c.face == face})
+            rows = sigma[3:].tolist(), np.degrees(sigma[:3]).tolist(), MICRO * position_mm[face]
+            faces[face] = FaceForecast(*rows, worst, MICRO * circle_mm, shares[face])
+        name, sigma_mm = worst_of(position_mm)
+        scale_ppm = PPM * forecast.scale_sigma
+        return cls(worst_face=name, worst_sigma_um=MICRO * sigma_mm, scale_sigma_ppm=scale_ppm, faces=faces)
+
+    def table(self) -> list[str]:
+        rows = [["<face", "σ x, µm", "y", "z", "all", "σ about x, mdeg", "y", "z", "<worst point", "µm", "<variance"]]
+        for face, row in self.faces.items():
+            shares = sorted(row.variance_shares.items(), key=lambda item: -item[1])
+            said = [f"{name.removeprefix('image ')} {100 * own:.0f} %" for name, own in shares if own > LEAST_SHARE]
+            sigma = [*row.translation_sigma_um, row.position_sigma_um, *row.rotation_sigma_mdeg]
+            worst = [row.worst_circle, number(row.worst_circle_sigma_um, 2)]
+            rows.append([face, *(number(s, 2) for s in sigma), *worst, join(said)])
+        return text_table(rows)
+
+
+FORECAST = (
+    "`worst_face`, whose position is known worst, and its `worst_sigma_um`; `scale_sigma_ppm` of the target's size; and"
+)

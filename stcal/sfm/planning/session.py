@@ -6,18 +6,30 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
-from stcal.design import BoardDesign, KnownDistance, ScaleReference, TargetDesign, reference_board, scale_reference
+from stcal.design import (
+    BoardDesign,
+    KnownDistance,
+    ScaleReference,
+    TargetDesign,
+    faces_of_known_shape,
+    reference_board,
+    scale_reference,
+)
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
+from stcal.io.json import ResultFile
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, circle_labels
 from stcal.parallel import one_thread
+from stcal.report.text import number, text_table
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.group_model import ImageObservations, MetricModel
@@ -25,9 +37,12 @@ from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.planning.forecast import (
+    FORECAST,
+    MICRO,
     ONE_PLATE,
     CentreNoise,
     Forecast,
+    ForecastPart,
     Setup,
     forecast,
     nominal_poses,
@@ -197,11 +212,29 @@ def plan(
     else:
         board = reference_board() if board is None else board
         make = partial(_beside_board, target=target, board=board, nominal=poses)
-    more = _remedy(make, replace(options, images=2 * options.images), "twice the images")
-    wider = [] if printed else [_wider(make, options)]
-    near = _remedy(make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %")
-    now = _as_asked(make, options)
-    return replace(now, remedies=(more, *wider, *now.remedies, near))
+    scene, models, setup = make(options)
+    now = forecast(models, setup)
+    better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
+    if isinstance(setup.board, ScaleReference):
+        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
+    remedies = (
+        _remedy(make, replace(options, images=2 * options.images), "twice the images"),
+        *([] if printed else [_wider(make, options)]),
+        *(Remedy(what, forecast(models, own, now.derivatives).worst()[1]) for what, own in better.items()),
+        _remedy(make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %"),
+    )
+    return Plan(
+        options=options,
+        setup=setup,
+        groups=tuple(model.group for model in models),
+        observations=round(sum(setup.centres(model).sum() for model in models)),
+        centre_sigma_px=rms(np.concatenate([model.sigma_px() for model in models])),
+        aperture_mm=widest_aperture_mm(models, setup.camera),
+        forecast=now,
+        shares=variance_shares(now, models, setup),
+        remedies=remedies,
+        hardly_seen=scene.hardly_seen() if isinstance(scene, BodyScene) else "",
+    )
 
 
 def _kept_dots(board: BoardDesign) -> set[DotLabel]:
@@ -212,26 +245,6 @@ def _kept_dots(board: BoardDesign) -> set[DotLabel]:
         for count in (board.rows, board.columns)
     )
     return {DotLabel(row, column) for row in rows for column in columns}
-
-
-def _as_asked(make: Photographs, options: PlanOptions) -> Plan:
-    scene, models, setup = make(options)
-    now = forecast(models, setup)
-    better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
-    if isinstance(setup.board, ScaleReference):
-        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
-    return Plan(
-        options,
-        setup,
-        tuple(model.group for model in models),
-        round(sum(setup.centres(model).sum() for model in models)),
-        rms(np.concatenate([model.sigma_px() for model in models])),
-        widest_aperture_mm(models, setup.camera),
-        now,
-        variance_shares(now, models, setup),
-        tuple(Remedy(what, forecast(models, own, now.derivatives).worst()[1]) for what, own in better.items()),
-        scene.hardly_seen() if isinstance(scene, BodyScene) else "",
-    )
 
 
 def _with_distance(setup: Setup, size: ScaleReference, model: MetricModel) -> Setup:
@@ -273,30 +286,23 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
     return float(min(widest))
 
 
-def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
-    """Returns the scene with the nominal geometry, in which nothing is misplaced."""
+def _beside_board(
+    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal
+) -> tuple[Scene, list[MetricModel], Setup]:
+    """Returns the photographs of a plan with a board: scene with the nominal geometry, in which nothing is misplaced,
+    models with their σ, input of a forecast."""
     shape = SceneOptions(
         seed=options.seed,
-        centre_sigma=0.0,
         distance_mm=options.distance_mm,
         spread_deg=options.spread_deg,
         images_per_group=options.images,
         groups=options.groups,
-        circle_sigma_mm=0.0,
-        face_shift_mm=0.0,
-        face_turn_deg=0.0,
         width=options.width,
         height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
+        **dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0),
     )
-    return make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
-
-
-def _beside_board(
-    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal
-) -> tuple[Scene, list[MetricModel], Setup]:
-    """Returns the photographs of a plan with a board: scene, models with their σ, input of a forecast."""
-    scene = _scene(options, target, board, nominal)
+    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
     run = options.run.adjustment(scene.target)
     kept = _kept_dots(board)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
@@ -319,8 +325,8 @@ def _beside_board(
     )
     every = observe(scene, 0.0, np.random.default_rng(0))
     seen = [image.select([k for k, x in enumerate(image.labels) if x in kept or x.plane != BOARD]) for image in every]
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    return scene, [options.noise.applied(m, scene.camera, radius) for m in true_models(scene, seen)], setup
+    radius_mm = setup.radius_mm()
+    return scene, [options.noise.applied(m, scene.camera, radius_mm) for m in true_models(scene, seen)], setup
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
@@ -369,16 +375,107 @@ def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservati
     images: list[ImageObservations] = []
     place: dict[CircleLabel, np.ndarray] = {}
     for i, (faces, pose) in enumerate(zip(shown, scene.camera_from_target, strict=True)):
-        own = {
-            label: xyz
-            for face in faces
-            if often[face.id] > 1
-            for label, xyz in zip(
-                face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True
-            )
-        }
+        own: dict[CircleLabel, np.ndarray] = {}
+        for face in (face for face in faces if often[face.id] > 1):
+            xyz = scene.target_from_face[face.id] @ face.places_mm(face.ids)
+            own |= dict(zip(face.labels(), xyz, strict=True))
         xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
         covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
         images.append(ImageObservations(f"{i:04d}", GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
         place |= own
     return images, place
+
+
+class PlanFile(ResultFile):
+    """The JSON file of ``plan``: the planned photographs, the forecast, and what would help."""
+
+    format: Literal["stcal plan 1"] = Field(description="the file's form and its version")
+    images_per_group: int = Field(description="photographs")
+    groups: tuple[str, ...] = Field(description="names")
+    spread_deg: float = Field(description="± about the view that shows both faces equally")
+    distance_mm: float = Field(description="of the camera")
+    reference_face: str = Field(description="face id")
+    observations: int = Field(description="centres in all images")
+    centre_sigma_px: float = Field(description="their RMS σ per axis")
+    aperture_mm: float = Field(
+        description="widest aperture, focal length / f-number, up to which depth of field moves no centre by more than "
+        "its σ"
+    )
+    forecast: ForecastPart = Field(description=FORECAST)
+    remedies: tuple[Remedy, ...] = Field(
+        description="`what` could be changed, `sigma_mm` of the worst face after that, null where it is not possible "
+        "for `reason`"
+    )
+
+    @classmethod
+    def of_plan(cls, plan: Plan) -> "PlanFile":
+        return cls(
+            format="stcal plan 1",
+            images_per_group=plan.options.images,
+            groups=plan.groups,
+            spread_deg=plan.options.spread_deg,
+            distance_mm=plan.options.distance_mm,
+            reference_face=plan.setup.start.reference_face,
+            observations=plan.observations,
+            centre_sigma_px=plan.centre_sigma_px,
+            aperture_mm=plan.aperture_mm,
+            forecast=ForecastPart.of(plan.forecast, plan.shares),
+            remedies=plan.remedies,
+        )
+
+
+USUAL_FOCAL_MM = 24.0  # focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide
+
+
+def plan_text(plan: Plan, noise: str) -> str:
+    """Returns the forecast as a table. ``noise`` : where the σ of the centres comes from."""
+    options, board, now = plan.options, plan.setup.board, ForecastPart.of(plan.forecast, plan.shares)
+    remedies: list[list[str]] = [["<what would help", "worst face, µm", "<"]]
+    for remedy in sorted(plan.remedies, key=lambda each: each.sigma_mm or np.inf):
+        told = f"not possible, {remedy.reason.partition('; ')[0]}"
+        if remedy.sigma_mm is not None:
+            told = f"{100 * (MICRO * remedy.sigma_mm / now.worst_sigma_um - 1):+.0f} %"
+        remedies.append([remedy.what, number(remedy.sigma_mm and MICRO * remedy.sigma_mm, 2), told])
+    lens = f"f/{USUAL_FOCAL_MM / plan.aperture_mm:.1f} of a {USUAL_FOCAL_MM:g} mm lens"
+    lines = [
+        _photographs_said(plan),
+        f"{plan.observations} {'centres' if board.rows else 'corners'}, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
+        *now.table(),
+        f"scale: σ {now.scale_sigma_ppm:.1f} ppm; worst is face {now.worst_face}, {now.worst_sigma_um:.2f} µm, against "
+        f"face {plan.setup.start.reference_face}",
+        "",
+        *text_table(remedies),
+        "in focus at the middle of each image, depth of field moves no centre by more than its σ up to an aperture "
+        f"{plan.aperture_mm:.2g} mm across ({'focal length / f-number' if options.camera else lens}), and up to one "
+        "2.8 times as wide from twice as far; what it moves is corrected to about 15 %",
+    ]
+    if assumed := [face.id for face in plan.setup.target.faces if face.outline_mm is None]:
+        lines.append(
+            f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles "
+            "(--margin-mm, or outline_mm in target.toml)"
+        )
+    if board.rows:
+        lines.append("the random places of board and cameras (--seed) change it by about ±3 %")
+    else:
+        lines += filter(None, [plan.hardly_seen])
+        lines.append("which faces the photographs happen to show together (--seed) changes it: compare two seeds")
+    return "\n".join(lines)
+
+
+def _photographs_said(plan: Plan) -> str:
+    options, camera, board = plan.options, plan.setup.camera, plan.setup.board
+    size = f"{camera.width}×{camera.height} px, {options.distance_mm:g} mm away"
+    if not board.rows:
+        faces = faces_of_known_shape(board)
+        prints = sorted({MICRO * (face.sigma_mm or 0.0) for face in faces})
+        ends = " to ".join(dict.fromkeys(f"{each:g}" for each in (prints[0], prints[-1])))
+        found = "found from them" if options.camera is None else "of the file"
+        return (
+            f"{options.images} images, {size}, of a body in random poses that show two or more of {len(faces)} faces; "
+            f"camera {found}, σ of print {ends} µm"
+        )
+    boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
+    return (
+        f"groups {', '.join(plan.groups)}, {options.images} images each, {size}, spread ±{options.spread_deg:g}°; "
+        f"{boards}, σ {MICRO * board.sigma_mm:g} µm"
+    )

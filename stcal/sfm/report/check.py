@@ -72,14 +72,16 @@ class TestedValue:
 
     def words(self) -> str:
         """Returns value and limit as text."""
-        limit = "" if self.limit is None else f", limit {_digits(self.limit)}"
-        return f"{_digits(self.value)}{f' {self.unit}' if self.unit else ''}{limit}"
+        value, limit = self.texts()
+        return value + (f", limit {limit}" if limit else "")
 
-
-def _digits(value: float) -> str:
-    """Returns a value to three digits, a large one without an exponent."""
-    text = f"{value:.3g}"
-    return f"{float(text):.0f}" if "e+" in text else text
+    def texts(self) -> list[str]:
+        """Returns the value with its unit, and the limit, to three digits, large ones without an exponent."""
+        value, limit = (
+            "" if each is None else f"{float(f'{each:.3g}'):.0f}" if abs(each) >= 999.5 else f"{each:.3g}"
+            for each in (self.value, self.limit)
+        )
+        return [f"{value} {self.unit}".strip(), limit]
 
 
 @dataclass(frozen=True, slots=True, repr=False)

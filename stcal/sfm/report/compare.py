@@ -14,7 +14,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.files import MODEL_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
-from stcal.io.table import FARTHEST, LENGTHS, csv_rows, read_table
+from stcal.io.table import FARTHEST, csv_rows, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import NONE, cells, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
@@ -26,11 +26,6 @@ NEAR_PX = 1.5
 """Largest distance of a label's ellipse centre from the image of the circle's centre, in px, at which the label is
 right. Eccentricity makes 0.2."""
 
-OF_A_UNIT = 0.1
-"""Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
-worst."""
-FAR_BEYOND = 20.0
-"""Error over σ above which, in all poses, the truth is doubted."""
 MOST_LISTED = 20
 """Largest number of images that the table of poses has a row for."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
@@ -130,7 +125,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     Raises
     ------
     InputError
-        A file is missing or has another form, the reference faces differ, or one of both is in another unit.
+        A file is missing or has another form, or the reference faces differ.
     """
     run = Path(run)
     answer = read_result(run / FACES if run.is_dir() else run, ComparedFaces, "run", REMEDY)
@@ -152,7 +147,6 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         raise InputError(
             "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
         )
-    _require_one_unit(f"run {run}, truth {truth}", answer, known)
     faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None
     if run.is_dir() and known.groups:
@@ -189,8 +183,7 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
     Raises
     ------
     InputError
-        A file is missing or has another form, the truth states no pose of any image, or the lengths are in another
-        unit.
+        A file is missing or has another form, or the truth states no pose of any image.
     """
     known = read_result(truth, TruthFile, "truth", REMEDY)
     true = {name: Rigid.from_matrix(pose) for name, pose in known.poses().items()}
@@ -201,23 +194,18 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
     measured, covariance = table.poses(), table.pose_covariances()
     images: dict[str, PoseErrors] = {}
     unknown: list[str] = []
-    distances: list[list[float]] = []
     for i, name in enumerate(table.text("image")):
         same = [name] if name in true else by_file.get(Path(name).name, [])
         if len(same) != 1:
             unknown.append(name)
             continue
-        pose = true[same[0]]
-        images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
-        distances.append([float(np.linalg.norm(p.translation)) for p in (pose, measured[i])])
+        images[name] = _pose_errors(measured[i], true[same[0]], None if covariance is None else covariance[i])
     if not images:
         raise InputError(
             "E-COMPARE-IMAGES",
             f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
             f"photographs{f', with names like {next(iter(true))}' if true else ''}",
         )
-    true_mm, measured_mm = np.median(distances, axis=0).tolist()
-    _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", true_mm, measured_mm, "poses")
     return ComparePosesFile(images=images, not_in_truth=unknown)
 
 
@@ -233,31 +221,6 @@ def _pose_errors(found: Rigid, true: Rigid, covariance: np.ndarray | None) -> Po
         rotation_mdeg=1e3 * float(np.degrees(turn.angle_rad())),
         normalised_error=normalised,
     )
-
-
-def _require_one_unit(where: str, found: ComparedFaces, known: TruthFile) -> None:
-    """Refuses lengths if distances show that those of one side are in another unit than mm."""
-    labels = [label for label in known.circles if label in found.circles]
-    faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
-    sides = (known, found)
-    for kind, points in (
-        ("circles", [np.array([side.circles[label] for label in labels]) for side in sides]),
-        ("faces", [np.array([side.target_from_face[face_id][:3, 3] for face_id in faces]) for side in sides]),
-    ):
-        true, measured = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
-        _require_same_unit(where, kind, true, measured, "run")
-
-
-def _require_same_unit(where: str, kind: str, true: float, measured: float, side: str) -> None:
-    """Refuses lengths whose ratio is the factor of another unit than mm."""
-    for unit, factor in LENGTHS.items():
-        for name, small, large in (("truth", true, measured), (side, measured, true)):
-            if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
-                raise InputError(
-                    "E-COMPARE-UNITS",
-                    f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
-                    f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
-                )
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
@@ -287,9 +250,9 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
         return None
     if not total.any():
         return None
-    true = {name for group in groups.values() for name in group.images}
-    counts = [*total.tolist(), len(true & measured.keys()), len(true)]
-    return LabelCounts(**dict(zip(LabelCounts.model_fields, counts, strict=True)))
+    true, (wrong, found, visible) = {name for group in groups.values() for name in group.images}, total.tolist()
+    images = len(true & measured.keys())
+    return LabelCounts(wrong=wrong, found=found, visible=visible, images=images, images_of_truth=len(true))
 
 
 def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) -> tuple[int, int, int]:
@@ -315,39 +278,35 @@ def _face(face_id: str, found: ComparedFaces, known: TruthFile) -> FaceErrors:
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([source.circles[label] for label in labels]).reshape(-1, 3) for source in (known, found))
     c = found.target_from_face_covariance.get(face_id)
-    error = sigma = None
+    mean = largest = sigma = turn = None
     with suppress(DegenerateError):  # with fewer than three circles in common there is no rigid fit
         error = 1e3 * np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
+        mean, largest = float(error.mean()), float(error.max())
     if c is not None:
-        sigma = 1e3 * np.sqrt(np.maximum(np.diag(c), 0))
+        turn, sigma = np.split(1e3 * np.sqrt(np.maximum(np.diag(c), 0)), 2)
+        turn = np.degrees(turn)
     return FaceErrors(
         **_pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump(),
         circles=len(labels),
-        circles_mean_um=None if error is None else float(error.mean()),
-        circles_max_um=None if error is None else float(error.max()),
-        translation_sigma_um=None if sigma is None else sigma[3:],
-        rotation_sigma_mdeg=None if sigma is None else np.degrees(sigma[:3]),
+        circles_mean_um=mean,
+        circles_max_um=largest,
+        translation_sigma_um=sigma,
+        rotation_sigma_mdeg=turn,
     )
 
 
 def poses_table(comparison: ComparePosesFile) -> str:
     """Returns the comparison of poses as a text table, the RMS of all first; of many the worst only."""
-    errors = list(comparison.images.values())
-    values = np.array([[e.translation_um, e.rotation_mdeg, e.normalised_error or np.nan] for e in errors])
+    errors = comparison.images
+    values = np.array([[e.translation_um, e.rotation_mdeg, e.normalised_error or np.nan] for e in errors.values()])
+    worst = sorted(np.argsort(-values[:, 0])[:MOST_LISTED].tolist())
+    names = [f"RMS of {len(errors)} poses", *(list(errors)[i] for i in worst)]
     rows = [["<image", "position", "rotation", "error / σ"], ["", "µm", "mdeg", ""]]
-    rms = np.sqrt((values**2).mean(axis=0))
-    worst = np.argsort(-values[:, 0])[:MOST_LISTED]
-    lines = [
-        (f"RMS of {len(errors)} poses", rms),
-        *((list(comparison.images)[i], values[i]) for i in sorted(worst.tolist())),
-    ]
-    for name, (position, rotation, over) in lines:
-        rows.append([name, number(position, 1), number(rotation, 2), NONE if np.isnan(over) else number(over, 2)])
+    for name, row in zip(names, [np.sqrt((values**2).mean(axis=0)), *values[worst]], strict=True):
+        rows.append([name, *(number(value, digits) for value, digits in zip(row, (1, 2, 2), strict=True))])
     text = text_table(rows)
     if more := len(errors) - len(worst):
         text.append(f"{more} poses with smaller errors of position: --json writes all")
-    if (values[:, 2] > FAR_BEYOND).all():
-        text.append("errors are far beyond σ in all poses: is this the truth of these photographs?")
     if unknown := comparison.not_in_truth:
         text.append(f"not in the truth: {', '.join(unknown[:3])}{' …' if len(unknown) > 3 else ''}")
     return "\n".join(text)

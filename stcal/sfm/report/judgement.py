@@ -21,9 +21,6 @@ PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
 """Relative σ, in ppm, from which it is stated in %."""
-SHARP_PX = 1.2
-"""σ of the blur of edges above which it limits a result: σ of centres are 1.6 times those at 0.75 px, of a sharp lens
-and the pixels' own size, which 2.5 times the images would make up for."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 FEW_IMAGES = 6
@@ -45,6 +42,30 @@ SIZES = {
     "drawing": "a length of the drawing",
 }
 """What the size of a result rests on."""
+
+
+SOURCES = {
+    "edges": (
+        "The size, by the edges of tags",
+        "all edges may have the same error, which no residual shows; {distance}",
+    ),
+    "sizes": ("The size of the print", "measure it better than size_sigma_mm says, or {distance}"),
+    "board": (
+        "The places of the board's dots",
+        "measure them, or take a better plate, and state sigma_mm in board.toml",
+    ),
+    "print": (
+        "The places of the printed corners",
+        "measure them, or take a better print, and state sigma_mm in target.toml",
+    ),
+    "distances": (
+        "The known distances",
+        "measure a longer one, or the same better, and state it with [[scale]] in target.toml",
+    ),
+    "flatness": ("The flatness of the faces", "measure it, and state it with --flatness"),
+    "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
+}
+"""Name and remedy of each source of σ beside the photographs."""
 
 
 class Judgement(Part):
@@ -108,22 +129,24 @@ class _Run:
     """What is decided by, of the content of ``report.json``."""
 
     def __init__(self, report: dict):
-        self.report, (self.faces, self.summary) = report, (report["faces"], report["summary"])
-        self.options, images = report["options"], {image["name"] for image in report["images"]}
-        self.every = ranked([Check.read(row) for row in report.get("checks", [])], images)
+        self.report, (self.faces, self.summary, self.options) = (
+            report,
+            (report[k] for k in ("faces", "summary", "options")),
+        )
+        self.every = ranked(
+            [Check.read(row) for row in report.get("checks", [])], {i["name"] for i in report["images"]}
+        )
         self.cause = next((check for check in self.every if check.key == CAUSE), None)
         self.checks = [check for check in self.every if check is not self.cause]
         self.open = [check for check in self.checks if check.told() == "not possible"]
-        self.made = sum(check.verdict != "not possible" for check in self.checks)
         self.lost = [note for note in report["notes"] if note["code"] == GROUP_LEFT_OUT]
         self.drawn = [note for note in report["notes"] if note["code"] == NOT_AS_DRAWN] if self.faces else []
         self.scale_from = self.summary.get("scale_from", ["board"])
         self.has_no_size = "drawing" in self.scale_from
         wanted, unseen = self.options.get("expect_faces"), self.summary["faces_not_seen"]
         # Without these faces the result is a part: those of the design, or those that the user expects.
-        self.lacking = [face for face in unseen if not wanted or face in wanted]
+        self.lacking = [face for face in unseen if not wanted or face in wanted] if self.faces else []
         self.missing = [face for face in unseen if face in (self.summary.get("faces_expected") or [])]
-        self.some_unused = bool(report["left_out"]["images"] or self.lost)
         alone = all(group["name"] == TOP_GROUP for group in report["groups"])
         self.are_few = alone and self.summary["images_mapped"] < FEW_IMAGES
 
@@ -138,7 +161,7 @@ class _Run:
             verdict=verdict,
             reserved=reserved,
             use=use,
-            quality=self._unknown(invalid) if verdict == "no" else self._quality(position, rotation),
+            quality=self._unknown(invalid) if verdict == "no" and self.faces else self._quality(position, rotation),
             limit=limit,
             next=" ".join([*filter(None, [remedy]), *self._more(verdict)]),
             position_sigma_um=position and position[0],
@@ -161,10 +184,9 @@ class _Run:
         if verdict == "yes" and (self.drawn or (gaps and self.lost)):
             verdict = "with care"
         reserved = verdict == "with care"
-        if verdict != "no" and gaps and self.lacking:
-            begin = "Part, with care" if reserved else "Part"
-            verdict, n = "part", len(self.faces)
-            reasons.insert(0, f"{n} of {n + len(self.lacking)} faces")
+        if verdict != "no" and self.lacking:
+            begin, verdict = "Part, with care" if reserved else "Part", "part"
+            reasons.insert(0, f"{len(self.faces)} of {len(self.faces) + len(self.lacking)} faces")
         return verdict, reserved, f"{begin or verdict.capitalize()}: {'; '.join([*reasons, *gaps])}."
 
     def _by_result(self) -> tuple[Use, str]:
@@ -173,35 +195,38 @@ class _Run:
             return "no", "there is no face in it, only λ and residuals of the board"
         if self._control():
             return "no", "it was made for comparison, and its faces are biased by tens of µm"
-        counts = {v: sum(c.verdict == v for c in self.checks) for v in ("failed", "suspicious", "passed")}
-        n, made, missing = counts["failed"], self.made, len(self.open)
-        if self.cause and self.cause.verdict == "failed":
-            of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
-            return "no", f"{self.cause.cause}{of}"
-        if n:
-            return "no", f"{n} of {made} checks failed, the first: {self.checks[0].title}"
-        if different := self.report.get("crosscheck", {}).get("differences"):
+        failed, suspicious, passed = (
+            sum(c.verdict == v for c in self.checks) for v in ("failed", "suspicious", "passed")
+        )
+        cause, made, missing = self.cause, failed + suspicious + passed, len(self.open)
+        if cause and cause.verdict == "failed":
+            of = f"; that is the likely cause of {failed} of {made} checks that failed" if failed else ""
+            return "no", f"{cause.cause}{of}"
+        if failed:
+            return "no", f"{failed} of {made} checks failed, the first: {self.checks[0].title}"
+        if different := self._different():
             return "with care", f"the native COLMAP comes to other faces ({different[0]})"
         if words := self._larger():
-            return "with care", f"{words}{f'; the likely cause: {self.cause.cause}' if self.cause else ''}"
-        if self.cause:
-            return "with care", f"{self.cause.cause}, though no check failed"
-        if n := counts["suspicious"]:
+            return "with care", f"{words}{f'; the likely cause: {cause.cause}' if cause else ''}"
+        if cause:
+            return "with care", f"{cause.cause}, though no check failed"
+        if suspicious:
             first = self.checks[0]
-            by_chance = f"; of {made} checks one is so by chance in one sound run of {round(1 / SUSPICIOUS / made)}"
+            are = "is" if suspicious == 1 else "are"
+            words = f"{suspicious} of {made} checks {are} suspicious, the first: {first.title}"
             # A residual beyond its limit that was left out is none by chance, and has no probability.
-            chance = all(value.probability is not None for value in first.measured[:1])
-            are = "is" if n == 1 else "are"
-            words = f"{n} of {made} checks {are} suspicious, the first: {first.title}"
-            return "with care", words + by_chance * chance
+            if all(value.probability is not None for value in first.measured[:1]):
+                words += f"; of {made} checks one is so by chance in one sound run of {round(1 / SUSPICIOUS / made)}"
+            return "with care", words
         if self.summary["sigma0"] is None:
             return "with care", "groups were solved one by one; there are no σ, and there are fewer checks"
-        testing = {check.verdict for check in self.checks if check.key in TESTED_BY}
-        if testing == {"not possible"}:
+        if {check.verdict for check in self.checks if check.key in TESTED_BY} == {"not possible"}:
             return "with care", f"the photographs are too few to test one another, {missing} checks were not possible"
-        passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
         open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
-        return "yes", f"{passed}{open_}"
+        return "yes", f"{f'{passed} checks passed' if passed else 'nothing was checked'}{open_}"
+
+    def _different(self) -> list[str]:
+        return self.report.get("crosscheck", {}).get("differences", [])
 
     def _larger(self) -> str:
         """Returns by how much σ are larger than pixels explain, and why; empty if they are not."""
@@ -213,41 +238,29 @@ class _Run:
             words.append(f"all σ are {larger:.1f} times as large, to cover what is beyond chance: {first.title}")
         return "; ".join(words)
 
-    def _left_out_in(self, face: str) -> list[str]:
-        """Returns the images in which a face was read but left out."""
-        of_face = {(ELSEWHERE, face), (SINGLE, face)}
-        notes = self.report["left_out"]["notes"]
-        return list(dict.fromkeys(each["image"] for each in notes if (each["code"], each["place"]) in of_face))
-
-    def _has_circles(self, face: str) -> bool:
-        rows = [*self.report["residuals_by_label"], *self.report["left_out"]["circles"]]
-        return any(row["label"].startswith(f"{face}:") for row in rows)
+    def _seen(self, face: str) -> str:
+        """Returns how a face that is not in the result was seen nevertheless; empty if it was not."""
+        notes, left_out = self.report["left_out"]["notes"], self.report["left_out"]["circles"]
+        if images := {n["image"] for n in notes if n["code"] in (ELSEWHERE, SINGLE) and n["place"] == face}:
+            return f"face {face} was read in {len(images)} image{'s' * (len(images) > 1)} and left out"
+        if any(row["label"].startswith(f"{face}:") for row in [*self.report["residuals_by_label"], *left_out]):
+            return f"face {face} is not in it: circles of it were seen, but they do not hold its frame"
+        return ""
 
     def _gaps(self) -> list[str]:
         """Returns in words what is missing: faces that are not in it, or in one image alone, and lost groups."""
-        never, words = [], []
-        for face in self.summary["faces_not_seen"]:
-            if images := self._left_out_in(face):
-                words.append(f"face {face} was read in {len(images)} image{'s' * (len(images) > 1)} and left out")
-            elif self._has_circles(face):
-                those = "those in the images that were used" if self.some_unused else "they"
-                words.append(f"face {face} is not in it, though circles of it were seen: {those} do not hold its frame")
-            else:
-                never.append(face)
+        seen = {face: self._seen(face) for face in self.summary["faces_not_seen"]}
+        never, words = [face for face in seen if not seen[face]], [words for words in seen.values() if words]
         if never:
-            seen = "in no image that was used" if self.some_unused else "seen in no image"
-            was = ("is" if len(never) == 1 else "are") if self.some_unused else ("was" if len(never) == 1 else "were")
-            words.insert(0, f"{_faces(never)} of the design {was} {seen}")
+            words.insert(0, f"no image that was used shows {_faces(never)} of the design")
         if single := [name for name, face in self.faces.items() if face["images"] == 1]:
-            words.append(f"{_faces(single)} {'rests' if len(single) == 1 else 'rest'} on one image")
+            words.append(f"one image alone shows {_faces(single)}")
         return words + [f"group {note['place']} was left out completely" for note in self.lost]
 
     # --- how good -----------------------------------------------------------------------------------------------------
 
     def _unknown(self, invalid: list[str]) -> str:
         """Returns the answer of a result that must not be used: no number, and what does not hold."""
-        if not self.faces:
-            return self._quality(None, None)
         if invalid:
             return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
         return "That is unknown: biased faces have no valid σ." if self._control() else "That is unknown."
@@ -259,14 +272,7 @@ class _Run:
         if len(self.faces) == 1:
             return "There is one face, which is the target frame itself; σ of its circles are in faces.json."
         if position is None or rotation is None:
-            ways = [chain for chains in self.report["chains"].values() if len(chains) > 1 for chain in chains]
-            if not ways:
-                return "There are no σ, and no face is reached by two chains that could be compared."
-            apart, turned = max(way["translation_mm"] for way in ways), max(way["rotation_rad"] for way in ways)
-            return (
-                f"There are no σ; chains to the same face through different groups are up to {number(1e3 * apart, 1)} "
-                f"µm and {number(1e3 * math.degrees(turned), 2)} mdeg off their mean."
-            )
+            return "There are no σ; the report has how far chains to the same face are off their mean."
         ppm, rim, scale = self.summary["scale_sigma_ppm"], self.summary.get("rim_mm"), ""
         if ppm is not None:
             scale = f", the size to {f'{number(ppm, 1)} ppm' if ppm < MOST_PPM else f'{significant(1e-4 * ppm)} %'}"
@@ -289,17 +295,21 @@ class _Run:
 
     # --- what limits it, what next ------------------------------------------------------------------------------------
 
-    def _limit(self) -> tuple[str, str]:
+    def _limit(self) -> Cause:
         """Returns what limits a result, and the remedy."""
-        worst = self.every[0].verdict if self.every else "passed"
-        lost = self._noted(self.lost, "Left out")
-        found = self._control()
-        if found is None and worst != "failed":  # what is only suspicious comes after groups that were lost
-            found = lost
-        found = found or self._by_checks(worst) or self._by_gaps()
-        return found or self._noted(self.drawn, "The drawing") or lost or self._by_size() or self._by_sigma()
+        worst, lost = self.every[0].verdict if self.every else "passed", _noted(self.lost, "Left out")
+        return (
+            self._control()
+            or (None if worst == "failed" else lost)  # what is only suspicious comes after groups that were lost
+            or self._by_checks(worst)
+            or self._by_gaps()
+            or _noted(self.drawn, "The drawing")
+            or lost
+            or self._by_size()
+            or self._by_sigma()
+        )
 
-    def _control(self) -> tuple[str, str] | None:
+    def _control(self) -> Cause | None:
         """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
         if not self.faces:
             return (
@@ -315,12 +325,7 @@ class _Run:
             return "The eccentricity of circles is not corrected.", "Run it without --no-eccentricity."
         return None
 
-    @staticmethod
-    def _noted(notes: list[dict], begin: str) -> tuple[str, str] | None:
-        """Returns what the first note says limits the result; None if there is none."""
-        return next(((f"{begin}: {n['words']}.", sentence(n["remedy"] or "take it again")) for n in notes), None)
-
-    def _by_checks(self, worst: str) -> tuple[str, str] | None:
+    def _by_checks(self, worst: str) -> Cause | None:
         """Returns the cause by the first failed check, a suspicious one that limits the result, or the cross-check."""
         if worst in ("failed", "suspicious"):
             check = self.every[0]
@@ -330,24 +335,22 @@ class _Run:
                 return found, remedy
             limits = self._by_gaps() or self._by_size() or self._by_sigma()
             return limits[0], f"{found} {remedy}"  # what is suspicious is to be looked at; σ still tell
-        if different := self.report.get("crosscheck", {}).get("differences"):
+        if different := self._different():
             remedy = "Look at the cross-check to see which of the two is right."
             return f"The native COLMAP differs: {different[0]}.", remedy
         return None
 
-    def _by_gaps(self) -> tuple[str, str] | None:
+    def _by_gaps(self) -> Cause | None:
         """Returns the cause where faces are missing that were to be there; None if all are."""
         if self.missing:
             return (
                 f"Face {join(self.missing)} should have been photographed, and is not in the result.",
                 "Look at the overlays and at what was left out, in the photographs that show it.",
             )
-        if self.faces and self.lacking:
-            n, of = len(self.faces), len(self.faces) + len(self.lacking)
-            return f"The photographs: they give {n} of the {of} faces of the design.", ""
-        return None
+        n, of = len(self.faces), len(self.faces) + len(self.lacking)
+        return (f"The photographs: they give {n} of the {of} faces of the design.", "") if n < of else None
 
-    def _by_size(self) -> tuple[str, str] | None:
+    def _by_size(self) -> Cause | None:
         """Returns the cause where no size is known; None where one is."""
         remedy = (
             "Measure the distance of two points and state it with scale in target.toml, or photograph the board of "
@@ -355,7 +358,7 @@ class _Run:
         )
         return ("Its size: nothing of known size is in view.", remedy) if self.has_no_size else None
 
-    def _by_sigma(self) -> tuple[str, str]:
+    def _by_sigma(self) -> Cause:
         """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
         if len(self.faces) == 1:
             remedy = "Photograph it together with other faces."
@@ -387,70 +390,49 @@ class _Run:
             )
         return self._by_images(sigma, photographs, of_all)
 
-    def _by_images(self, sigma: float, variance: float, of_all: str) -> tuple[str, str]:
+    def _by_images(self, sigma: float, variance: float, of_all: str) -> Cause:
         """Returns the cause where photographs limit the result, by their part of ``sigma``², 0 if unknown."""
         centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says which do most."
         if not variance:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
-        share = f"{number(100 * variance / sigma**2, 0)} {of_all}"
-        blurs = [sum(row["blur_px"]) / 2 for row in self.report.get("focus", [])]
-        if blurs and (blur := median(blurs)) > SHARP_PX:
-            return (
-                f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres "
-                f"grow with it; they are {share}.",
-                f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
-            )
-        fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
-        of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
+        fewer, share = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0)), 100 * variance / sigma**2
+        centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
-            f"The centring of circles{of_centres} in {self.summary['images_mapped']} images: {share}; no face stands "
-            "out.",
+            f"{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands out.",
             f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these "
             f"{number(sigma, 1)} µm, and {advice}",
         )
 
-    def _source(self, kind: str) -> tuple[str, str]:
+    def _source(self, kind: str) -> Cause:
         """Returns the name of a source other than the photographs that limits the result, and its remedy."""
-        few = "" if self.are_few else "More photographs help little: "
-        given = "a longer or better known" if "distances" in self.summary.get("scale_from", []) else "the"
-        distance = f"state {given} distance of two points of the target"
+        given = "a longer or better known" if "distances" in self.scale_from else "the"
+        distance = f"state {given} distance of two points of the target with [[scale]] in target.toml"
         if kind == "sizes" and (self.summary.get("edge_share") or 0.0) > 0.5:
-            common = "all edges may have the same error, which no residual shows"
-            return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
-        name, remedy = {
-            "sizes": ("The size of the print", "measure it better than size_sigma_mm says, or "
-                      f"{distance} with [[scale]] in target.toml"),
-            "board": ("The places of the board's dots", "measure them, or take a better plate, and state sigma_mm in "
-                      "board.toml"),
-            "print": ("The places of the printed corners", "measure them, or take a better print, and state sigma_mm "
-                      "in target.toml"),
-            "distances": ("The known distances", "measure a longer one, or the same better, and state it with "
-                          "[[scale]] in target.toml"),
-            "flatness": ("The flatness of the faces", "measure it, and state it with --flatness"),
-            "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give "
-                           "that file"),
-        }[kind]  # fmt: skip
-        return name, sentence(f"{few}{remedy}")
+            kind = "edges"
+        few, (name, remedy) = "" if self.are_few else "More photographs help little: ", SOURCES[kind]
+        return name, sentence(f"{few}{remedy.format(distance=distance)}")
 
     def _more(self, verdict: Use) -> list[str]:
         """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
         advice = []
-        used, given = (self.summary[key] for key in ("images_mapped", "images"))
         if self.faces and self.are_few:
+            used, given = (self.summary[key] for key in ("images_mapped", "images"))
             advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
-        if self.faces and self.lacking:
-            read = [face for face in self.lacking if self._left_out_in(face) or self._has_circles(face)]
-            if unseen := [face for face in self.lacking if face not in read]:
-                seen = "in no image that was used" if self.some_unused else "not seen in any image"
-                body = (
-                    "" if verdict == "part" else "; if they are in the images, check that target.toml is of this body"
-                )
-                advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}{body}.")
-            if read:
-                was, it = ("was", "it") if len(read) == 1 else ("were", "them")
-                advice.append(f"Read why {_faces(read)} {was} left out, and photograph {it} again from other places.")
+        read = [face for face in self.lacking if self._seen(face)]
+        if unseen := [face for face in self.lacking if face not in read]:
+            advice.append(
+                f"Photograph {_faces(unseen)} together with one of the others: no image that was used shows it."
+            )
+        if read:
+            was = "was" if len(read) == 1 else "were"
+            advice.append(f"Read why {_faces(read)} {was} left out, and take further photographs from other places.")
         if verdict in ("yes", "part") and self.open:
             remedy = self.open[0].remedy
             same = sum(check.remedy == remedy for check in self.open)
             advice.append(f"For {same} more check{'s' * (same > 1)}: {remedy}.")
         return advice
+
+
+def _noted(notes: list[dict], begin: str) -> Cause | None:
+    """Returns what the first note says limits the result; None if there is none."""
+    return next(((f"{begin}: {n['words']}.", sentence(n["remedy"] or "take it again")) for n in notes), None)

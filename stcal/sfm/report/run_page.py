@@ -1,16 +1,18 @@
-"""The page of a run."""
+"""The page of a run: its answer, how far to trust it, and all that it rests on; with its figures."""
 
+import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import partial
-from typing import Any
+from itertools import chain, product
 
-from stcal.io.images import TOP_GROUP
-from stcal.labels import BOARD, parse_label
+import numpy as np
+
+from stcal.labels import BOARD, dot_cells, parse_label, parse_labels
 from stcal.report.document import (
     Block,
     Document,
-    Html,
     Section,
     Table,
     alarms,
@@ -24,19 +26,44 @@ from stcal.report.document import (
     subheading,
     swatch,
     tone_of,
+    verdict_word,
 )
-from stcal.report.text import cells, join, number
-from stcal.sfm.report import run_figures
-from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
-from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, photographs, space_parts
-from stcal.sfm.report.sections import (
-    Words,
-    checks_section,
-    crosscheck_section,
-    published_section,
-    settings,
-    trust,
+from stcal.report.svg import (
+    AXIS_COLOURS,
+    COLOURS,
+    INK,
+    RED_BLUE,
+    SMALL,
+    Axes,
+    Drawing,
+    arrows,
+    mixed_names,
+    round_below,
 )
+from stcal.report.text import NONE, cells, join, number
+from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
+from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
+
+FIRST_IMAGES = 100
+"""Number of rows and overlays that the page has room for."""
+LONGEST = 0.04
+"""Length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width."""
+Residuals = np.ndarray
+"""Array (n, 4) of circles: centre x, y and residual x, y, px."""
+
+SOLVES = {
+    "joint": "joint: one adjustment over all groups",
+    "chain": "chain: group by group, then combined",
+    "paper": "paper: as published by Zhang & Wei (2017), for comparison",
+}
+FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
+
+
+def has_board(report: dict) -> bool:
+    """Returns whether a board of dots gives the scale."""
+    return "board" in report["summary"].get("scale_from", ["board"])
+
 
 PUBLISHED = (
     "as published, for comparison: centres of contours with equal weights, without the eccentricity; faces are off by "
@@ -59,30 +86,27 @@ def report_html(
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)
-    report = _with_named_groups(report)
-    colours = run_figures.group_colours([group["name"] for group in report["groups"]])
-    summary, words, options = report["summary"], Words.of(report), report["options"]
+    colours = {group["name"]: COLOURS[i % len(COLOURS)] for i, group in enumerate(report["groups"])}
+    summary, options = report["summary"], report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
     pictures = [
-        macro("photographs", shown, rest, words) if shown["each"] else "" if gone else "There are none",
+        macro("photographs", shown, rest) if shown["each"] else "" if gone else "There are none",
         f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
         if gone
         else "",
     ]
     answers = macro("answers", judgement.answers(), tone_of(judgement.verdict))
     sections = [
-        Section("Faces", _answer(report, colours, words)),
+        Section("Faces", _answer(report, colours)),
         Section("May I use it?", [answers, *checks_section(report.get("checks", []))], name="use"),
-        Section("How far to trust it", trust(report, judgement, words), name="trust"),
-        Section("Faces in detail", _faces_in_detail(report, words), name="detail"),
-        Section("Scale", _scale(report, words)),
+        Section("How far to trust it", trust(report, judgement), name="trust"),
+        Section("Faces in detail", _faces_in_detail(report), name="detail"),
+        Section("Scale", _scale(report)),
         Section("Residuals", _residuals(report, colours)),
-        Section("Focus", _focus(report)),
-        Section("Initial pairs", _pairs(report), name="pairs"),
-        Section("Left out", _left_out(report, words)),
+        Section("Left out", _left_out(report)),
         *(Section(title, make(report[key]), name=key) for key, (title, make) in others.items() if key in report),
-        Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")]),
+        Section("Settings", [Table(["<Setting", "<Value"], settings(report), css="text facts")]),
         Section("Overlays", pictures),
     ]
     counts = (
@@ -99,33 +123,6 @@ def report_html(
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
-def _with_named_groups(report: dict) -> dict:
-    """Returns the report with a word in place of the dot for the group of the folder itself."""
-    if all(group["name"] != TOP_GROUP for group in report["groups"]):
-        return report
-    word = "all" if len(report["groups"]) == 1 else "top folder"
-
-    def named(value: Any, key: str) -> Any:
-        if isinstance(value, dict):
-            return {word if k == TOP_GROUP and key == "boards" else k: named(v, k) for k, v in value.items()}
-        if isinstance(value, list):
-            return [named(v, key) for v in value]
-        return word if value == TOP_GROUP and key in ("group", "groups", "name") else value
-
-    return named(report, "")
-
-
-HOW_TO_USE = """import json, numpy as np
-
-faces = json.load(open("faces.json"))
-pose = np.array(faces["target_from_face"]["{face}"])  # 4x4, mm
-xyz_target = pose @ [x, y, 0, 1]  # of a point on face {face}
-
-# 6x6, rotation (rad) before translation (mm)
-covariance = faces["target_from_face_covariance"]["{face}"]"""
-"""Program that reads the result."""
-
-
 def faces_table(faces: dict[str, dict], reference: str) -> Table:
     """Returns the poses of the faces in the target frame, with σ."""
     rows = []
@@ -139,40 +136,27 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
     return Table(["<Face"] + ["x", "y", "z"] * 3, rows, [("", 1), ("mm", 3), ("σ µm", 3), ("σ mdeg", 3)])
 
 
-def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
-    """Returns the faces with σ, the target in space, and how to use the result."""
-    others = [face for face in report["faces"] if face != report["reference_face"]]
-    with_it = "boards and cameras" if words.board else "cameras"
-    origin = "origin circle" if words.point == "circle" else "origin"
-    parts = space_parts(report, colours)
-    space = [
-        macro(
-            "turned",
-            lambda: run_figures.upright(parts, report["scene"]["cameras"]),
-            f"Target, {with_it} in space",
-            [("target", "Target"), ("all", f"With {with_it}")],
-        ),
-        "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
-        legend(colours, "Groups:"),
-    ]
-    use = [
-        subheading("How to use it"),
-        "faces.json beside this page has the pose of each face as a 4×4 matrix, the covariance of each, and the "
-        f"{words.points} in the target frame; `stcal-sfm export RUN` writes it for other programs",
-        macro("verbatim", HOW_TO_USE.replace("{face}", others[0] if others else "")),
-    ]
+def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
+    """Returns the faces with σ, and the target in space."""
+    with_it = "boards and cameras" if has_board(report) else "cameras"
+    views = [("target", "Target"), ("all", f"With {with_it}")]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
-        f"is that of the face's {origin}, σ are one standard deviation, of the position along and of the rotation "
-        "about an axis"
+        "is that of the face's origin, σ are one standard deviation, of the position along and of the rotation about "
+        "an axis. faces.json beside this page has poses, covariances and points; `stcal-sfm export RUN` writes them "
+        "for other programs"
         if report["faces"]
         else "",
         faces_table(report["faces"], report["reference_face"]),
-        columns(space, use) if others else page_only(*space),
+        page_only(
+            macro("turned", partial(space_parts, report, colours), f"Target, {with_it} in space", views),
+            "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
+            legend(colours, "Groups:"),
+        ),
     ]
 
 
-def _faces_in_detail(report: dict, words: Words) -> list[Block]:
+def _faces_in_detail(report: dict) -> list[Block]:
     """Returns what each face rests on, distances between faces, and the ways to each face."""
     rests = [
         [name, *cells(face, "circles circles_of_design plane_rms_um:1 images"), join(face["groups"])]
@@ -188,7 +172,7 @@ def _faces_in_detail(report: dict, words: Words) -> list[Block]:
             off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
             ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
-    found = [f"{words.points.capitalize()} found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
+    found = ["Points found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     return [
         Table(["<Face", *found], rests),
         columns(
@@ -210,30 +194,35 @@ def _faces_in_detail(report: dict, words: Words) -> list[Block]:
     ]
 
 
-def _scale(report: dict, words: Words) -> list[Block]:
-    """Returns λ and the board's residuals of each group."""
-    by_rows = [("λ, by rows (mm/unit)", "mm_per_unit_rows:6"), ("Rows", ""), ("Difference (ppm)", "difference_ppm:1")]
-    columns_of = [
-        ("λ, least squares (mm/unit)", "mm_per_unit:6"),
-        *(by_rows if words.board else ()),
-        ("σ (ppm)", "sigma_ppm:1"),
-        ("Dots" if words.board else "Points", "dots"),
-        ("Residual, mean (µm)", "board_mean_um:1"),
-        ("± (µm)", "board_spread_um:1"),
-        ("Residual, RMS (µm)", "board_rms_um:1"),
-    ]
-    rows = []
+def _scale(report: dict) -> list[Block]:
+    """Returns λ and the board's residuals of each group, the plots of all on one scale."""
+    rows, boards = [], {}
     for group in report["groups"]:
-        scale = group["scale"]
-        most = max((math.hypot(*v) for v in scale["board_residuals_um"].values()), default=None)
-        two = " and ".join(str(row) for row in scale["rows"])
-        own = [value for _, spec in columns_of for value in (cells(scale, spec) if spec else [two])]
-        rows.append([group["name"], *own, number(most, 1)])
-    pictures = _board_residuals(report["groups"])
-    without = (
-        "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
-        "between points: they stand for the dots in this table"
-    )
+        scale, by_rows = group["scale"], [NONE] * 3
+        if scale.get("source", "board") == "board":
+            boards[group["name"]] = scale
+            mm, off = cells(scale, "mm_per_unit_rows:6 difference_ppm:1")
+            by_rows = [mm, " and ".join(str(row) for row in scale["rows"]), off]
+        (least, *own), vectors = (
+            cells(scale, "mm_per_unit:6 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1"),
+            scale["board_residuals_um"].values(),
+        )
+        most = max((math.hypot(*vector) for vector in vectors), default=None)
+        rows.append([group["name"], least, *by_rows, *own, number(most, 1)])
+    heads = ["<Group", "λ, least squares (mm/unit)", "λ, by rows (mm/unit)", "Rows", "Difference (ppm)", "σ (ppm)",
+             "Points", "Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]  # fmt: skip
+    residuals = [vector for scale in boards.values() for vector in scale["board_residuals_um"].values()]
+    reach = max((math.hypot(*vector[:2]) for vector in residuals), default=0.0)
+    height = max((abs(vector[2]) for vector in residuals), default=0.0)
+    pictures = [
+        plot(
+            partial(board_residuals, scale["board_residuals_um"], reach, height),
+            f"Residual vectors of the board, group {name}",
+            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
+            "",
+        )
+        for name, scale in boards.items()
+    ]
     of_boards = [
         subheading("Board residuals"),
         "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
@@ -241,31 +230,11 @@ def _scale(report: dict, words: Words) -> list[Block]:
         plots(*pictures),
     ]
     return [
-        "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
-        "(first and last row, all pairs). σ is that of λ from the board's stated σ"
-        if words.board
-        else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
-        "distances between points. σ is that of λ from their stated σ",
-        Table(["<Group", *(head for head, _ in columns_of), "Residual, max (µm)"], rows),
-        without if words.board and len(pictures) < len(report["groups"]) else "",
+        "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published (first "
+        "and last row, all pairs); without a board, over the corners of printed faces or the known distances between "
+        "points. σ is that of λ from their stated σ",
+        Table(heads, rows),
         *(of_boards if pictures else []),
-    ]
-
-
-def _board_residuals(groups: list[dict]) -> list[Html]:
-    """Returns the plots of the boards' residuals, all on one scale."""
-    scales = {each["name"]: each["scale"] for each in groups if each["scale"].get("source", "board") == "board"}
-    vectors = [vector for scale in scales.values() for vector in scale["board_residuals_um"].values()]
-    reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
-    height = max((abs(vector[2]) for vector in vectors), default=0.0)
-    return [
-        plot(
-            partial(run_figures.board_residuals, scale["board_residuals_um"], reach, height),
-            f"Residual vectors of the board, group {name}",
-            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
-            "",
-        )
-        for name, scale in scales.items()
     ]
 
 
@@ -309,45 +278,10 @@ def _by_label(planes: dict[str, list]) -> Block:
     return columns(*([subheading(name), Table(heads, rows)] for name, rows in planes.items()), css="columns small")
 
 
-def _focus(report: dict) -> list[Block]:
-    """Returns what was corrected for blur that varies across a circle."""
-    if not report.get("focus"):
-        return []
-    rows = []
-    for row in report["focus"]:
-        (near, far), (near_px, far_px) = row["depth_mm"], row["blur_px"]
-        depths = [number(near, 0), number(near_px, 2), number(far, 0), number(far_px, 2)]
-        rows.append([row["image"], number(row["focused_mm"], 0), *depths, number(row["shift_px"], 4)])
-    heads = ["<Image", "In focus at (mm)", "Nearest circle (mm)", "Its blur (px)", "Farthest (mm)", "Its blur (px)"]
-    return [
-        "Out of focus the blur grows with the distance from the plane of focus, also across a tilted circle, whose "
-        "centre then seems to lie nearer to its blurrier side. Centres are corrected for it, and what is uncertain of "
-        "it is in their σ",
-        Table([*heads, "Largest correction (px)"], rows),
-    ]
-
-
-def _pairs(report: dict) -> list[Block]:
-    """Returns how each group's mapping began."""
-    rows = []
-    for group in report["groups"]:
-        pair = group["pairs"][0]
-        angle = number(math.degrees(pair["median_angle_rad"]), 2)
-        start = [f"{pair['first']} and {pair['second']}", angle, group["seeded"], group["rounds"]]
-        rows.append([group["name"], len(group["images"]), join(group["faces"]), group["points"], *start])
-    heads = ["<Group", "Images mapped", "<Faces", "Points", "<Chosen pair", "Angle (°)", "<Started from", "Rounds"]
-    return [
-        "Each group starts from the pair of images with the largest median ray angle that is still safe "
-        f"({report['options']['max_pair_angle_deg']:.1f}° at most)",
-        Table(heads, rows),
-    ]
-
-
-def _left_out(report: dict, words: Words) -> list[Block]:
+def _left_out(report: dict) -> list[Block]:
     """Returns all that was left out, with reasons, and the notes."""
     left, unseen = report["left_out"], report["summary"]["faces_not_seen"]
     blocks: list[Block] = []
-    points = words.points.capitalize()
     circles: dict[tuple[str, str], list[str]] = {}
     for circle in left["circles"]:
         circles.setdefault((circle["image"], circle["reason"]), []).append(circle["label"])
@@ -355,7 +289,7 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     for title, heads, rows in (
         ("Files", ["<File", "<Reason"], [cells(row, "name reason") for row in left["files"]]),
         ("Images", ["<Image", "<Reason"], [cells(row, "name reason") for row in left["images"]]),
-        (points, ["<Image", "Number", f"<{points}", "<Reason"], of_circles),
+        ("Points", ["<Image", "Number", "<Points", "<Reason"], of_circles),
         ("Notes on images", ["<Image", "<Note"], [cells(row, "image note") for row in left["notes"]]),
         ("Notes on the whole run", ["<No.", "<Note"], [[i, note["note"]] for i, note in enumerate(report["notes"], 1)]),
     ):
@@ -364,3 +298,298 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     if unseen:
         blocks.append(f"Faces of the design that are not in the result: {join(unseen)}")
     return blocks or ["Nothing was left out"]
+
+
+def trust(report: dict, judgement: Judgement) -> list[Block]:
+    """Returns for what σ hold, and the worst value of each kind."""
+    summary, options = report["summary"], report["options"]
+    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
+    if options["solve"] != "joint":
+        scope = (
+            "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
+            "the given intrinsics: an error of the camera calibration goes into the faces"
+        )
+    elif judgement.verdict == "no":
+        scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
+    else:
+        refined = options.get("refine_camera", False)
+        absent = [] if refined else ["the camera calibration"]
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if has_board(report) else []
+        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
+        scope += (
+            f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
+        )
+    factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
+    larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
+    of_groups = f"group by group, residuals are {larger} the centres' own σ"
+    if sigma0 is not None:
+        of_groups += (
+            f". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = {sigma0:.2f}; near 1, "
+            "all observations agree with one another. The σ of the faces include that factor, and σ₀ too where it is "
+            f"above 1: small residuals make no σ smaller. `budget` states the latter as {max(1.0, sigma0):.3f}"
+        )
+    single = [face for face, chains in report["chains"].items() if len(chains) == 1]
+    one_way = "reached by only one chain, so that no second chain confirms them: face"
+    return [scope, of_groups, f"{one_way} {join(single)}" if single else ""]
+
+
+def settings(report: dict) -> list[list[str]]:
+    summary, options, camera = report["summary"], report["options"], report["camera"]
+    left_out, last_move = report["left_out"], summary["last_move_px"]
+    sizes = " × ".join(str(size) for size in camera["size_px"])
+    solve, frame = str(options["solve"]), str(options["frame"])
+    round_ = not report["faces"] or not report["faces"].keys() <= set(summary.get("printed_faces", []))
+    single = sum(row.get("gate") == "views" for row in left_out["circles"])
+    eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
+    rows = [
+        ["Solve", SOLVES.get(solve, solve)],
+        ["Face frames", FRAMES.get(frame, frame) if round_ else "those of their drawings"],
+        ["Eccentricity", eccentricity if round_ else ""],
+        ["Surface", f"luminous, behind rims of {rim:.3f} mm" if (rim := summary.get("rim_mm")) else ""],
+        ["Dots of the board", f"behind rims of {rim:.3f} mm" if (rim := summary.get("dot_rim_mm")) else ""],
+        ["Reference face", report["reference_face"]],
+        ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
+        ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
+        ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
+        [
+            "Left out",
+            f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
+            f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows",
+        ],
+        ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
+        [
+            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
+            f"{camera['model']}, {sizes} px",
+        ],
+        ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
+        ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
+        ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
+        ["Program", f"stcal {report['version']}"],
+    ]
+    return [[name, value] for name, value in rows if value]
+
+
+def crosscheck_section(check: dict) -> list[Block]:
+    """Returns the section on the cross-check with the native COLMAP."""
+    mapping = check["mapping"]
+    names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
+    models = [
+        [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
+        for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
+    ]
+    largest = ""
+    if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
+        largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
+    rows = [[face] for face in mapping["faces"]]
+    for row, key in product(rows, ("mapping", "result", "plain")):
+        entry = check[key]["faces"].get(row[0])
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3 sigmas:2")] if entry else [NONE] * 3
+    over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
+    return [
+        f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
+        f"{check['schema']} for the native one), initial pairs and thresholds",
+        alarms([f"They differ: {'; '.join(check['differences'])}."]) if check["differences"] else "They agree",
+        Table(["<Model", "Images", "Residual RMS (px)"], models),
+        subheading("Faces"),
+        "Differences in the target frame: the two programs' models as COLMAP adjusts them; the native models against "
+        "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
+        "deviations. The third has no tolerance: it shows what weights and the joint adjustment are worth",
+        Table(["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3, rows, over),
+        subheading("Cameras"),
+        "Native against pycolmap, against the target, and in σ of the camera in its group. They matter only if faces "
+        f"move with them, which the table of faces shows{largest}",
+        *check["notes"],
+    ]
+
+
+FIRST_NAMES = 6
+"""Number of names that a row has room for."""
+
+
+def checks_section(rows: list[dict]) -> list[Block]:
+    """Returns the checks that did not pass; the others, and what all of them measured, folded."""
+    checks = sorted(map(Check.read, rows), key=lambda check: ORDER.index(check.verdict))
+    heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
+    is_open = [check.verdict in ("failed", "suspicious") for check in checks]
+    open_, others = ([_check_row(c) for c, own in zip(checks, is_open, strict=True) if own is k] for k in (True, False))
+    measured = [
+        [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
+        for check in checks
+        for m in check.measured
+    ]
+    return [
+        f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
+        "images or points it tested",
+        Table(heads, open_, css="text"),
+        fold(
+            f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
+        ),
+        fold(
+            "What was measured",
+            Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
+        ),
+    ]
+
+
+def _check_row(check: Check) -> list:
+    surplus = len(check.names) - FIRST_NAMES
+    names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
+    value = check.measured[0].texts() if check.measured else [NONE, NONE]
+    return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
+
+
+def published_section(comparison: dict) -> list[Block]:
+    """Returns the gain of each step from the published method to this result."""
+    heads, rows = comparison_cells(comparison)
+    return [
+        "The same photographs by the method of Zhang & Wei (2017) as published, and with one more step of this "
+        "package in each row. The last row is this result. All have three-point frames. Faces: distance of the origin "
+        "from that of the last row. Compared with σ of the last row, it shows what each step is worth here",
+        Table(heads, rows),
+        alarms([f"{row['method']}: {row['reason']}." for row in comparison["rows"] if row["reason"]]),
+    ]
+
+
+def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:
+    """Draws residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
+    ``residuals_um``: (3,) by ``board:row:column``; ``reach_um``: drawn as long as the pitch; ``height_um``: end of the
+    colour scale."""
+    cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
+    vectors = _points(residuals_um.values())
+    per_cell = reach_um if reach_um > 0 else 1.0
+    height_um = height_um if height_um > 0 else 1.0
+    bar_um = round_below(per_cell)
+    drawing = Drawing(4.3, 3.5)
+    last = cells.max(0) if len(cells) else np.zeros(2)
+    pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
+    box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
+    axes = Axes(drawing, box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
+    marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
+    rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
+    axes.frame("column", "row", "", columns, rows, SMALL)
+    places = axes.at(cells[:, 1], cells[:, 0])
+    colours = mixed_names((1 + vectors[:, 2] / height_um) / 2, RED_BLUE)
+    drawing.discs(places, min(2.75, 0.25 * pitch), colours, "#777777")
+    drawing.lines(arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
+    bar = axes.at([0, bar_um / per_cell], last[0] + 1.45)
+    drawing.lines([bar], INK, 2.5)
+    drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", SMALL + 1, "start")
+    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), -height_um, height_um, "z, µm", RED_BLUE)
+    return drawing
+
+
+def _points(places: Iterable) -> np.ndarray:
+    """Returns places as an array (n, 3), also if there are none."""
+    return np.array(list(places), float).reshape(-1, 3)
+
+
+def _length(share: float, points: np.ndarray) -> float:
+    """Returns a share of the largest extent of points along an axis, mm; 1 if there are none."""
+    return share * float(np.ptp(points, axis=0).max()) if len(points) else 1.0
+
+
+def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
+    """Returns the path of a camera's pyramid; rows of ``axes`` are the camera's axes, with Z as viewing direction."""
+    at, axes = np.array(pose["position_mm"], float), np.array(pose["axes"], float)
+    half = depth * np.array(camera["size_px"]) / (2 * np.array(camera["focal_px"]))
+    around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    corners = [at + depth * axes[2] + sx * half[0] * axes[0] + sy * half[1] * axes[1] for sx, sy in around]
+    sides = [place for k in range(4) for place in (at, corners[k], corners[k - 3])]
+    return [*sides, at, at + 2.2 * depth * axes[2]]
+
+
+DIGITS = 2
+"""Number of decimals of coordinates in mm: far finer than a screen shows."""
+AXIS = 0.2
+"""Length of the faces' axes, as a share of the target's extent."""
+CAMERA = 0.07
+"""Depth of a camera's pyramid, as a share of the scene's extent."""
+SHEET = "#7f93a8"
+
+
+def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
+    """Returns the parts to be drawn in the target frame: ``kind`` (``line``, ``sheet``, ``point``, ``text``), ``xyz``
+    (mm), ``colour``, and for some ``name``, ``size`` (px) and ``target``: whether the part belongs to the target."""
+    scene = report["scene"]
+    parts = _faces(scene["circles"], report["faces"])
+    for label, xyz in scene["circles"].items():
+        parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True))
+    for group, dots in scene["boards"].items():
+        parts += [_part("point", [xyz], colours.get(group, INK), size=1.2) for xyz in dots]
+        if len(dots):
+            parts.append(_part("text", [np.mean(dots, axis=0)], colours.get(group, INK), name=f"group {group}"))
+    places = [view["position_mm"] for view in scene["cameras"]]
+    everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
+    depth = _length(CAMERA, everything)
+    for camera in scene["cameras"]:
+        path, colour = frustum(camera, report["camera"], depth), colours.get(camera["group"], INK)
+        parts.append(_part("line", path, colour, name=camera["image"], size=1.1))
+    return parts
+
+
+def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict]:
+    """Returns sheet, axes and name of each face."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    reach, parts = _length(AXIS, _points(circles.values())), []
+    for name, face in faces.items():
+        centres = _points(place for label, place in circles.items() if parse_label(label).plane == name)
+        pose = np.array(face["target_from_face"], float)
+        origin = pose[:3, 3]
+        with suppress(QhullError, ValueError):  # circles that do not span the plane
+            hull = ConvexHull((centres - origin) @ pose[:3, :2])
+            parts.append(_part("sheet", centres[hull.vertices], SHEET, target=True))
+        for axis, colour in enumerate(AXIS_COLOURS):
+            parts.append(_part("line", [origin, origin + reach * pose[:3, axis]], colour, size=1.6, target=True))
+        middle = centres.mean(0) if len(centres) else origin
+        parts.append(_part("text", [middle + 0.9 * reach * pose[:3, 2]], "#1c2733", name=name, target=True))
+    return parts
+
+
+def _part(kind: str, xyz, colour: str, **more) -> dict:
+    return {"kind": kind, "xyz": np.round(np.asarray(xyz, float), DIGITS).tolist(), "colour": colour, **more}
+
+
+def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> dict:
+    """Returns all photographs that the page shows, with vectors on one scale.
+
+    ``each`` : of each its ``name``, what was found in it, its JPEG as a data URI, and the path of its ``vectors``;
+    ``box`` : the images' place in px, pixel centres integer; ``aspect`` : width by height; ``factor`` : by which all
+    vectors are lengthened, 0 if there are none; ``stroke`` : width of their lines, px; ``bar`` : path of a bar, as long
+    as the vector of a residual of ``bar_px``.
+    """
+    width, height = report["camera"]["size_px"]
+    mapped = {row["image"]: row for row in report["residuals_by_image"]}
+    lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])
+    usual = float(np.quantile(lengths, 0.95)) if len(lengths) else 0.0
+    factor = round_below(LONGEST * width / usual) if usual > 0 else 0.0
+    bar_px = round_below(LONGEST * width / factor) if factor else 0.0
+    each = []
+    for name, jpeg in overlays.items():
+        entry = mapped.get(name)
+        says = f"{entry['observations']} centres, {number(entry['rms_px'], 4)} px RMS" if entry else "not mapped"
+        lines = residuals.get(name, np.zeros((0, 4))).tolist()
+        vectors = "".join(f"M{x:.1f} {y:.1f}l{factor * dx:.1f} {factor * dy:.1f}" for x, y, dx, dy in lines)
+        uri = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+        each.append({"name": name, "says": says, "jpeg": uri, "vectors": vectors})
+    return {
+        "each": each,
+        "box": f"-0.5 -0.5 {width} {height}",
+        "aspect": round(width / height, 5),
+        "factor": factor,
+        "stroke": round(width / 450, 2),
+        "bar": f"M{0.98 * width:.1f} {0.97 * height:.1f}h{-factor * bar_px:.1f}",
+        "bar_px": bar_px,
+    }
+
+
+def shown_overlays(report: dict) -> list[str]:
+    """Returns the names of the images whose overlays the page shows; of a large set, those that deserve a look."""
+    names = [image["name"] for image in report["images"]]
+    if len(names) <= FIRST_IMAGES:
+        return names
+    worst = {row["image"]: row["max_px"] for row in report["residuals_by_image"]}
+    noted = {note["image"] for note in report["left_out"]["notes"]}
+    ranked = sorted(names, key=lambda name: (name in worst, name not in noted, -worst.get(name, 0.0)))
+    chosen = set(ranked[:FIRST_IMAGES])
+    return [name for name in names if name in chosen]

@@ -55,8 +55,7 @@ from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.judgement import Judgement, judged
-from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, shown_overlays
-from stcal.sfm.report.run_page import report_html
+from stcal.sfm.report.run_page import FIRST_IMAGES, Residuals, report_html, shown_overlays
 from stcal.sfm.runs.report_file import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.run_result import AnyRun, RunResult, SavedRun, folder_of
 from stcal.sfm.runs.run_text import found_in_all

@@ -13,11 +13,9 @@ from stcal.errors import StcalError
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.sfm.budget import combine
-from stcal.sfm.budget.budget_file import BudgetFile, _unusual
+from stcal.sfm.budget.budget_file import BudgetFile, against_stated
 from stcal.sfm.budget.budget_page import budget_report
-from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.length_test import against_stated
-from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
+from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
@@ -315,8 +313,6 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     ("content", "words"),
     [
         ("[board]\npitch_sigma_ppm = 30e-6\n", "30, and in % 0.3;"),
-        ('[fields]\ndate = "2999-01-01"\n', "2999-01-01: in the future"),
-        ('[fields]\ndate = "05.01.2031"\n', "YYYY-MM-DD"),
         ("[board]\ntemperature_c = 295.65\n", "22.5 °C"),
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
         ("[target]\nexpansion_ppm_per_k = 0.000023\n", "2.3e-05 1/K is 23;"),
@@ -354,13 +350,3 @@ def test_a_sigma_as_files_are_written_with_counts_as_assumed(small_run, stcal_sf
     rows = {row["key"]: row for row in json.loads(out.read_text())["sources"]}
     assert rows["board_dots"]["origin"] == "assumed"
     assert "the default" in rows["board_dots"]["words"]
-
-
-def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():
-    def asked(**values) -> list[str]:
-        return _unusual(Statement(StatedSize(**values), StatedSize(), {}, {}, False))
-
-    assert asked(temperature_c=23.0, temperature_sigma_k=0.5, expansion_ppm_per_k=70.0) == []
-    assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
-    assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
-    assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]

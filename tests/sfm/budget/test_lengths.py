@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.errors import StcalError
-from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.length_test import SHARED, against_run, against_stated
-from stcal.sfm.budget.sources import statement_of
+from stcal.sfm.budget.budget_file import SHARED, against_run, against_stated
+from stcal.sfm.budget.combine import budget_of_run, longest_of, statement_of
 from tests.outcome import INPUT, assert_error
 
 PITCH = "[board]\npitch_sigma_ppm = 50.0\n"

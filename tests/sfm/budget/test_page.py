@@ -54,15 +54,9 @@ def test_a_pdf_stands_beside_a_page(stcal_sfm, small_run, tmp_path):
 @pytest.mark.parametrize(
     ("value", "shown"), [(14.26, "14"), (9.96, "10"), (0.01234, "0.012"), (126.0, "130"), (None, "–")]
 )
-def test_uncertainties_have_two_significant_digits(value, shown):
+def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_of_them(value, shown):
     assert significant(value) == shown
-
-
-@pytest.mark.parametrize(
-    ("value", "expanded", "shown"), [(166.18664, 0.031, "166.187"), (236.457, 15.0, "236"), (1.23456, 0.0, "1.2346")]
-)
-def test_values_end_with_the_last_digit_of_their_uncertainty(value, expanded, shown):
-    assert as_exact(value, expanded) == shown
+    assert [as_exact(166.18664, 0.031), as_exact(236.457, 15.0), as_exact(1.23456, 0.0)] == ["166.187", "236", "1.2346"]
 
 
 def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_path):

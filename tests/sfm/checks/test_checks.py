@@ -23,7 +23,7 @@ from stcal.sfm.checks.significance import MOST_ENLARGED, Trial, culprits, judge
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
-from stcal.sfm.report.sections import checks_section
+from stcal.sfm.report.run_page import checks_section
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene

@@ -186,19 +186,14 @@ def content_of_gltf(path) -> tuple[dict, bytes]:
         ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
         ("box.csv", "", "", "E-FRAME-NAME … --name … ''"),
         ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
+        ("mine.csv", "", "target", "E-OUTPUT-EXISTS"),
     ],
 )
 def test_refused(small_run, tmp_path, name, form, root, said):
+    (tmp_path / "mine.csv").write_text("mine", encoding="utf-8")
     with fails_with(said):
         export_run(small_run, tmp_path / name, form, root)
-
-
-def test_nothing_is_overwritten(small_run, tmp_path):
-    path = tmp_path / "box.urdf"
-    path.write_text("mine", encoding="utf-8")
-    with fails_with("E-OUTPUT-EXISTS"):
-        export_run(small_run, path)
-    assert path.read_text(encoding="utf-8") == "mine"
+    assert (tmp_path / "mine.csv").read_text(encoding="utf-8") == "mine"
 
 
 def test_the_form_may_be_told(small_run, tmp_path, faces):

@@ -6,16 +6,14 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.sfm.interop.export_model import export_model
+from stcal.sfm.interop.export_colmap import export_model
 from tests.outcome import fails_with
 from tests.shared import own_copy, unsealed_copy
 
@@ -161,8 +159,7 @@ def test_colmap_has_the_runs_circles_poses_and_keypoints(exported, known, keypoi
             assert np.abs(point.xy - 0.5 - keypoints[name, k][1]).max() < AGAIN_PX
 
 
-@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
-def test_native_colmap_reads_it(exported, kind, tmp_path):
+def test_native_colmap_reads_it(exported, tmp_path):
     """Another version than pycolmap's, 3.8 for one, which knows no rigs and frames and passes over their files."""
     if not shutil.which("colmap"):
         pytest.skip("no colmap program")
@@ -174,13 +171,13 @@ def test_native_colmap_reads_it(exported, kind, tmp_path):
         )
         return done.stdout + done.stderr
 
-    ours = pycolmap.Reconstruction(str(exported[kind]))
-    said = colmap("model_analyzer", "--path", exported[kind])
+    ours = pycolmap.Reconstruction(str(exported["colmap-bin"]))
+    said = colmap("model_analyzer", "--path", exported["colmap-bin"])
     number = {key: float(re.search(rf"{key}: ([\d.]+)", said)[1]) for key in ("Registered images", "Points", "error")}
     assert number["Registered images"] == ours.num_reg_images()
     assert number["Points"] == ours.num_points3D()
     assert number["error"] == pytest.approx(ours.compute_mean_reprojection_error(), abs=2e-6)
-    colmap("model_converter", "--input_path", exported[kind], "--output_path", tmp_path, "--output_type", "TXT")
+    colmap("model_converter", "--input_path", exported["colmap-bin"], "--output_path", tmp_path, "--output_type", "TXT")
     for line in (tmp_path / "points3D.txt").read_text(encoding="ascii").splitlines():
         if not line.startswith("#"):
             point_id, *xyz = line.split()[:4]
@@ -217,24 +214,6 @@ def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keyp
     # The lens stretches residuals by a few per cent.
     assert np.sqrt(np.mean(np.square(residuals))) == pytest.approx(own["residual_rms_px"], rel=0.1)
     assert own["residual_rms_px"] < 0.02
-
-
-def test_two_focal_lengths_become_one(own, tmp_path, keypoints):
-    model = read_camera(own / "inputs/cameras.txt")
-    camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
-    write_cameras_txt(own / "inputs/cameras.txt", camera)
-    native = pycolmap.Reconstruction(str(own / "colmap/target_model"))
-    native.camera(1).params = camera.colmap_params()
-    native.write_binary(str(own / "colmap/target_model"))
-    written = export_model(own, tmp_path / "model.nvm", "nvm")
-    assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
-    cameras, points = read_nvm(tmp_path / "model.nvm")
-    for _, _, views in points:
-        for i, k, x, y in views:
-            name, focal, *_ = cameras[i]
-            assert focal == written.focal_px
-            seen = camera.pixel_from_normalised(np.array([x, y]) / focal)
-            assert np.abs(seen - keypoints[name, k][1]).max() < AGAIN_PX
 
 
 def test_a_model_that_was_changed_is_refused(small_run, tmp_path):

@@ -14,8 +14,8 @@ import pycolmap
 import pytest
 
 from stcal.errors import InputError
-from stcal.sfm.interop.export_database import export_database
-from stcal.sfm.interop.native import calibrate_models, faces_from_models
+from stcal.sfm.interop.crosscheck import calibrate_models, faces_from_models
+from stcal.sfm.interop.export_colmap import export_database
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import seeded_mapping
 from stcal.sfm.mapping.models import open_model, read_model, write_model

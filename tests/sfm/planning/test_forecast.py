@@ -196,9 +196,9 @@ def after(known: KnownRun, views: list[PlannedView], now: Forecast) -> Forecast:
     return forecast(list(models.values()), known.setup, now.derivatives)
 
 
-@pytest.mark.parametrize("flatness_mm", [None, 0.01])
-@pytest.mark.parametrize("common", [0.0, 0.6])
-@pytest.mark.parametrize("refined", [False, True])
+@pytest.mark.parametrize(
+    ("flatness_mm", "common", "refined"), [(None, 0.0, False), (0.01, 0.6, False), (None, 0.6, True), (0.01, 0.0, True)]
+)
 def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, common, refined):
     prior = CameraPrior("OPENCV", np.diag([2.0] * 4 + [1e-3] * 4) ** 2) if refined else None
     setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
@@ -238,16 +238,6 @@ def offered(known):
     return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
 
 
-@pytest.mark.slow
-def test_an_advised_view_beats_a_random_one(known, advice):
-    views = [view for _, own in offered(known) for view in own]
-    picked = np.random.default_rng(5).choice(len(views), 20, replace=False)
-    random = [after(known, [views[i]], advice.now).worst()[1] for i in picked]
-    now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
-    assert best <= min(random)
-    assert (now - best) > 1.5 * (now - np.mean(random)) > 0
-
-
 @pytest.fixture
 def coarse(monkeypatch):
     monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 50.0)
@@ -277,12 +267,11 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     assert group.sigma_mm == pytest.approx(forecast(known.models, known.setup).worst()[1], rel=0.15)
 
 
-@pytest.mark.parametrize(("grid_deg", "least"), [(25.0, 4), pytest.param(10.0, 20, marks=SLOW)])
-def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, least):
+def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", grid_deg)
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
     for model, own in offered(known):
-        assert len(own) > least
+        assert len(own) > 4
         for view in own:
             assert not {"2", "4"} <= view.tilts_deg.keys()
             assert sum(model.labels[i].startswith("board:") for i in view.model.point_index) == 63
@@ -298,19 +287,11 @@ def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
 
 
-def test_advise_takes_a_run_and_its_folder(small_run, monkeypatch):
-    """As :func:`stcal.sfm.load_run` returns it; what is chosen is tested with the geometry."""
-    monkeypatch.setattr("stcal.sfm.planning.advise.forecast", lambda models, *_, **__: {}[len(models)])
-    for given in (load_run(small_run), small_run, str(small_run)):
-        with pytest.raises(KeyError, match="2"):
-            advise(given, 1)
-
-
 def test_a_plan_takes_a_camera_as_its_file():
     camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
     target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
     for given in (camera, model_of(camera)):
-        assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
+        assert session._beside_board(PlanOptions(images=2, camera=given), target, board, None)[0].camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
         assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
 
@@ -438,8 +419,7 @@ def test_plan_needs_the_size_of_the_camera():
         PlanOptions(camera=camera)
 
 
-@pytest.mark.parametrize("common", [0.0, 0.99])
-@pytest.mark.parametrize("refined", [False, True])
+@pytest.mark.parametrize(("common", "refined"), [(0.0, True), (0.99, False)])
 def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, common, refined):
     """To rounding: the two ways differ in the order of elimination alone."""
     prior = CameraPrior("OPENCV", np.diag([1, 1, 1, 1, 1e-6, 1e-6, 1e-8, 1e-8])) if refined else None
@@ -463,12 +443,11 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
 
 
-@pytest.mark.parametrize("one_board", [True, False])
-def test_a_fine_board_is_forecast_by_some_of_its_dots(one_board, monkeypatch):
+def test_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
     """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
     board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
     board = replace(board, corner_radius_mm=None)
-    options, target = PlanOptions(images=4, one_board=one_board), reference_target()
+    options, target = PlanOptions(images=4), reference_target()
     some = make_plan(options, target, board, target.rough_poses())
     monkeypatch.setattr(session, "MOST_DOTS", 1000)
     every = make_plan(options, target, board, target.rough_poses())

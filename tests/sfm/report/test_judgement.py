@@ -1,6 +1,7 @@
 """The report in four sentences."""
 
 import copy
+import re
 
 import pytest
 
@@ -151,9 +152,6 @@ def test_without_sigma():
     found = judgement_of(own)
     assert (found.verdict, found.position_sigma_um, found.position_face) == ("with care", None, None)
     assert "--solve joint" in found.next
-    (way,) = own["chains"]["2"]
-    own["chains"]["2"] = [way, way | {"translation_mm": 0.02004}]
-    assert "up to 20.0 µm and 7.25 mdeg off" in judgement_of(own).quality
 
 
 def test_the_board_alone_and_one_face():
@@ -178,16 +176,6 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
     assert judgement_of(own).use == "With care: focus changed, though no check failed."
 
 
-def test_blur_that_limits_is_said_before_more_images():
-    own = report()
-    own["focus"] = [{"blur_px": [2.5, 1.5]}]
-    told = judgement_of(own)
-    assert told.limit.startswith("The sharpness: edges are blurred by 2.0 px")
-    assert "Nothing has to be done" not in told.next
-    own["focus"] = [{"blur_px": [0.9, 0.8]}]
-    assert "sharpness" not in judgement_of(own).limit
-
-
 def test_a_difference_from_the_native_program_calls_for_care():
     found = judgement_of(report() | {"crosscheck": {"differences": ["face 2 is 9 µm off"]}})
     assert found.verdict == "with care"
@@ -198,7 +186,8 @@ def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
-    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; faces 5, 6")
+    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; ")
+    assert "faces 5, 6" in told.use
     assert "4 of the 6 faces" in told.limit
     assert told.next.startswith("Photograph faces 5, 6")
     assert told.next.endswith("For 2 more checks: add a group.")
@@ -234,7 +223,7 @@ def test_a_missing_face_that_was_expected_is_named():
     assert "faces 5, 6" in told.use
     assert "Face 6 should have been photographed" in told.limit
     own["checks"] = [check("a", "failed", remedy="x")]
-    assert "the first: Check a; faces 5, 6 " in judgement_of(own).use
+    assert re.search("the first: Check a; .* faces 5, 6 ", judgement_of(own).use)
 
 
 def test_a_face_that_was_read_and_left_out_is_missing():

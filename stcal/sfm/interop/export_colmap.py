@@ -1,0 +1,443 @@
+"""Export to COLMAP and viewers of its models: the database in the schema of any version, and the final model.
+
+The schemas of the database, as SQL, were read from the empty database that each version itself makes: 3.8 from the
+native program, 3.9 (3.9.1) to 4.2 (4.2.1) from pycolmap. Releases of one version differ in nothing but the last digits
+of ``user_version``, which 4.x stamps as major, minor and patch. The tables of 4.1 are those of 4.0.
+"""
+
+import os
+import re
+import sqlite3
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.camera_model import camera_from_colmap
+from stcal.io.files import TARGET_MODEL, require_unchanged
+from stcal.io.table import csv_text
+from stcal.labels import DotLabel, Label
+from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
+from stcal.sfm.mapping.colmap import pycolmap
+from stcal.sfm.mapping.database import from_colmap_px, write_database
+from stcal.sfm.mapping.models import open_model, require_keypoints, rigid_from_colmap, write_reconstruction
+from stcal.sfm.mapping.pairs import image_graph
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The database schema of a COLMAP version."""
+
+    name: str
+    user_version: int  # the stamp of the version's first release
+    tables: dict[str, str]  # declaration by name
+    indices: dict[str, str]  # table and columns of unique indices by name
+
+    def statements(self) -> list[str]:
+        """Returns the SQL statements that make an empty database."""
+        return [
+            *(f"CREATE TABLE {table} ({declaration})" for table, declaration in self.tables.items()),
+            *(f"CREATE UNIQUE INDEX {index} ON {columns}" for index, columns in self.indices.items()),
+            f"PRAGMA user_version = {self.user_version}",
+        ]
+
+
+_MATRIX = "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
+_IMAGE_KEY = "image_id INTEGER NOT NULL PRIMARY KEY"
+_OF_IMAGE = "FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE"
+_OF_RIG = "FOREIGN KEY (rig_id) REFERENCES rigs (rig_id) ON DELETE CASCADE"
+_SENSOR = "sensor_id INTEGER NOT NULL, sensor_type INTEGER NOT NULL"
+_PAIRS = f"pair_id INTEGER NOT NULL PRIMARY KEY, {_MATRIX}"
+_GEOMETRIES = f"{_PAIRS}, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB"
+_IMAGES = (
+    "image_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, camera_id INTEGER NOT NULL{}, "
+    "UNIQUE (name), CHECK (image_id >= 0 and image_id < 2147483647), "
+    "FOREIGN KEY (camera_id) REFERENCES cameras (camera_id)"
+)
+_PRIOR_POSES = "".join(f", prior_{name} REAL" for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz"))
+_PRIORS = f"{_IMAGE_KEY}, position BLOB, coordinate_system INTEGER NOT NULL"
+
+_CHANGES: dict[str, tuple[int, dict[str, str], dict[str, str]]] = {
+    "3.8": (
+        3800,
+        {
+            "cameras": "camera_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, model INTEGER NOT NULL, "
+            "width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL",
+            "images": _IMAGES.format(_PRIOR_POSES),
+            "keypoints": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
+            "descriptors": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
+            "matches": _PAIRS,
+            "two_view_geometries": _GEOMETRIES,
+        },
+        {"index_name": "images (name)"},
+    ),
+    "3.9": (3900, {}, {}),
+    "3.10": (3900, {"images": _IMAGES.format(""), "pose_priors": f"{_PRIORS}, {_OF_IMAGE}"}, {}),
+    "3.11": (3900, {"pose_priors": f"{_PRIORS}, position_covariance BLOB, {_OF_IMAGE}"}, {}),
+    "3.12": (
+        3900,
+        {
+            "rigs": "rig_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, ref_sensor_id INTEGER NOT NULL, "
+            "ref_sensor_type INTEGER NOT NULL",
+            "rig_sensors": f"rig_id INTEGER NOT NULL, {_SENSOR}, sensor_from_rig BLOB, {_OF_RIG}",
+            "frames": f"frame_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, rig_id INTEGER NOT NULL, {_OF_RIG}",
+            "frame_data": f"frame_id INTEGER NOT NULL, data_id INTEGER NOT NULL, {_SENSOR}, "
+            "FOREIGN KEY (frame_id) REFERENCES frames (frame_id) ON DELETE CASCADE",
+        },
+        {
+            "rig_ref_sensor_assignment": "rigs (ref_sensor_id, ref_sensor_type)",
+            "rig_sensor_assignment": "rig_sensors (sensor_id, sensor_type)",
+            "frame_sensor_assignment": "frame_data (data_id, sensor_type)",
+        },
+    ),
+    "3.13": (3900, {}, {}),
+    "4.0": (
+        4_00_00_00,
+        {
+            "descriptors": f"{_IMAGE_KEY}, type INTEGER NOT NULL, {_MATRIX}, {_OF_IMAGE}",
+            "pose_priors": "pose_prior_id INTEGER NOT NULL PRIMARY KEY, corr_data_id INTEGER NOT NULL, "
+            "corr_sensor_id INTEGER NOT NULL, corr_sensor_type INTEGER NOT NULL, position BLOB, "
+            "position_covariance BLOB, gravity BLOB, coordinate_system INTEGER NOT NULL",
+        },
+        {"pose_prior_data_assignment": "pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type)"},
+    ),
+    "4.1": (4_01_00_00, {}, {}),
+    "4.2": (4_02_00_00, {"two_view_geometries": f"{_GEOMETRIES}, camera1 BLOB, camera2 BLOB"}, {}),
+}
+"""Stamp of each version's first release, and the tables and indices that it added or changed, the oldest first."""
+
+SCHEMAS: dict[str, Schema] = {}
+"""All published schemas by name, the oldest first."""
+_tables, _indices = {}, {}
+for _name, (_stamp, _new_tables, _new_indices) in _CHANGES.items():
+    _tables, _indices = _tables | _new_tables, _indices | _new_indices
+    SCHEMAS[_name] = Schema(_name, _stamp, _tables, _indices)
+
+
+def find_schema(name: str) -> Schema:
+    """Returns the schema of that name."""
+    if name not in SCHEMAS:
+        raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
+    return SCHEMAS[name]
+
+
+def schema_of_version(version: str) -> Schema:
+    """Returns the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and writes."""
+    release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
+    if release is None or release[1] not in SCHEMAS:
+        versions = ", ".join(SCHEMAS)
+        raise InputError(
+            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {versions}"
+        )
+    return SCHEMAS[release[1]]
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """Summary of an exported database."""
+
+    path: Path
+    schema: str
+    images: int
+    pairs: int  # of images with a two-view geometry
+    camera_models: tuple[str, ...]  # COLMAP's names
+
+
+@require_arguments
+def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
+    """Writes the database of a run for another version of COLMAP, with the same ids, orders and values.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file; it appears complete or not at all.
+    schema : str
+        Version of COLMAP that is to open it: ``3.8`` to ``4.2``.
+
+    Raises
+    ------
+    InputError
+        The schema is unknown, or ``out`` exists or cannot be written.
+    """
+    run, out, wanted = saved_run(run), Path(out), find_schema(schema)
+    require_new(out)
+    with _complete(out) as scratch:
+        pairs = write_copy(run, scratch / out.name, wanted)
+    return Exported(out, wanted.name, len(run.observations), pairs, (run.camera.colmap_model,))
+
+
+@contextmanager
+def _complete(*places: Path) -> Iterator[Path]:
+    """Yield a folder for new files or folders, which appear at their places complete or not at all."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{places[-1].name}.partial-", dir=places[-1].parent) as scratch:
+            yield Path(scratch)
+            for place in places:
+                require_free(place, folder=place.is_dir())
+                if place.is_dir():
+                    place.rmdir()  # empty; not every system lets a folder take its place
+                (Path(scratch) / place.name).rename(place)
+    except OSError as error:  # a full disk names no file
+        error.filename = error.filename or str(places[-1])
+        raise
+
+
+def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
+    """Writes a new database of a run's images and labels; returns the number of its pairs.
+
+    It is in rollback-journal mode, which is a single file that any program opens.
+    """
+    own = path.with_name(f"own-{path.name}")
+    pairs = image_graph(run.observations, run.board_design).pairs
+    write_database(own, run.camera, run.observations, pairs, run.corrected_px)
+    try:
+        with closing(sqlite3.connect(path)) as copy, copy:
+            for statement in wanted.statements():
+                copy.execute(statement)
+            copy.commit()
+            copy.execute("ATTACH ? AS own", (str(own),))
+            for table in wanted.tables:
+                theirs, ours = (
+                    [name for _, name, *_ in copy.execute(f"PRAGMA {database}.table_info({table})")]
+                    for database in ("main", "own")
+                )
+                columns = ", ".join(name for name in theirs if name in ours)
+                copy.execute(f"INSERT INTO {table} ({columns}) SELECT {columns} FROM own.{table} ORDER BY rowid")
+    except sqlite3.Error as error:
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"{path}: cannot be written ({error}); check the folder's space and rights"
+        ) from error
+    return len(pairs)
+
+
+def database_text(written: Exported) -> str:
+    """Returns a text on the contents of the copied database, and how to open it."""
+    return (
+        f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
+        f"camera model {', '.join(written.camera_models)}\n"
+        f"open it with: colmap gui --database_path {written.path} --image_path IMAGES"
+    )
+
+
+FORMATS = ("colmap-bin", "colmap-txt", "nvm", "bundler")
+"""Formats of a model. OUT is a folder, but a file for NVM, with ``OUT.labels.csv`` beside it."""
+LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedModel:
+    """Summary of an exported model."""
+
+    path: Path
+    labels: Path
+    images: int
+    points: int
+    focal_px: float | None  # of an ideal camera in place of the run's; None if the format holds the run's camera
+    centre_px: tuple[float, float] | None  # OpenCV pixel origin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    id: int
+    group: str  # empty if several groups share it
+    label: Label
+    xyz: list[float]  # (3,), target frame, mm
+    rgb: tuple[int, int, int]
+    views: tuple[tuple[int, int], ...]  # (image id, keypoint)
+
+
+@require_arguments
+def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
+    """Writes the final model of a run in another program's format: mm, target frame, labels beside it.
+
+    It appears complete or not at all. The model's files must be as the run wrote them.
+
+    NVM and Bundler support one focal length, little distortion and a centred principal point. They get an ideal camera
+    without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
+    undistorted to match.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file for ``nvm``, new or empty folder for the others; missing parent folders are made.
+    form : {"colmap-bin", "colmap-txt", "nvm", "bundler"}
+        The format.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a damaged or changed model, an unknown format, a name that it cannot hold, or ``out``
+        exists.
+    """
+    out, kind, is_folder = Path(out), form, form != "nvm"
+    if kind not in FORMATS:
+        raise InputError("E-OPTION-FORM", f"format {kind}: unknown; give one of {', '.join(FORMATS)}")
+    labels = out / "labels.csv" if is_folder else out.with_name(f"{out.name}.labels.csv")
+    existing = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+    if not existing.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: {existing} is a file; give another place")
+    places = [out] if is_folder else [labels, out]
+    for place in places:
+        require_free(place, folder=is_folder)
+    saved = saved_run(run)
+    reconstruction, points = _labelled_points(saved)
+    (native,) = reconstruction.cameras.values()
+    camera = camera_from_colmap(
+        native.model.name, native.width, native.height, list(native.params), saved.folder
+    ).sized(0, 0)
+    spaced = [image.name for image in saved.observations if " " in image.name]
+    if spaced and kind in ("colmap-txt", "bundler"):
+        raise InputError(
+            "E-MODEL-NAMES",
+            f"format {kind}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
+            "or rename the image and run again",
+        )
+    texts, focal_px = {labels.name: _labels_csv(points, saved.faces, kind)}, float(camera.focal.mean())
+    if kind in IDEAL:
+        images = [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
+        texts |= dict(zip((out.name,) if kind == "nvm" else ("bundle.out", "list.txt"),
+                          IDEAL[kind](images, points, _ideal_views(images, points, camera, focal_px), focal_px),
+                          strict=True))  # fmt: skip
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with _complete(*places) as scratch:
+        folder = scratch / out.name if is_folder else scratch
+        folder.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        if kind not in IDEAL:
+            write_reconstruction(reconstruction, folder, text=kind == "colmap-txt")
+    optics = (focal_px, ((camera.width - 1) / 2, (camera.height - 1) / 2)) if kind in IDEAL else (None, None)
+    return ExportedModel(out, labels, len(reconstruction.reg_image_ids()), len(points), *optics)
+
+
+def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
+    """Returns the run's model with coloured points, and the points by ascending id."""
+    path = run.folder / TARGET_MODEL
+    if not path.is_dir():
+        raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
+    for file in path.iterdir():
+        require_unchanged(file)
+    reconstruction = open_model(path)
+    observations = {image.name: (image, xy) for image, xy in zip(run.observations, run.corrected_px, strict=True)}
+    image_of = {}
+    for image_id, image in reconstruction.images.items():
+        if image.name not in observations:
+            fault = f"image {image.name} is not as in the run's labels.csv"
+            raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
+        image_of[image_id], corrected_px = observations[image.name]
+        require_keypoints(path, image, image_of[image_id].labels, corrected_px)
+    rgb = colours(run)
+    points = []
+    for point_id, point in sorted(reconstruction.points3D.items()):
+        views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
+        names = {image_of[image_id].labels[k] for image_id, k in views}
+        if len(names) != 1:
+            fault = f"point {point_id} is of {len(names)} labels, 1 needed"
+            raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
+        label = names.pop()
+        groups = {image_of[image_id].group for image_id, _ in views}
+        colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
+        point.color = np.array(colour, np.uint8)
+        group = groups.pop() if len(groups) == 1 else ""
+        points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))
+    return reconstruction, points
+
+
+def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
+    """Returns ``labels.csv``. Its first column is the point's id in COLMAP's files, in others its index from 0."""
+    covariance = faces.circle_covariance_mm2
+    rows: list[Sequence] = [LABEL_COLUMNS]
+    for place, point in enumerate(points):
+        sigma = [""] * 3
+        if point.label in covariance:
+            sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
+        name = point.id if kind.startswith("colmap") else place
+        rows.append([name, point.group, point.label, *map(repr, point.xyz), *sigma])
+    return csv_text(rows)
+
+
+View = tuple[int, int, float, float]
+"""Place of the image, keypoint, and x and y in the ideal camera, px, relative to the principal point, y down."""
+
+
+def _ideal_views(
+    images: Sequence[pycolmap.Image], points: Sequence[_Point], camera: Camera, focal_px: float
+) -> list[list[View]]:
+    """Returns the views of every point in the ideal camera."""
+    place = {image.image_id: i for i, image in enumerate(images)}
+    xy_px = np.concatenate([[images[place[i]].points2D[k].xy for i, k in point.views] for point in points])
+    ideal = iter((focal_px * camera.normalised_from_pixel(from_colmap_px(xy_px))).tolist())
+    return [
+        [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, ideal, strict=False)]  # which goes on
+        for point in points
+    ]
+
+
+def _nvm(
+    images: Sequence[pycolmap.Image], points: Sequence[_Point], views: Sequence[list[View]], focal_px: float
+) -> tuple[str]:
+    """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
+    MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
+    lines = ["NVM_V3 ", " ", f"{len(images)}  "]
+    for image in images:
+        x, y, z, w = image.cam_from_world().rotation.quat.tolist()
+        centre = image.projection_center().tolist()
+        lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
+    lines += ["", str(len(points))]
+    for point, own in zip(points, views, strict=True):
+        lines.append(_numbers(*point.xyz, *point.rgb, len(own), *chain(*own)))
+    return ("\n".join([*lines, "", "0", ""]),)
+
+
+def _bundler(
+    images: Sequence[pycolmap.Image], points: Sequence[_Point], views: Sequence[list[View]], focal_px: float
+) -> tuple[str, str]:
+    """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
+    lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
+    up_from_down = np.diag([1.0, -1.0, -1.0])
+    for image in images:
+        pose = rigid_from_colmap(image.cam_from_world())
+        rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
+        lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
+    for point, own in zip(points, views, strict=True):
+        up = chain(*((i, k, x, -y) for i, k, x, y in own))
+        lines += [_numbers(*point.xyz), _numbers(*point.rgb), _numbers(len(own), *up)]
+    return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
+
+
+def _numbers(*values: float) -> str:
+    """Returns the shortest text that reads back as the same numbers."""
+    return " ".join(map(repr, values))
+
+
+IDEAL = {"nvm": _nvm, "bundler": _bundler}
+"""Writers of the formats that know an ideal camera alone."""
+
+
+def model_text(written: ExportedModel, kind: str) -> str:
+    """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
+    lines = [
+        f"{written.images} images and {written.points} points; mm, target frame: {written.path}",
+        f"labels: {written.labels}",
+    ]
+    if written.focal_px is not None and written.centre_px is not None:
+        x, y = written.centre_px
+        lines.append(
+            f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "
+            f"camera without distortion, f = {written.focal_px:.4f} px, principal point ({x:g}, {y:g}) px; undistort "
+            "the photographs to it to match"
+        )
+    return "\n".join(lines)
