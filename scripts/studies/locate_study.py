@@ -30,12 +30,10 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
 from stcal.locate.estimate import locate, merge
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import LayoutPlan, TargetLayout
 from stcal.locate.layout_calibration import CalibrationImages
-from stcal.locate.patent import PatentOptions
-from stcal.locate.scenes import LocateOptions, locate_image, run
-from stcal.locate.verdict import VerdictOptions, judge
+from stcal.locate.scenes import LocateOptions, find_scenes, locate_image, run
+from stcal.locate.verdict import PatentOptions, VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.optics import Light, expose
 from stcal.workflows.board_views import calibration_images

@@ -57,8 +57,8 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
-    from stcal.register.liu2017 import Liu2017Options
-    from stcal.register.point_pairs import read_pairs
+    from stcal.register.registered import read_pairs
+    from stcal.register.registration import Liu2017Options
     from stcal.register.registration_report import OF_ROBOT, RegistrationFile, registration_report, sample_size_section
     from stcal.register.workspace import findings
 

@@ -58,18 +58,12 @@ class GoalChain(Brief):
 
     Parameters
     ----------
-    mount : UncertainRigid
-        flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
-    moving : bool
-        Whether the camera is on the flange.
-    flange : dict of UncertainRigid
-        base_from_flange by scene, mm; empty for a fixed camera.
-    offset : Rigid
-        obj_from_goal, mm, which is exact.
-    source : str
-        Origin of ``mount``, for messages.
-    poses_source : str
-        Origin of ``flange``, for messages.
+    mount : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
+    moving : whether the camera is on the flange.
+    flange : base_from_flange by scene, mm; empty for a fixed camera.
+    offset : obj_from_goal, mm, which is exact.
+    source : origin of ``mount``, for messages.
+    poses_source : origin of ``flange``, for messages.
     """
 
     mount: UncertainRigid
@@ -269,32 +263,23 @@ def goal_chain(
 
     Parameters
     ----------
-    hand_eye : HandEye, Rigid, str or Path, optional
-        Result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
+    hand_eye : result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
         ``robot_poses``, base_from_camera without.
-    registration : Registration, str or Path, optional
-        Result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a is the
-        frame of a fixed camera, b the robot's base.
-    robot_poses : dict of Rigid, str or Path, optional
-        base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are used.
-        Needed for a camera on the flange only.
-    offset : Rigid, str or Path, optional
-        obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
-    key : str
-        Column of the table that names the scenes.
-    quaternions : {"wxyz", "xyzw"}
-        Order of the table's quaternions: by the names of their columns, or x, y, z, w in the order of the columns.
+    registration : result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a
+        is the frame of a fixed camera, b the robot's base.
+    robot_poses : base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are
+        used. Needed for a camera on the flange only.
+    offset : obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
+    key : column of the table that names the scenes.
+    quaternions : {"wxyz", "xyzw"}; order of the table's quaternions: by the names of their columns, or x, y, z, w in
+        the order of the columns.
 
     Returns
     -------
-    GoalChain
-        For :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
+    GoalChain : for :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
 
-    Raises
-    ------
-    InputError
-        Neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not needed, the
-        registration is not rigid, or a file does not follow ``data_layout.md``.
+    Raises InputError: neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not
+    needed, the registration is not rigid, or a file does not follow ``data_layout.md``.
     """
     if hand_eye is not None and registration is not None:
         raise InputError(
@@ -344,13 +329,10 @@ class Goals(Brief):
 
     Parameters
     ----------
-    base_from_goal : dict of Rigid
-        Pose by scene, mm.
-    covariance : dict of (6, 6) array
-        Covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the errors
-        of all links of the chain; the patent's method states none of its own.
-    notes : tuple of str
-        Doubts about the robot's poses or the transform to it.
+    base_from_goal : pose by scene, mm.
+    covariance : covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the
+        errors of all links of the chain; the patent's method states none of its own.
+    notes : doubts about the robot's poses or the transform to it.
     """
 
     base_from_goal: dict[str, Rigid]
@@ -364,22 +346,16 @@ def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
 
     Parameters
     ----------
-    results : sequence of Located
-        Results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses are
-        found.
-    chain : GoalChain
-        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
+    results : results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's
+        poses are found.
+    chain : transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
 
     Returns
     -------
-    Goals
-        Of accepted poses only, so that no robot moves to a rejected one.
+    Goals : of accepted poses only, so that no robot moves to a rejected one.
 
-    Raises
-    ------
-    InputError
-        A scene has no robot pose; or the target stands still between the scenes only in another unit or convention of
-        the robot's poses or the transform, which the message names.
+    Raises InputError: A scene has no robot pose; or the target stands still between the scenes only in another unit or
+    convention of the robot's poses or the transform, which the message names.
     """
     chain.require_poses([each.name for each in results])
     seen = {each.name: uncertain(each) for each in accepted(results)}

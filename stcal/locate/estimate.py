@@ -162,14 +162,11 @@ class SeenTags(Brief):
 
     Parameters
     ----------
-    rows : (k,) int array
-        Rows of the tags in the layout.
-    corners_px : (k, 4, 2) array
-        Corners in the image, with distortion.
-    covariance_px2 : (k, 8, 8) array
-        Covariances of the four corners of each tag, including the layout's additional σ of single corners.
-    edge_sigma_px : (k,) array
-        σ of the common shift of all edges of a tag.
+    rows : (k,); rows of the tags in the layout.
+    corners_px : (k, 4, 2); corners in the image, with distortion.
+    covariance_px2 : (k, 8, 8); covariances of the four corners of each tag, including the layout's additional σ of
+        single corners.
+    edge_sigma_px : (k,); σ of the common shift of all edges of a tag.
     """
 
     rows: np.ndarray
@@ -198,30 +195,18 @@ class ObjPose(ImageFit, Brief):
 
     Parameters
     ----------
-    camera_from_obj : Rigid
-        The pose, mm.
-    covariance : (6, 6) array
-        Covariance, rad and mm, left perturbation in the camera frame.
-    rows : (k,) int array
-        Rows of the tags used in the layout.
-    outliers : tuple of int
-        Rows of the tags that were left out because they contradict the others.
-    residuals_px : (4k, 2) array
-        Measured minus projected corners.
-    weights : (4k,) array
-        Huber's weights.
-    chi2 : float
-        χ² of the residuals with their full covariance.
-    redundancy : int
-        Number of measured coordinates minus the six unknowns of the pose.
-    foreshortening : float
-        Cosine between the target's normal and the line of sight to the middle of its corners.
-    extent_px : float
-        Extent of the corners in the image across their longer direction.
-    delta_chi2 : float
-        χ² of the second solution minus that of the pose; infinite if there is no second solution.
-    second : Rigid or None
-        The second solution, camera_from_obj.
+    camera_from_obj : the pose, mm.
+    covariance : (6, 6); covariance, rad and mm, left perturbation in the camera frame.
+    rows : (k,); rows of the tags used in the layout.
+    outliers : rows of the tags that were left out because they contradict the others.
+    residuals_px : (4k, 2); measured minus projected corners.
+    weights : (4k,); Huber's weights.
+    chi2 : χ² of the residuals with their full covariance.
+    redundancy : number of measured coordinates minus the six unknowns of the pose.
+    foreshortening : cosine between the target's normal and the line of sight to the middle of its corners.
+    extent_px : extent of the corners in the image across their longer direction.
+    delta_chi2 : χ² of the second solution minus that of the pose; infinite if there is no second solution.
+    second : the second solution, camera_from_obj.
     """
 
     camera_from_obj: Rigid
@@ -258,28 +243,18 @@ def locate(
 
     Parameters
     ----------
-    seen : SeenTags
-        Corners of the layout's tags, px.
-    layout : TargetLayout
-        The target, with the covariance of its corners.
-    camera : Camera
-        The camera at the size of the image.
-    prior : CameraPrior, optional
-        Covariance of the intrinsics; they are exact if None.
-    where : str
-        Name of the scene, for messages.
+    seen : corners of the layout's tags, px.
+    layout : the target, with the covariance of its corners.
+    camera : the camera at the size of the image.
+    prior : covariance of the intrinsics; they are exact if None.
+    where : name of the scene, for messages.
 
     Returns
     -------
-    ObjPose
-        The better minimum, with the second solution if there is one.
+    ObjPose : the better minimum, with the second solution if there is one.
 
-    Raises
-    ------
-    DegenerateError
-        There is no tag, the tags contradict one another, or the corners do not determine the rotation.
-    ConvergenceError
-        No minimum is reached.
+    Raises DegenerateError: there is no tag, the tags contradict one another, or the corners do not determine the
+    rotation. Raises ConvergenceError: no minimum is reached.
     """
     if not len(seen):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")

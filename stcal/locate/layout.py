@@ -27,18 +27,12 @@ class LayoutPlan(Brief):
 
     Parameters
     ----------
-    name : str
-        Name of the target.
-    tags : tuple of (str, int)
-        Dictionary and id of the n tags.
-    size_mm : (n,) array
-        Side lengths, NaN if not given.
-    origin : int
-        Row of the tag whose centre is the origin of {obj}.
-    corners_mm : (n, 4, 2) array
-        Nominal corners in the plane of the target, NaN if a place is not given.
-    unusual_size : bool
-        True if unusually long or short sides are not a mistake of units.
+    name : name of the target.
+    tags : dictionary and id of the n tags.
+    size_mm : (n,); side lengths, NaN if not given.
+    origin : row of the tag whose centre is the origin of {obj}.
+    corners_mm : (n, 4, 2); nominal corners in the plane of the target, NaN if a place is not given.
+    unusual_size : true if unusually long or short sides are not a mistake of units.
     """
 
     name: str
@@ -65,21 +59,14 @@ class TargetLayout(Brief):
 
     Parameters
     ----------
-    name : str
-        Name of the target.
-    tags : tuple of (str, int)
-        Dictionary and id of the n tags; the ids differ.
-    corners_mm : (n, 4, 2) array
-        Top left, top right, bottom right, bottom left corner as printed, in {obj}.
-    covariance_mm2 : (8n, 8n) array
-        Covariance of all coordinates, mm², tag by tag, corner by corner, x before y.
-    origin : int
-        Row of the tag that holds the origin.
-    sigma_px, tag_sigma_px : float
-        σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
-        the four corners of a tag together. Estimated from the residuals of the calibration.
-    unusual_size : bool
-        True if unusually long or short sides are not a mistake of units.
+    name : name of the target.
+    tags : dictionary and id of the n tags; the ids differ.
+    corners_mm : (n, 4, 2); top left, top right, bottom right, bottom left corner as printed, in {obj}.
+    covariance_mm2 : (8n, 8n); covariance of all coordinates, mm², tag by tag, corner by corner, x before y.
+    origin : row of the tag that holds the origin.
+    sigma_px, tag_sigma_px : σ due to print, lens and flatness, in addition to the measured σ of a corner: of each
+        corner by itself, and of the four corners of a tag together. Estimated from the residuals of the calibration.
+    unusual_size : true if unusually long or short sides are not a mistake of units.
     """
 
     name: str
@@ -124,17 +111,9 @@ def load_plan(path: str | Path) -> LayoutPlan:
 
     Parameters
     ----------
-    path : str or Path
-        The file: TOML, or YAML of apriltag_ros.
+    path : the file: TOML, or YAML of apriltag_ros.
 
-    Returns
-    -------
-    LayoutPlan
-
-    Raises
-    ------
-    InputError
-        The file is unreadable, does not follow ``data_layout.md``, or repeats an id.
+    Raises InputError: the file is unreadable, does not follow ``data_layout.md``, or repeats an id.
     """
     return _plan(load_tags(path, WHAT), f"{WHAT} {path}")
 
@@ -144,18 +123,13 @@ def load_layout(path: str | Path) -> TargetLayout:
 
     Parameters
     ----------
-    path
-        The file: TOML, or YAML of apriltag_ros.
+    path The file: TOML, or YAML of apriltag_ros.
 
     Returns
     -------
-    TargetLayout
-        Corners in {obj}, mm, with their covariance.
+    TargetLayout : corners in {obj}, mm, with their covariance.
 
-    Raises
-    ------
-    InputError
-        See :func:`load_plan`; or a tag has no place.
+    Raises InputError: See :func:`load_plan`; or a tag has no place.
     """
     where = f"{WHAT} {path}"
     data = load_tags(path, WHAT)

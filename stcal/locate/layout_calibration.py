@@ -284,25 +284,16 @@ class CalibratedLayout(Brief):
 
     Parameters
     ----------
-    layout : TargetLayout
-        Layout with the covariance of all corners.
-    published : (n, 4, 2) array
-        Corners in {obj} by the method of the patent, before the adjustment, mm.
-    board_from_obj : Rigid
-        Pose of {obj} on the board.
-    adjusted : AdjustedLayout
-        Poses and residuals of the adjustment.
-    images : tuple of str
-        Names of the images used.
-    counts : (n,) int array
-        Number of images that show each tag.
-    unseen : tuple of int
-        Rows of the plan whose tags no image shows; the layout lacks them.
-    deviation_mm : (n,) array
-        Largest distance of a tag's corner from its nominal place, after the nominal target is fitted to the calibrated
-        one; NaN if the plan has no place.
-    left_out : tuple of str
-        Images that were not used, and why.
+    layout : layout with the covariance of all corners.
+    published : (n, 4, 2); corners in {obj} by the method of the patent, before the adjustment, mm.
+    board_from_obj : pose of {obj} on the board.
+    adjusted : poses and residuals of the adjustment.
+    images : names of the images used.
+    counts : (n,); number of images that show each tag.
+    unseen : rows of the plan whose tags no image shows; the layout lacks them.
+    deviation_mm : (n,); largest distance of a tag's corner from its nominal place, after the nominal target is fitted
+        to the calibrated one; NaN if the plan has no place.
+    left_out : images that were not used, and why.
     """
 
     format: ClassVar = "stcal layout calibration 1"
@@ -332,28 +323,19 @@ def calibrate(
 
     Parameters
     ----------
-    plan : LayoutPlan
-        Tags of the target, and the tag that holds the origin of {obj}.
-    views : sequence of BoardView or None
-        Views of the board in m images; None if it is not seen.
-    tags : sequence of Tags
-        Tags in the m images.
-    names : sequence of str
-        Names of the images.
-    camera : Camera
-        Camera that took the images, at their size.
-    symmetries : sequence of Rigid
-        All board_from_board that map the board onto itself. The tags then decide the board's numbering in each image.
+    plan : tags of the target, and the tag that holds the origin of {obj}.
+    views : views of the board in m images; None if it is not seen.
+    tags : tags in the m images.
+    names : names of the images.
+    camera : camera that took the images, at their size.
+    symmetries : all board_from_board that map the board onto itself. The tags then decide the board's numbering in each
+        image.
 
     Returns
     -------
-    CalibratedLayout
-        Corners in mm, with their covariance.
+    CalibratedLayout : corners in mm, with their covariance.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than two images show board and tags, or none of them shows the tag that holds {obj}.
+    Raises DegenerateError: fewer than two images show board and tags, or none of them shows the tag that holds {obj}.
     """
     rows = {tag: row for row, tag in enumerate(plan.tags)}
     images, left_out = [], []

@@ -15,12 +15,10 @@ from stcal.io.json import Finite, Named, Part, Pose, ResultFile, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
 from stcal.locate.base_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.estimate import Merged, ObjPose
-from stcal.locate.exposures import Exposure, SceneFiles
 from stcal.locate.layout import TargetLayout
 from stcal.locate.layout_calibration import AdjustedLayout, CalibratedLayout
-from stcal.locate.patent import ASSUMED, PatentPose
-from stcal.locate.scenes import Located
-from stcal.locate.verdict import Verdict
+from stcal.locate.scenes import Exposure, Located, SceneFiles
+from stcal.locate.verdict import ASSUMED, PatentPose, Verdict
 from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, columns, macro, verdict_word
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
@@ -34,15 +32,13 @@ def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str
 
     Parameters
     ----------
-    results : sequence of Located
-        Results of :func:`~stcal.locate.run`.
-    chain : GoalChain, optional
-        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`, for further columns ``base_from_goal_…``.
+    results : results of :func:`~stcal.locate.run`.
+    chain : transforms to the robot's base, of :func:`~stcal.locate.goal_chain`, for further columns
+        ``base_from_goal_…``.
 
     Returns
     -------
-    str
-        CSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
+    str : cSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
     """
     refused = ""
     for scene in results:

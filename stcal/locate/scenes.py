@@ -1,26 +1,265 @@
-"""Pipeline from exposures to poses with verdicts: the stages in order."""
+"""Scenes of exposures: schedules of times, capture, and the pipeline from exposures to poses with verdicts."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+import stcal
 from stcal.boards.board_designs import TagLayout
 from stcal.boards.on_faces import shift_by_curves
-from stcal.boards.tags import seen_otherwise
+from stcal.boards.tags import Tags, find_tags, seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
-from stcal.io.images import decode, grey_8bit, grey_of, size_fault
+from stcal.io.device import DARK, SATURATED, Source, png
+from stcal.io.files import json_text, real_place, save
+from stcal.io.images import (
+    SUFFIXES,
+    TOP_GROUP,
+    USUAL,
+    ImageFile,
+    decode,
+    find_images,
+    grey_8bit,
+    grey_of,
+    image_file,
+    size_fault,
+)
+from stcal.io.json import Part, ResultFile, require_result_written
 from stcal.locate.estimate import Merged, ObjPose, locate, merge
-from stcal.locate.exposures import Exposure, SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.layout import TargetLayout
-from stcal.locate.patent import PatentOptions, PatentPose, locate_as_patent
-from stcal.locate.verdict import Verdict, VerdictOptions, judge, likely_mistake
+from stcal.locate.verdict import (
+    PatentOptions,
+    PatentPose,
+    Verdict,
+    VerdictOptions,
+    judge,
+    likely_mistake,
+    locate_as_patent,
+)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SceneFiles(Brief):
+    """The exposures of one scene, not yet read.
+
+    Parameters
+    ----------
+    name : name of the scene.
+    files : files of the exposures.
+    skipped : files beside them that are not exposures, with reasons.
+    """
+
+    name: str
+    files: tuple[ImageFile, ...]
+    skipped: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        require_fields(self, "scene")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """One readable image: the ``tags`` that it shows, and its ``size`` (width and height, px)."""
+
+    name: str
+    tags: Tags
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneTags:
+    """The readable exposures of one scene; ``unreadable`` : why others could not be read."""
+
+    name: str
+    exposures: tuple[Exposure, ...]
+    unreadable: tuple[str, ...] = ()
+
+
+CAPTURED = "capture.json"
+"""Name of the file that ``capture`` writes beside the images of a scene."""
+
+
+@require_arguments
+def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
+    """Returns exposure times in a geometric series.
+
+    Parameters
+    ----------
+    shortest, longest : first and last exposure time, in any unit.
+    count : number of exposure times.
+
+    Returns
+    -------
+    (count,) array : in the unit of the arguments.
+
+    Raises InputError: times are not positive or not in order, or ``count`` does not fit them.
+    """
+    if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
+        raise InputError(
+            "E-EXPOSURES-VALUE",
+            f"exposures: {count} from {shortest:g} to {longest:g}; two or more, from a positive shortest time to a "
+            "longest that is not shorter, needed",
+        )
+    return np.geomspace(shortest, longest, count)
+
+
+@require_arguments
+def find_scenes(path: str | Path) -> list[SceneFiles]:
+    """Finds the scenes in a folder.
+
+    Parameters
+    ----------
+    path : one image; a folder of exposures; or a folder of such folders, each a scene.
+
+    Raises InputError: the path does not exist, or holds no image.
+    """
+    path = Path(path)
+    if path.is_file():
+        if path.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(USUAL)} needed"
+            )
+        return [SceneFiles(path.stem, (image_file(path),))]
+    files, skipped = find_images(path)
+    scenes = []
+    for group in dict.fromkeys(file.group for file in files):
+        skipped_in_group = [s for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group]
+        left_out = tuple(f"{s.name}: {s.reason}" for s in skipped_in_group if Path(s.name).name != CAPTURED)
+        name = real_place(path).name if group == TOP_GROUP else group
+        scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
+    return scenes
+
+
+def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int | None = None) -> Iterator[SceneTags]:
+    """Yields the tags of each scene. Each image is decoded once, while other threads search earlier images for tags."""
+    dictionaries = layout.dictionaries()
+    with ThreadPoolExecutor(workers) as pool:
+        for scene in scenes:
+            pending, unreadable = [], []
+            for file in scene.files:
+                # Decoding stays in this thread, because it captures what the decoders write to standard error.
+                try:
+                    image = grey_8bit(decode(file.read(), file.name))
+                except (InputError, OSError) as error:
+                    unreadable.append(" ".join(str(error).split()))
+                else:
+                    pending.append(pool.submit(detect, image, file.name, dictionaries))
+            yield SceneTags(scene.name, tuple(each.result() for each in pending), tuple(unreadable))
+
+
+def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
+    """Finds the tags of a decoded image."""
+    return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
+
+
+class CapturedRow(Part):
+    image: str
+    exposure: float
+    exposure_set: float
+    saturated_share: float
+    dark_share: float
+
+
+class CaptureFile(ResultFile):
+    """Content of ``capture.json`` of a scene: the settings asked for, and those really set."""
+
+    format: Literal["stcal capture 1"] = Field(description="the file's form and its version")
+    version: str = Field(description="of stcal")
+    camera: str = Field(description="what took the images")
+    gain: float | None = Field(description="asked for; null: as it was")
+    settle_s: float = Field(description="waited after each change of exposure, s")
+    exposures: list[CapturedRow] = Field(
+        description="`image`, `exposure` asked for and `exposure_set` by the driver, in its unit; `saturated_share` "
+        "and `dark_share` of the pixels"
+    )
+
+
+def scene_folder(out: Path, scene: str) -> Path:
+    """Returns a scene's new folder; raises InputError: the name is invalid, or the scene exists."""
+    if not re.fullmatch(r"[\w][\w .-]{0,99}", scene):
+        raise InputError(
+            "E-DEVICE-NAME", f"scene {scene!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
+        )
+    folder = out / scene
+    if folder.exists():
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
+    return folder
+
+
+@require_arguments
+def capture(
+    source: Source,
+    exposures: Sequence[float],
+    folder: str | Path,
+    gain: float | None = None,
+    settle_s: float = 0.3,
+    taken: Callable[[CapturedRow], None] | None = None,
+) -> CaptureFile:
+    """Takes an exposure series and writes ``<folder>/<exposure>.png`` and ``capture.json`` with the settings used.
+
+    Parameters
+    ----------
+    source : the camera; or anything else with a ``name`` and their methods.
+    exposures : exposures in the unit of the camera's driver, as of :func:`stcal.locate.exposure_times`.
+    folder : new folder of the scene. It is written only after all images are taken.
+    gain : gain that ``source`` was told, for ``capture.json``.
+    settle_s : time that the camera is given after each change of exposure, s.
+    taken : called with the row of each image.
+
+    Returns
+    -------
+    CaptureFile : the exposures asked for and those set, and shares of saturated and dark pixels.
+
+    Raises InputError: the camera refuses an exposure or gives no image, an exposure comes twice, or the folder exists.
+    """
+    folder = Path(folder)
+    if not 0 <= settle_s <= 60:
+        raise InputError("E-OPTION-RANGE", f"--settle-s {settle_s:g}: 0 to 60 s needed")
+    if folder.exists():
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
+    rows, images = [], []
+    for exposure in exposures:
+        image, exposure_set = source.expose(float(exposure), settle_s)
+        row = CapturedRow(
+            image=f"{exposure:.6g}.png",
+            exposure=float(exposure),
+            exposure_set=exposure_set,
+            saturated_share=float((image >= SATURATED).mean()),
+            dark_share=float((image <= DARK).mean()),
+        )
+        if any(each.image == row.image for each in rows):
+            raise InputError(
+                "E-EXPOSURES-VALUE", f"exposure {exposure:.6g} comes twice; take fewer --count, or a wider range"
+            )
+        rows.append(row)
+        images.append(image)
+        if taken:
+            taken(row)
+    content = CaptureFile(
+        format="stcal capture 1",
+        version=stcal.__version__,
+        camera=source.name,
+        gain=gain,
+        settle_s=settle_s,
+        exposures=rows,
+    )
+    folder.mkdir(parents=True)
+    for row, image in zip(rows, images, strict=True):
+        save(folder / row.image, png(image))
+    save(folder / CAPTURED, json_text(content.content()))
+    require_result_written(folder / CAPTURED, content)
+    return content
+
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0
@@ -33,16 +272,12 @@ class LocateOptions:
 
     Parameters
     ----------
-    method : {"joint", "patent"}
-        One pose from all exposures together, or the method of the patent.
-    verdict : VerdictOptions
-        Limits of the joint method.
-    patent : PatentOptions
-        Limits of the patent's method.
-    moved_px : float
-        A scene has moved if its tags shift by more than this between exposures, and by more than :data:`MOVED_SIGMAS`.
-    workers : int or None
-        Number of threads that search for tags; as many as cores if None.
+    method : {"joint", "patent"}; one pose from all exposures together, or the method of the patent.
+    verdict : limits of the joint method.
+    patent : limits of the patent's method.
+    moved_px : A scene has moved if its tags shift by more than this between exposures, and by more than
+        :data:`MOVED_SIGMAS`.
+    workers : number of threads that search for tags; as many as cores if None.
     """
 
     method: Method = "joint"
@@ -65,18 +300,12 @@ class Located(Brief):
 
     Parameters
     ----------
-    tags : SceneTags
-        Tags that its exposures show.
-    merged : Merged or None
-        Merged corners of all exposures; None if the exposures do not belong together.
-    pose : ObjPose or None
-        Pose by the joint method; None if it failed, or another method was asked for.
-    verdict : Verdict
-        Whether the pose may be used.
-    notes : tuple of str
-        What was left out, and other notes.
-    patent : PatentPose or None
-        Result of the patent's method, if it was asked for.
+    tags : tags that its exposures show.
+    merged : merged corners of all exposures; None if the exposures do not belong together.
+    pose : pose by the joint method; None if it failed, or another method was asked for.
+    verdict : whether the pose may be used.
+    notes : what was left out, and other notes.
+    patent : result of the patent's method, if it was asked for.
     """
 
     tags: SceneTags
@@ -114,20 +343,15 @@ def run(
 
     Parameters
     ----------
-    scenes : sequence of SceneFiles
-        Scenes from :func:`~stcal.locate.find_scenes`.
-    layout : TargetLayout or TagLayout
-        The target.
-    camera : Camera
-        The camera that took the exposures.
-    options : LocateOptions, optional
-        Options of the method; the defaults if None.
+    scenes : scenes from :func:`~stcal.locate.find_scenes`.
+    layout : the target.
+    camera : the camera that took the exposures.
+    options : options of the method; the defaults if None.
 
     Yields
     ------
-    Located
-        One result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and never
-        ends the run.
+    Located : one result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and
+        never ends the run.
     """
     options, model = options or LocateOptions(), camera_model(camera)
     layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
@@ -151,26 +375,17 @@ def locate_image(
 
     Parameters
     ----------
-    image : (height, width) or (height, width, 3) array
-        Grey or RGB, 8 or 16 bit.
-    layout : TargetLayout or TagLayout
-        The target.
-    camera : Camera
-        The camera that took the image.
-    options : LocateOptions, optional
-        Options of the method; the defaults if None.
-    name : str
-        Name of the image, for messages.
+    image : (height, width) or (height, width, 3); grey or RGB, 8 or 16 bit.
+    layout : the target.
+    camera : the camera that took the image.
+    options : options of the method; the defaults if None.
+    name : name of the image, for messages.
 
     Returns
     -------
-    Located
-        Its ``pose`` is None if there is none; the verdict says why.
+    Located : its ``pose`` is None if there is none; the verdict says why.
 
-    Raises
-    ------
-    InputError
-        The image is no grey or RGB array, or its size is not the camera's.
+    Raises InputError: the image is no grey or RGB array, or its size is not the camera's.
     """
     grey = grey_of(image, name)
     target = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout

@@ -13,8 +13,8 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.io.json import Finite, Matrix, Matrix4, Named, Points, ResultFile, Vector3
 from stcal.parallel import one_thread
-from stcal.register.liu2017 import Liu2017Options, orthogonal_samples
 from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
+from stcal.register.registration import Liu2017Options, orthogonal_samples
 from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
@@ -258,7 +258,7 @@ def sample_size_section(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
     rows, tries = [], min(options.tries, 200)
     for points in range(4, min(41, len(xyz_a)), 2):
         samples = orthogonal_samples(xyz_a, xyz_b, replace(options, sample=points, tries=tries), seed)
-        shares = np.array([(np.delete(error, own) < options.limit_mm).mean() for _, own, _, error in samples])
+        shares = np.array([(np.delete(error, own) < options.limit_mm).mean() for own, _, error in samples])
         best, median = (100 * shares.max(), 100 * np.median(shares)) if len(shares) else (np.nan, np.nan)
         acceptable = f"{(shares > options.share).sum()} of {tries}"
         rows.append([points, number(best, 1), number(median, 1), len(shares), acceptable])

@@ -14,9 +14,8 @@ from scipy.special import chdtrc, chdtri
 from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
-from stcal.register.point_pairs import Pairs
-from stcal.register.registered import ErrorFigures, Registration, held_out
-from stcal.register.transforms import AFFINE, MODELS, Problem, Transform, jacobian, problem_of
+from stcal.register.consensus import AFFINE, MODELS, Problem, Transform, jacobian, problem_of
+from stcal.register.registered import ErrorFigures, Pairs, Registration, held_out
 
 MOST_POINTS = 500
 """Largest number of points of the model, evenly chosen from more, as its cost grows with the third power."""

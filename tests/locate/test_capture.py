@@ -11,7 +11,7 @@ from stcal.cli.main import app
 from stcal.errors import InputError
 from stcal.io import device as module
 from stcal.io.device import OpenCVSource, SimulatedSource
-from stcal.locate.exposures import capture, find_scenes, scene_folder
+from stcal.locate.scenes import capture, find_scenes, scene_folder
 from tests.outcome import fails_with, refuses
 
 

@@ -13,10 +13,9 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
 from stcal.locate.estimate import merge
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import LayoutPlan
 from stcal.locate.layout_calibration import CalibrationImages
-from stcal.locate.scenes import run
+from stcal.locate.scenes import find_scenes, run
 from stcal.synthetic.optics import Light, expose
 from stcal.workflows.board_views import calibration_images
 from tests.support.holdout import half_calibrated, subset_trials

@@ -6,8 +6,8 @@ import pytest
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.locate.exposures import exposure_times
-from stcal.locate.patent import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
+from stcal.locate.scenes import exposure_times
+from stcal.locate.verdict import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
 from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
 

@@ -9,9 +9,8 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import TargetLayout
-from stcal.locate.scenes import LocateOptions, locate_scene, run
+from stcal.locate.scenes import LocateOptions, find_scenes, locate_scene, run
 from stcal.synthetic.optics import Light, expose
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 

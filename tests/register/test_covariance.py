@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.register import register
-from stcal.register.consensus import covariance_of, sigma_within
-from stcal.register.transforms import MODELS, problem_of
+from stcal.register.consensus import MODELS, covariance_of, problem_of, sigma_within
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, make_scene, parameter_error

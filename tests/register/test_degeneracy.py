@@ -5,8 +5,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
+from stcal.register.consensus import MODELS
 from stcal.register.doubts import WIDER_THAN, single_supports, spreads, symmetry
-from stcal.register.transforms import MODELS
 from tests.outcome import fails_with, refuses
 
 B_FROM_A = Rigid.exp([0.2, -0.7, 1.0, 500, 100, -900])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.register import Liu2017Options, register
-from stcal.register.liu2017 import affine_least_squares, liu2017
+from stcal.register.registration import affine_least_squares, liu2017
 from tests.outcome import fails_with, refuses
 from tests.support.point_pairs import cube, scene
 

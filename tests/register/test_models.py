@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.register.transforms import MODELS, Problem, hypotheses, jacobian, parts
+from stcal.register.consensus import MODELS, Problem, hypotheses, jacobian, parts
 from tests.outcome import fails_with
 from tests.support.point_pairs import make_scene
 

@@ -7,9 +7,17 @@ from scipy.stats import beta
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
-from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
-from stcal.register.row_groups import lies_together, sphericity, two_groups, wilks_bound
-from stcal.register.transforms import MODELS, Problem, problem_of
+from stcal.register.consensus import (
+    CLEAN_SETS_WITH_OUTLIER,
+    MODELS,
+    Problem,
+    by_scale,
+    chernoff,
+    deletion_squares,
+    problem_of,
+    search,
+)
+from stcal.register.doubts import lies_together, sphericity, two_groups, wilks_bound
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, scene
 

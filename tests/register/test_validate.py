@@ -6,8 +6,8 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
+from stcal.register.consensus import MODELS, problem_of
 from stcal.register.registered import held_out
-from stcal.register.transforms import MODELS, problem_of
 from tests.support.point_pairs import SIGMA_MM, scene
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.transforms import MODELS, Problem, problem_of
+from stcal.register.consensus import MODELS, Problem, problem_of
 from stcal.register.workspace import MOST_POINTS, cubes, residual_field
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.robot.kinematics.conditions import USUAL, Conditions, loaded
-from stcal.robot.kinematics.robot_model import Chain, Elasticity, Robot, warn_of_degrees
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot, loaded, warn_of_degrees
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
@@ -32,9 +31,7 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
     -------
     Poses : m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
 
-    Raises
-    ------
-    InputError : joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
+    Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
     values = _joint_vectors(q, robot)
     return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
@@ -45,18 +42,14 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
     Parameters
     ----------
-    robot, q, tool
-        As of :func:`forward`.
+    robot, q, tool : as of :func:`forward`.
 
     Returns
     -------
-    (m, 6, n) array
-        Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left
-        perturbation), by rad or mm of each joint. The deflection of links is taken as constant.
+    (m, 6, n) array : rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base
+        (left perturbation), by rad or mm of each joint. The deflection of links is taken as constant.
 
-    Raises
-    ------
-    InputError : joint values of another shape or not finite; an unknown tool.
+    Raises InputError: joint values of another shape or not finite; an unknown tool.
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)

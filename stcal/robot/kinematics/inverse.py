@@ -105,9 +105,9 @@ def inverse(
     ----------
     robot : an arm of n joints; where its base stands does not matter.
     poses : m transforms base_from_tool, mm.
-    near : (m, n) or (n,) array, optional
-        Reference values of the controller, rad or mm. Without it the first pose gets the branch nearest to the middle
-        of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
+    near : (m, n) or (n,); reference values of the controller, rad or mm. Without it the first pose gets the branch
+        nearest to the middle of the limits (0 where unlimited), and every other the one nearest to that of the pose
+        before.
     tool : name of the tool.
     payload_kg : mass at the flange; that of the robot if not given.
 
@@ -115,10 +115,8 @@ def inverse(
     -------
     Inverse : joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
 
-    Raises
-    ------
-    InputError : ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown
-        tool; a mass that no arm carries.
+    Raises InputError: ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an
+    unknown tool; a mass that no arm carries.
 
     References
     ----------
@@ -157,9 +155,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     -------
     Inverse : joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
 
-    Raises
-    ------
-    InputError : the arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
+    Raises InputError: the arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
     problem = InverseProblem.of(robot, tool)
     problem.refuse_redundant()

@@ -15,9 +15,9 @@ from stcal.io.files import require_written, save
 from stcal.io.table import LEVER_MM, POSE, pose_values
 from stcal.io.toml import Finite, PoseEntry, Sized, Strict, load_toml, toml_string
 from stcal.lengths import require_millimetres, stated_unusual
-from stcal.robot.kinematics.conditions import MOST_KG
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, joint_frames
 from stcal.robot.kinematics.robot_model import (
+    MOST_KG,
     Chain,
     Convention,
     DHRow,
@@ -124,10 +124,8 @@ def load_robot(path: str | Path) -> Robot:
     -------
     Robot : lengths in mm, angles in rad.
 
-    Raises
-    ------
-    InputError : unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix
-        that does not fit, quaternions that are not unit; the message names the file and the place.
+    Raises InputError: unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling
+    matrix that does not fit, quaternions that are not unit; the message names the file and the place.
     """
     if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
         raise InputError(
@@ -296,9 +294,7 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
     robot : what to write.
     comments : lines to stand at the top.
 
-    Raises
-    ------
-    InputError : it cannot be written.
+    Raises InputError: it cannot be written.
     """
     save(Path(path), robot_toml(robot, comments))
     require_robot_written(path, robot)

@@ -14,7 +14,68 @@ from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
-from stcal.robot.kinematics.conditions import loaded
+
+PAYLOAD = "payload_kg"
+APPROACH = "approach"
+DIRECTIONS = (-1.0, 0.0, 1.0)
+MOST_KG = 1e4
+"""Largest mass at a flange. Arms carry up to 2.3 t."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conditions:
+    """Payload and approach directions of m joint vectors. ``payload_kg`` : (m,) mass at the flange; ``approach`` : (m,
+    n) direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown."""
+
+    payload_kg: np.ndarray | None = None
+    approach: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.approach is not None:
+            freeze(self, "approach", (None, None), "approach")
+            for value in self.approach[~np.isin(self.approach, DIRECTIONS)]:
+                raise InputError("E-APPROACH-VALUE", f"approach is {value:g}; 1, -1 or 0 needed")
+        if self.payload_kg is not None:
+            freeze(self, "payload_kg", (None,), "payload")
+            for value in self.payload_kg[(self.payload_kg < 0) | (self.payload_kg > MOST_KG)]:
+                raise InputError("E-PAYLOAD-VALUE", f"payload is {value:g} kg; 0 … {MOST_KG:g} needed")
+
+    def __getitem__(self, index) -> "Conditions":
+        """Returns the conditions of the joint vectors selected by a mask, slice or list."""
+        if self.payload_kg is None and self.approach is None:
+            return self
+        return Conditions(*(None if each is None else each[index] for each in (self.payload_kg, self.approach)))
+
+    @property
+    def approached(self) -> bool:
+        """True if the approach direction of any joint is known."""
+        return self.approach is not None and bool(self.approach.any())
+
+    @property
+    def loaded(self) -> bool:
+        """True if a payload above 0 is known for any joint vector."""
+        return self.payload_kg is not None and bool(self.payload_kg.any())
+
+    def ignored(self, who: str) -> tuple[str, ...]:
+        """Returns a note that the rigid arm ``who`` does not deflect under its payload; no note without payload."""
+        if not self.loaded:
+            return ()
+        return (f"{who} is rigid, {PAYLOAD} moves nothing (`identify --model elastic` tells what links give way by)",)
+
+
+USUAL = Conditions()
+"""Default conditions: payload of the robot file, approach directions unknown."""
+
+
+def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
+    """Returns conditions with one mass for all ``count`` joint vectors, or one for each; raises InputError."""
+    if payload_kg is None:
+        return USUAL
+    values = np.asarray(payload_kg, float)
+    if values.shape not in ((), (count,)):
+        raise InputError("E-ARRAY-SHAPE", f"payload: shape {values.shape}, one number or ({count},) needed")
+    return Conditions(np.broadcast_to(values, (count,)))
+
 
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
@@ -49,9 +110,7 @@ class DHRow:
     theta : angle about the joint's axis where the joint's value is 0, rad.
     beta : second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
 
-    Raises
-    ------
-    InputError : a value that is no finite number.
+    Raises InputError: a value that is no finite number.
 
     References
     ----------
@@ -88,9 +147,7 @@ class Joint:
     lower, upper : limits of the controller's value, rad or mm; unlimited where not given.
     fixed : dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
 
-    Raises
-    ------
-    InputError : another type, limits that are swapped or no numbers, a dimension that no row has.
+    Raises InputError: another type, limits that are swapped or no numbers, a dimension that no row has.
     """
 
     type: JointType = "revolute"
@@ -131,15 +188,13 @@ class Elasticity:
     gravity : (3,) its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`
     hysteresis : (n,) rad: added to the angle of revolute joints that came from below, subtracted if they came from
         above
-    pivot : (n, 3) point about which each link turns when it deflects, mm, in its joint's frame: on the joint's axis
-        for a revolute joint. The origin of that frame if not given; always the origin in a :class:`Chain`.
+    pivot : (n, 3) point about which each link turns when it deflects, mm, in its joint's frame: on the joint's axis for
+        a revolute joint. The origin of that frame if not given; always the origin in a :class:`Chain`.
     payload_kg : mass that is carried if joint vectors do not state another
     payload_centre : (3,) its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it
         has moved, of a :class:`Chain`
 
-    Raises
-    ------
-    InputError : arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
+    Raises InputError: arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
     """
 
     compliance: np.ndarray
@@ -220,18 +275,15 @@ class Robot(Brief):
     convention : of all rows; see :class:`DHRow`.
     rows : one for each joint, from the base; mm, rad.
     joints : one for each row: type and range.
-    coupling : (n, n) array, optional
-        Kinematic joint values from the controller's, a regular matrix; the identity if not given.
+    coupling : (n, n); kinematic joint values from the controller's, a regular matrix; the identity if not given.
     world_from_base : base in the frame of the measuring instrument, mm.
     tools : flange_from_tool by name, mm; ``""`` is the tool if none is named.
     elasticity : rigid if not given.
     tree : every joint is carried by the one before it, and tools by the last one, if not given.
     unusual_size : true if unusually long or short links are not a mistake of units.
 
-    Raises
-    ------
-    InputError : another convention; rows and joints of other types, or of different numbers, or none; lengths that are
-        not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
+    Raises InputError: another convention; rows and joints of other types, or of different numbers, or none; lengths
+    that are not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
     """
 
     name: str
@@ -293,9 +345,8 @@ class Robot(Brief):
         types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
         name : for messages and reports
 
-        Raises
-        ------
-        InputError : arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        Raises InputError: arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint`
+        refuse.
 
         Warns
         -----

@@ -96,10 +96,8 @@ class DesignOptions:
     box : lowest x, y, z and highest x, y, z of the tool in the base, mm.
     tool : name of the tool that is measured.
 
-    Raises
-    ------
-    InputError
-        A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box that is empty.
+    Raises InputError: A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box
+    that is empty.
     """
 
     count: int = 40
@@ -147,10 +145,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     -------
     PoseDesign : joint vectors with their poses base_from_tool, and their observability beside random ones.
 
-    Raises
-    ------
-    InputError : a prismatic joint without limits, or no poses in the box.
-    DegenerateError : so few poses that the parameters cannot be determined.
+    Raises InputError: a prismatic joint without limits, or no poses in the box. Raises DegenerateError: so few poses
+    that the parameters cannot be determined.
 
     References
     ----------

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import read_measurements
+from stcal.robot.kinematics.measurements import read_measurements, read_targets
 from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from stcal.robot.use.targets import read_targets
 from tests.outcome import fails_with
 
 WPR, ABC, OPEN = ("w_deg", "p_deg", "r_deg"), ("a_deg", "b_deg", "c_deg"), ("rx_deg", "ry_deg", "rz_deg")

@@ -8,7 +8,6 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward, inverse
-from stcal.robot.kinematics.conditions import Conditions, loaded
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import (
     chain_parameters,
@@ -20,7 +19,7 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
-from stcal.robot.kinematics.robot_model import Elasticity, Robot, mh80
+from stcal.robot.kinematics.robot_model import Conditions, Elasticity, Robot, loaded, mh80
 from stcal.robot.simulated import joint_vectors
 from tests.outcome import fails_with
 

@@ -12,11 +12,11 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import read_targets
 from stcal.robot.kinematics.robot_file import robot_toml
 from stcal.robot.kinematics.robot_model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv
-from stcal.robot.use.targets import read_targets
 from tests.outcome import fails_with
 from tests.support.arms import elastic
 

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
-from stcal.robot.use.compensation import compensate
-from stcal.robot.use.targets import Targets, on_targets, robots_apart
+from stcal.robot.use.compensation import compensate, on_targets, robots_apart
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])

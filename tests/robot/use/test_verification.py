@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.robot_report import verification_report
-from stcal.robot.use.verification import MeasuredPoses, Verification, VerificationFile, read_measured, verify
+from stcal.robot.use.evaluation import MeasuredPoses, Verification, VerificationFile, read_measured, verify
 from tests.outcome import refuses
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
