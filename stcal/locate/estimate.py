@@ -42,19 +42,17 @@ SETTLED = 1e-5
 """Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
 NEAR_DEPTH = 1e-9
 """Depth that stands for a smaller one, mm."""
-WEIGH_STEPS, WEIGHED = 60, 1e-6
-"""Largest number of steps, and the least decrease of χ²: a step of less than σ/1000 is the last. Errors that many
-corners share, such as those of the intrinsics, can move a pose by many σ due to single corners."""
+WEIGHED = 1e-6
+"""Least decrease of χ²: a step of less than σ/1000 is the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarProblem:
     """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
 
-    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (2n, 2n)
-    covariance of ``seen``; ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) covariance of ``xy``,
-    mm²; ``common`` : (n, 2, q) derivative of ``seen`` by parameters that several corners share: shifts of each tag's
-    edges and of each tag, and the intrinsics if they are not exact; ``prior`` : (q, q) covariance of these parameters.
+    ``xy`` : (n, 2) in {obj}, mm, of covariance ``shape`` (2n, 2n); ``seen`` : (n, 2), of covariance ``noise`` (2n, 2n);
+    ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``common`` : (n, 2, q) derivative of ``seen`` by what corners share
+    (shifts of each tag's edges and of each tag, inexact intrinsics), of covariance ``prior`` (q, q).
     """
 
     xy: np.ndarray
@@ -146,7 +144,7 @@ def weighed(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed
 
     # A second solution that is far worse need not converge: it only shows that the first one is better.
     minimum = minimise(
-        pose, linearise, Poses.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
+        pose, linearise, Poses.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=60
     ).state
     view = project(problem, minimum)
     return weigh(view.residual, view.by_pose, full, minimum)
@@ -400,12 +398,11 @@ class Shift:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """Result of :func:`merge`: the merged corners of all exposures.
+    """Corners of all exposures by :func:`merge`: ``seen``, of the layout's tags.
 
-    ``seen`` : the layout's tags with merged corners; ``counts`` : (e,) number of the layout's tags in each exposure;
-    ``share`` : share of the corners' variance that differs between exposures; ``shifts`` : shift of each exposure
-    against the one with the most tags in common; ``repeated`` : tags of the layout that an exposure shows more than
-    once; ``unknown`` : tags that are not in the layout.
+    ``counts`` : (e,) of these tags in each exposure; ``share`` : of the corners' variance that differs between
+    exposures; ``shifts`` : of each exposure against the one with the most tags in common; ``repeated`` : tags that an
+    exposure shows more than once; ``unknown`` : tags that the layout lacks.
     """
 
     seen: SeenTags
@@ -421,9 +418,8 @@ class Merged:
 
 
 def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
-    """Returns weighted means of the corners over the exposures, with their covariance. The part of their errors that
-    exposures share (print, lens, sampling), by differences against stated σ, does not average out; larger differences
-    increase the σ."""
+    """Returns weighted means of the corners, with their covariance. Errors that exposures share (print, lens),
+    by differences against stated σ, do not average out; larger differences increase the σ."""
     rows = layout.rows()
     used = np.array(sorted({rows[tag] for tags in exposures for tag in tags.tags if tag in rows}), int)
     # corners, NaN if unseen; covariances of each and of a tag's four, px²; σ of the edges' common shift

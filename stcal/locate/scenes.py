@@ -35,7 +35,7 @@ from stcal.io.images import (
     size_fault,
 )
 from stcal.io.json import Part, ResultFile, require_result_written
-from stcal.locate.estimate import Merged, ObjPose, locate, merge
+from stcal.locate.estimate import Merged, ObjPose, SeenTags, locate, merge
 from stcal.locate.layout import TargetLayout
 from stcal.locate.verdict import (
     PatentOptions,
@@ -356,11 +356,8 @@ def run(
     options, model = options or LocateOptions(), camera_model(camera)
     layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        located = locate_scene(tags, layout, model, options)
-        if _without_tag(located):
-            first = next(file for file in files.files if file.name == tags.exposures[0].name)
-            located = _explained(located, layout, decode(first.read(), first.name))
-        yield located
+        by_name = {file.name: file for file in files.files}
+        yield locate_scene(tags, layout, model, options, lambda name, own=by_name: decode(own[name].read(), name))
 
 
 @require_arguments
@@ -395,45 +392,78 @@ def locate_image(
     if size != wanted:
         raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
     exposure = detect(grey_8bit(grey), name, target.dictionaries())
-    located = locate_scene(SceneTags(name, (exposure,)), target, model, options)
-    return _explained(located, target, grey) if _without_tag(located) else located
+    return locate_scene(SceneTags(name, (exposure,)), target, model, options, lambda _: grey)
 
 
 def locate_scene(
-    scene: SceneTags, layout: TargetLayout, camera: CameraModel, options: LocateOptions | None = None
+    scene: SceneTags,
+    layout: TargetLayout,
+    camera: CameraModel,
+    options: LocateOptions | None = None,
+    image_of: Callable[[str], np.ndarray] | None = None,
 ) -> Located:
-    """Locates the target in one scene and judges the pose."""
+    """Locates the target in one scene and judges the pose; in an image without its tags, others are looked for."""
     options = options or LocateOptions()
     used, notes = scene.exposures, [f"left out: {trouble}" for trouble in scene.unreadable]
+    merged = None
 
-    def rejected(merged: Merged | None, *reasons: str) -> Located:
+    def rejected(*reasons: str) -> Located:
         return Located(scene, merged, None, Verdict("reject", (), reasons), tuple(notes))
 
-    if trouble := _size_trouble(scene, camera):
-        return rejected(None, trouble)
+    if not used:
+        return rejected("no readable image; 1 needed")
+    sizes = {exposure.size: exposure.name for exposure in reversed(used)}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} {size[0]}×{size[1]}" for size, name in sorted(sizes.items()))
+        return rejected(f"exposures of different sizes ({shown} px); one size needed, as the camera file's")
+    width, height = used[0].size
+    if (camera.width or width, camera.height or height) != (width, height):
+        return rejected(
+            f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
+            "give the camera that took them"
+        )
     merged = merge([exposure.tags for exposure in used], layout, [exposure.name for exposure in used])
-    if merged.unknown:
-        notes.append(f"tags in view that the layout does not have: {_first_ids(merged.unknown)}")
+    unknown = ", ".join(str(tag) for _, tag in merged.unknown[:5]) + (", …" if len(merged.unknown) > 5 else "")
+    if unknown:
+        notes.append(f"tags in view that the layout does not have: {unknown}")
     notes += [
         f"{each.name}: motion during the exposure blurs edges by {each.tags.smear_px:.1f} px, which σ contain; "
         "camera and target at rest, or a shorter exposure"
         for each in used
         if each.tags.smear_px
     ]
-    if trouble := _scene_trouble(merged, options):
-        return rejected(merged, trouble)
+    if not sum(merged.counts) and image_of:
+        if unknown:
+            return rejected(
+                f"no tag of the layout, but others of its dictionaries ({unknown}); is it the layout of this target?"
+            )
+        shown = seen_otherwise(image_of(used[0].name), layout.rows(), "the layout file")
+        more = f", and {used[0].name} shows {shown}" if shown else ""
+        return rejected(f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed{more}")
+    if merged.repeated:
+        names = ", ".join(str(tag) for _, tag in merged.repeated)
+        return rejected(f"tags seen twice: {names}; every id once in view needed; cover the copy")
+    if not len(merged.seen):
+        return rejected("no tag of the layout; 1 needed")
+    moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
+    if moved:
+        shift = max(moved, key=lambda shift: shift.shift_px)
+        further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
+        return rejected(
+            f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
+            f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
+        )
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
 
-    def mistakes(pose: ObjPose | None) -> list[str]:
+    def mistakes(seen: SeenTags, pose: ObjPose | None) -> list[str]:
         try:
-            mistake = likely_mistake(merged.seen, layout, camera.sized(*used[0].size), prior, pose)
+            mistake = likely_mistake(seen, layout, camera.sized(width, height), prior, pose)
         except StcalError:  # it is the camera's fault
             return []
         return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
 
     try:
-        sized = camera.sized(*used[0].size)
-        corners = merged.seen.corners_px
+        sized, corners = camera.sized(width, height), merged.seen.corners_px
         straight = corners - shift_by_curves(corners, sized)
         merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
         if options.method == "patent":
@@ -441,69 +471,14 @@ def locate_scene(
             return Located(scene, merged, None, found.verdict, tuple(notes), found)
         pose = locate(merged.seen, layout, sized, prior, scene.name)
     except StcalError as error:
-        return rejected(merged, str(error).removeprefix(f"{scene.name}: "), *mistakes(None))
+        return rejected(str(error).removeprefix(f"{scene.name}: "), *mistakes(merged.seen, None))
     if pose.outliers:
-        notes.append(
-            f"tags that contradict the others, left out: {', '.join(str(layout.tags[r][1]) for r in pose.outliers)}"
-        )
-    explained = mistakes(pose) if pose.outliers else []
+        ids = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
+        notes.append(f"tags that contradict the others, left out: {ids}")
+    explained = mistakes(merged.seen, pose) if pose.outliers else []
     pose, verdict = judge(pose, options.verdict)
     if verdict.decision == "reject":
-        explained = explained or mistakes(pose)
+        explained = explained or mistakes(merged.seen, pose)
     if explained:
         verdict = replace(verdict, decision="reject", reasons=(*verdict.reasons, *explained))
     return Located(scene, merged, pose, verdict, tuple(notes))
-
-
-def _first_ids(tags: Sequence[tuple[str, int]]) -> str:
-    return ", ".join(str(tag) for _, tag in tags[:5]) + (", …" if len(tags) > 5 else "")
-
-
-def _size_trouble(scene: SceneTags, camera: CameraModel) -> str | None:
-    used = scene.exposures
-    if not used:
-        return "no readable image; 1 needed"
-    sizes = {exposure.size: exposure.name for exposure in reversed(used)}
-    if len(sizes) > 1:
-        shown = ", ".join(f"{name} {size[0]}×{size[1]}" for size, name in sorted(sizes.items()))
-        return f"exposures of different sizes ({shown} px); one size needed, as the camera file's"
-    width, height = used[0].size
-    if (camera.width or width, camera.height or height) != (width, height):
-        return (
-            f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
-            "give the camera that took them"
-        )
-    return None
-
-
-def _scene_trouble(merged: Merged, options: LocateOptions) -> str | None:
-    if merged.repeated:
-        names = ", ".join(str(tag) for _, tag in merged.repeated)
-        return f"tags seen twice: {names}; every id once in view needed; cover the copy"
-    if not len(merged.seen):
-        return "no tag of the layout; 1 needed"
-    moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
-    if not moved:
-        return None
-    shift = max(moved, key=lambda shift: shift.shift_px)
-    further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
-    return (
-        f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
-        f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
-    )
-
-
-def _without_tag(located: Located) -> bool:
-    return located.merged is not None and not sum(located.merged.counts)
-
-
-def _explained(located: Located, layout: TargetLayout, image: np.ndarray) -> Located:
-    """Returns the result of a scene without a tag with the reason: tags in its image may be of another dictionary."""
-    if located.merged and located.merged.unknown:
-        names = _first_ids(located.merged.unknown)
-        reason = f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
-    else:
-        reason = f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed"
-        if shown := seen_otherwise(image, layout.rows(), "the layout file"):
-            reason = f"{reason}, and {located.exposures[0].name} shows {shown}"
-    return replace(located, verdict=Verdict("reject", (), (reason,)))

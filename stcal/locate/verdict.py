@@ -132,13 +132,9 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     return pose, Verdict("ambiguous", tuple(checks), (f"two poses {apart_deg:.1f}° apart: {checks[-1].text()}",))
 
 
-LEAST_TAGS = 2
-"""A single tag fits each way round."""
-FITS = 0.02
-"""Largest RMS distance of corners from where a layout has them, over the mean side of the tags in the image. A tag that
-is turned or elsewhere misses by half a side and more; lens and print by less than a hundredth."""
-BETTER = 3.0
-"""Factor by which this distance must shrink for a mistake to be named."""
+FITS, BETTER = 0.02, 3.0
+"""Largest RMS distance of corners from where a layout has them, over the mean side of the tags; factor by which it must
+shrink for a mistake to be named. A wrong tag misses by half a side and more; lens and print by less than 0.01."""
 ALIKE = 1.5
 """Mistakes that fit within this factor of the best one fit as well: the first of them is named, the simplest."""
 TURNS = {
@@ -154,7 +150,7 @@ def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
     """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by it as it is."""
-    if len(detected) < LEAST_TAGS:
+    if len(detected) < 2:  # a single tag fits each way round
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()
     allowed = FITS * float(side)
@@ -197,8 +193,6 @@ ASSUMED = (
 )
 SAME_RAD, SAME_SHARE = 1e-3, 1e-3
 """T_a and T_b are the same pose if they differ by less: in rotation, and in translation as a share of the distance."""
-TINY_PX = 1e-9
-"""Error that stands for an exact fit in the ratio of errors, in px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,13 +290,6 @@ def triangulated_area(points: np.ndarray) -> float:
     return float(np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0)).sum())
 
 
-def same_pose(a: Rigid, b: Rigid) -> bool:
-    """True if T_a and T_b are equivalent (S8)."""
-    difference = a @ b.inverse()
-    shift = np.linalg.norm(a.translation - b.translation)
-    return difference.angle_rad() < SAME_RAD and bool(shift < SAME_SHARE * np.linalg.norm(a.translation))
-
-
 def locate_as_patent(
     exposures: Sequence[Tags],
     layout: TargetLayout,
@@ -336,8 +323,10 @@ def locate_as_patent(
         )
         results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=found.determinant)
         if best is None or low < best.errors_px[0]:
-            same = same_pose(first, second)
-            verdict = gate(found.determinant, low, high / max(low, TINY_PX), same, options)
+            shift = np.linalg.norm(first.translation - second.translation)
+            same = (first @ second.inverse()).angle_rad() < SAME_RAD  # T_a and T_b are equivalent (S8)
+            same = bool(same and shift < SAME_SHARE * np.linalg.norm(first.translation))
+            verdict = gate(found.determinant, low, high / max(low, 1e-9), same, options)
             pair, count = (first, second, (low, high)), len(listed[i])
             best = PatentPose(i, tuple(chosen), *pair, found.determinant, count, verdict, same=same)
     if best is None:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.special import chdtr, chdtrc, chdtri, gammaln
+from scipy.special import chdtr, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.least_squares import NormalEquations, minimise
@@ -299,8 +299,6 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
     return moved if isinstance(transform, Rigid) else Similarity(scale, moved)
 
 
-CONTRADICTED_AT = 0.01
-"""Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 WIDE = 8.0
 """Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
 
@@ -315,35 +313,16 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
         return sigma
 
     def excess(candidate: float) -> float:
-        return candidate**2 * _variance_within(threshold / candidate) - sigma**2
+        return candidate**2 * variance_within(threshold / candidate) - sigma**2
 
     if excess(threshold) < 0:
         return threshold
     return float(root_scalar(excess, method="brentq", bracket=(sigma, threshold), xtol=1e-9 * sigma, rtol=1e-9).root)
 
 
-def _variance_within(cut: float) -> float:
+def variance_within(cut: float) -> float:
     """Returns the variance of residuals within ``cut`` σ, over that of all."""
     return float(chdtr(5, cut**2) / chdtr(3, cut**2))
-
-
-def covariance_of(
-    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
-) -> tuple[np.ndarray, bool, float]:
-    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
-
-    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
-    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
-    """
-    redundancy, used, scaled = float(inliers.redundancy), sigma, True
-    if inliers.sigma_mm is not None:
-        scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)
-        if not scaled:
-            used, redundancy = inliers.sigma_mm, np.inf
-    matrix = used**2 * inliers.unit_covariance(b_from_a)
-    if used > 0 and threshold < WIDE * used:
-        matrix = matrix / _variance_within(threshold / used)
-    return matrix, scaled, redundancy
 
 
 FALSE_ALARMS = 1e-4
@@ -472,12 +451,6 @@ MAX_ROUNDS = 50
 """Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
 BY_CHANCE = 0.01
 """Largest number of false alarms of a consensus that is accepted, per file."""
-DISTINCT = 5.0
-"""Least distance between two distinct transforms, in σ."""
-MOST_OF_REST = 0.5
-"""Least share of the outliers that must agree on another transform: a few of many always lie near one by chance."""
-AS_GOOD = 0.5
-"""Share of the result's points with which a second transform makes the result ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -616,31 +589,3 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     choices = _log_choices(count, k) + _log_choices(k, size)
     value = np.log(count - size) + choices + (k - size) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
-
-
-def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
-    model, outside = problem.model, np.flatnonzero(~fitted.inliers)
-    if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
-        return None
-    rng = np.random.default_rng(seed + 1)
-    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
-    redundancy = model.redundancy(int(fitted.inliers.sum()))
-    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
-    consensus = search(problem[tried], by_threshold(threshold), rng)
-    if consensus is None or consensus.inliers.sum() <= model.sample:
-        return None
-    transform = problem[tried[consensus.inliers]].fit()
-    outliers = problem[outside]
-    near = outliers.squares(transform) <= threshold**2
-    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
-        return None
-    points = outliers.xyz_a[near]
-    if np.sqrt(((transform @ points - fitted.transform @ points) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
-        return None  # good points that a tight threshold cut off
-    # wrong points lie anywhere as far off the transform found as the farthest of them
-    off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
-    found = Fitted(transform, near, fitted.sigma, threshold, consensus.samples)
-    if chance(outliers, found, np.full(3, 2 * off)) > np.log(BY_CHANCE):
-        return None
-    return replace(found, inliers=np.isin(np.arange(len(problem)), outside[near]))

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
-from scipy.special import bdtrc, chdtrc, gammaln, ndtr
+from scipy.special import bdtrc, ndtr
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError, StcalError
+from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
@@ -21,7 +21,6 @@ from stcal.register.consensus import (
     AFFINE,
     BY_CHANCE,
     CLEAN_SETS_WITH_OUTLIER,
-    FALSE_ALARMS,
     LEAST_SHARE,
     LEVERAGE_UP_TO,
     MODELS,
@@ -31,14 +30,11 @@ from stcal.register.consensus import (
     Model,
     Problem,
     Transform,
-    by_share,
     chance,
-    chernoff,
     jacobian,
     parts,
     robust_fit,
     rotation_of,
-    search,
     some_of,
 )
 from stcal.register.registered import Registration
@@ -103,65 +99,10 @@ def order_note(change: Change, problem: Problem) -> str:
     )
 
 
-TRIED, FEW = 200, 16
-"""Largest number of points that are examined for groups, and for which square sums replace determinants."""
-SPHERICAL, TOGETHER = 0.1, 0.01
-"""Significance of anisotropic noise, of half the sets of 16 points with three times the noise along one axis; and
-probability that scattered groups seem to lie together."""
-
-
-def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Transform, Transform] | None:
-    """Returns the transforms of the larger group of points and of the other; None if one transform explains all of them
-    as well, or their places determine the group."""
-    n, model = len(problem), problem.model
-    points = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
-    n = len(points)
-    if n < 2 * (model.sample + 1):
-        return None
-    try:
-        single = points.whitened(points.residuals(points.fit()))
-        assigned = _assigned(points, rng)
-    except (DegenerateError, ConvergenceError):
-        return None
-    if assigned is None or np.abs(single).max() <= points.rounding_mm():
-        return None
-    first, (one, two) = assigned
-    parted = points.whitened(np.where(first[:, None], points.residuals(one), points.residuals(two)))
-    if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(FALSE_ALARMS):
-        return None
-    if lies_together(points.xyz_a, first):
-        return None
-    return (two, one) if first.sum() < n / 2 else (one, two)
-
-
-def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
-    """Returns a bound of the log probability that parting into given groups shrinks residuals (n, 3) so. It is 0 if the
-    loudest axis's noise in the fit exceeds the quiet axes' there: determinants then tell nothing."""
-    n, per_axis = len(whole), model.parameters / 3
-    one, two = whole.T @ whole, parted.T @ parted
-    of_error = n - 2 * per_axis
-    if np.linalg.cond(two) > n / 2:
-        return 0.0
-    bound = wilks_bound(np.linalg.slogdet(two)[1] - np.linalg.slogdet(one)[1], of_error, per_axis)
-    if n <= FEW and sphericity(two, of_error) > SPHERICAL:
-        share = np.trace(two) / np.trace(one)
-        bound = min(bound, float(chernoff(share, 1.5 * of_error, model.parameters / 2)))
-    return bound
-
-
-def sphericity(scatter: np.ndarray, redundancy: float) -> float:
-    """Returns the p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
-    w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
-    return float(chdtrc(5, max(-(redundancy - 23 / 18) * w, 0.0)))
-
-
-def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
-    """Returns Chernoff's bound of log P(Λ ≤ exp(log_ratio)) for Wilks' Λ(3, of_error, of_hypothesis), a product of
-    Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1)."""
-    a, b = (of_error - np.arange(3)) / 2, of_hypothesis / 2
-    t = np.linspace(0, a[2], 400, endpoint=False)[:, None]
-    moments = gammaln(a - t) + gammaln(a + b) - gammaln(a) - gammaln(a + b - t)
-    return float((t[:, 0] * log_ratio + moments.sum(1)).min())
+TRIED = 200
+"""Largest number of points that are examined for groups."""
+TOGETHER = 0.01
+"""Probability that scattered groups seem to lie together."""
 
 
 def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
@@ -169,30 +110,6 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     same = int((group[_nearest(xyz_a)] == group).sum())
     share = group.mean()
     return bool(bdtrc(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
-
-
-def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Transform, Transform]] | None:
-    """Returns the mask (n,) of one group, and the transforms of both; None if one becomes too small."""
-    model, n = problem.model, len(problem)
-    core = search(problem, by_share(model, n), rng)
-    others = np.flatnonzero(~core.inliers) if core else np.zeros(0, int)
-    inner = search(problem[others], by_share(model, len(others)), rng) if len(others) > model.sample else None
-    if core is None or inner is None:
-        return None
-    first, second = core.inliers, np.isin(np.arange(n), others[inner.inliers])
-    best, least = None, np.inf
-    while True:  # ends: each round lowers the sum of squares
-        if min(first.sum(), second.sum()) <= model.sample:
-            break
-        transforms = problem[first].fit(), problem[second].fit()
-        apart = np.array([problem.squares(t) for t in transforms])
-        total = apart.min(0).sum()
-        if total >= least:
-            break
-        first = apart[0] <= apart[1]
-        second = ~first
-        best, least = (first, transforms), total
-    return best
 
 
 NEEDED, ALONG = 14.5, 9.2
@@ -403,26 +320,25 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
         enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
         if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and enough:
             narrow = candidate, fitted
-            best = Wider(candidate, fitted, sigma, f"lengths in b are {_scale_in_words(candidate, fitted, sigma)}")
-    return best
-
-
-def _scale_in_words(problem: Problem, transform: Transform, sigma_mm: float) -> str:
-    """Returns the ratio of lengths in b to those in a, the likely cause, and the remedy."""
-    if isinstance(transform, Affine):
-        scales = np.linalg.svd(transform.linear, compute_uv=False)
-        return (
+            best = Wider(candidate, fitted, sigma, "")
+    if best is None:
+        return None
+    scales = np.linalg.svd(parts(best.transform)[0], compute_uv=False)
+    if best.problem.model == AFFINE:
+        said = (
             f"{', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one instrument is "
             "scaled or not square to the others, or an arm bends; correct it, or use --model affine within these points"
         )
-    scale = float(np.cbrt(np.linalg.det(parts(transform)[0])))
-    sigma = scale * float(np.sqrt((sigma_mm**2 * problem.unit_covariance(transform))[6, 6]))
-    digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
-    return (
-        f"{scale:.{digits}f} ± {sigma:.{digits}f} times those in a: temperature (steel 11.5, aluminium 23 ppm/K), a "
-        "length standard, a board or an instrument of another scale; correct one of the files, or use --model "
-        "similarity"
-    )
+    else:
+        relative = best.sigma_mm * float(np.sqrt(best.problem.unit_covariance(best.transform)[6, 6]))
+        scale, sigma = float(np.cbrt(scales.prod())), float(np.cbrt(scales.prod())) * relative
+        digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+        said = (
+            f"{scale:.{digits}f} ± {sigma:.{digits}f} times those in a: temperature (steel 11.5, aluminium 23 ppm/K), "
+            "a length standard, a board or an instrument of another scale; correct one of the files, or use --model "
+            "similarity"
+        )
+    return replace(best, note=f"lengths in b are {said}")
 
 
 WIDER_THAN = 10.0

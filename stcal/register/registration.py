@@ -14,40 +14,49 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc, chdtri, gammaln
 
-from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import frozen, require_arguments, require_fields
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.arrays import frozen, require_arguments, require_fields, rms
 from stcal.geometry.rigid import Affine
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register.consensus import (
-    AS_GOOD,
     BY_CHANCE,
+    FALSE_ALARMS,
     MODELS,
     RIGID,
+    SUBSET,
+    WIDE,
     Fitted,
+    Model,
     Problem,
-    alternative_fit,
+    Transform,
+    by_share,
+    by_threshold,
     chance,
-    covariance_of,
+    chernoff,
     problem_of,
     robust_fit,
     rotation_of,
+    search,
     settled,
     sigma_within,
+    variance_within,
 )
 from stcal.register.doubts import (
+    TRIED,
     by_chance,
     check_extent,
     check_mirrored,
     check_mirrored_with_outliers,
     check_supports,
     check_units,
+    lies_together,
     moved_meanwhile,
     notes_of,
     order_note,
     shifted_rows,
-    two_groups,
     wider,
 )
 from stcal.register.registered import Alternative, Registration, held_out
@@ -133,6 +142,14 @@ def orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Opt
 
 
 METHODS = ("robust", "least-squares", "liu2017")
+DISTINCT = 5.0
+"""Least distance between two distinct transforms, in σ."""
+MOST_OF_REST = 0.5
+"""Least share of the outliers that must agree on another transform: a few of many always lie near one by chance."""
+AS_GOOD = 0.5
+"""Share of the result's points with which a second transform makes the result ambiguous."""
+CONTRADICTED_AT = 0.01
+"""Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 NEAREST_MM = 1e-9
 """Smallest threshold, mm: the precision of a double for points at a distance up to 1e12 mm."""
 
@@ -196,7 +213,7 @@ def register(
     )
     again: Callable[[Problem], Fitted] = {
         "robust": partial(robust_fit, threshold=threshold_mm, seed=seed),
-        "least-squares": _least_squares,
+        "least-squares": lambda part: replace(_as_assigned(part, np.ones(len(part), bool), None), threshold=np.inf),
         "liu2017": lambda part: liu2017(part.xyz_a, part.xyz_b, published, seed),
     }[method]
     if method == "robust":
@@ -209,7 +226,12 @@ def register(
         check_extent(inside.model, inside.xyz_a, fitted.sigma)
     if method == "robust" and not fitted.inliers.all():
         check_supports(problem, fitted.inliers, fitted.sigma)
-    alternative = None if second is None else _alternative(fitted, second, problem.xyz_a)
+    alternative = None
+    if second is not None:
+        rotations = [rotation_of(each.transform) for each in (fitted, second)]
+        apart = np.linalg.norm(fitted.transform @ problem.xyz_a - second.transform @ problem.xyz_a, axis=1)
+        turn = float(Rotation.from_matrix(rotations[0] @ rotations[1].T).magnitude())
+        alternative = Alternative(second.transform, np.flatnonzero(second.inliers), rms(apart), turn)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         change = moved_meanwhile(problem, fitted.transform)
@@ -284,10 +306,6 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
     return problem_of(chosen, a, b, weights, covariances, lines)
 
 
-def _least_squares(problem: Problem) -> Fitted:
-    return replace(_as_assigned(problem, np.ones(len(problem), bool), None), threshold=np.inf)
-
-
 def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitted, Fitted | None]:
     """Returns the fit, and another fit on which other points agree."""
     try:
@@ -321,7 +339,131 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
     return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
-def _alternative(fitted: Fitted, other: Fitted, a: np.ndarray) -> Alternative:
-    apart = np.sqrt(np.mean(((fitted.transform @ a - other.transform @ a) ** 2).sum(1)))
-    turn = Rotation.from_matrix(rotation_of(fitted.transform) @ rotation_of(other.transform).T).magnitude()
-    return Alternative(other.transform, np.flatnonzero(other.inliers), float(apart), float(turn))
+def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
+    """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
+    model, outside = problem.model, np.flatnonzero(~fitted.inliers)
+    if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
+        return None
+    rng = np.random.default_rng(seed + 1)
+    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
+    redundancy = model.redundancy(int(fitted.inliers.sum()))
+    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
+    consensus = search(problem[tried], by_threshold(threshold), rng)
+    if consensus is None or consensus.inliers.sum() <= model.sample:
+        return None
+    transform = problem[tried[consensus.inliers]].fit()
+    outliers = problem[outside]
+    near = outliers.squares(transform) <= threshold**2
+    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
+        return None
+    points = outliers.xyz_a[near]
+    if np.sqrt(((transform @ points - fitted.transform @ points) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
+        return None  # good points that a tight threshold cut off
+    # wrong points lie anywhere as far off the transform found as the farthest of them
+    off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
+    found = Fitted(transform, near, fitted.sigma, threshold, consensus.samples)
+    if chance(outliers, found, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+        return None
+    return replace(found, inliers=np.isin(np.arange(len(problem)), outside[near]))
+
+
+FEW, SPHERICAL = 16, 0.1
+"""Largest number of points for which square sums replace determinants; significance of anisotropic noise, of half the
+sets of 16 points with three times the noise along one axis."""
+
+
+def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Transform, Transform] | None:
+    """Returns the transforms of the larger group of points and of the other; None if one transform explains all of them
+    as well, or their places determine the group."""
+    n, model = len(problem), problem.model
+    points = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
+    n = len(points)
+    if n < 2 * (model.sample + 1):
+        return None
+    try:
+        single = points.whitened(points.residuals(points.fit()))
+        assigned = _assigned(points, rng)
+    except (DegenerateError, ConvergenceError):
+        return None
+    if assigned is None or np.abs(single).max() <= points.rounding_mm():
+        return None
+    first, (one, two) = assigned
+    parted = points.whitened(np.where(first[:, None], points.residuals(one), points.residuals(two)))
+    if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(FALSE_ALARMS):
+        return None
+    if lies_together(points.xyz_a, first):
+        return None
+    return (two, one) if first.sum() < n / 2 else (one, two)
+
+
+def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
+    """Returns a bound of the log probability that parting into given groups shrinks residuals (n, 3) so. It is 0 if the
+    loudest axis's noise in the fit exceeds the quiet axes' there: determinants then tell nothing."""
+    n, per_axis = len(whole), model.parameters / 3
+    one, two = whole.T @ whole, parted.T @ parted
+    of_error = n - 2 * per_axis
+    if np.linalg.cond(two) > n / 2:
+        return 0.0
+    bound = wilks_bound(np.linalg.slogdet(two)[1] - np.linalg.slogdet(one)[1], of_error, per_axis)
+    if n <= FEW and sphericity(two, of_error) > SPHERICAL:
+        share = np.trace(two) / np.trace(one)
+        bound = min(bound, float(chernoff(share, 1.5 * of_error, model.parameters / 2)))
+    return bound
+
+
+def sphericity(scatter: np.ndarray, redundancy: float) -> float:
+    """Returns the p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
+    w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
+    return float(chdtrc(5, max(-(redundancy - 23 / 18) * w, 0.0)))
+
+
+def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
+    """Returns Chernoff's bound of log P(Λ ≤ exp(log_ratio)) for Wilks' Λ(3, of_error, of_hypothesis), a product of
+    Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1)."""
+    a, b = (of_error - np.arange(3)) / 2, of_hypothesis / 2
+    t = np.linspace(0, a[2], 400, endpoint=False)[:, None]
+    moments = gammaln(a - t) + gammaln(a + b) - gammaln(a) - gammaln(a + b - t)
+    return float((t[:, 0] * log_ratio + moments.sum(1)).min())
+
+
+def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Transform, Transform]] | None:
+    """Returns the mask (n,) of one group, and the transforms of both; None if one becomes too small."""
+    model, n = problem.model, len(problem)
+    core = search(problem, by_share(model, n), rng)
+    others = np.flatnonzero(~core.inliers) if core else np.zeros(0, int)
+    inner = search(problem[others], by_share(model, len(others)), rng) if len(others) > model.sample else None
+    if core is None or inner is None:
+        return None
+    first, second = core.inliers, np.isin(np.arange(n), others[inner.inliers])
+    best, least = None, np.inf
+    while True:  # ends: each round lowers the sum of squares
+        if min(first.sum(), second.sum()) <= model.sample:
+            break
+        transforms = problem[first].fit(), problem[second].fit()
+        apart = np.array([problem.squares(t) for t in transforms])
+        total = apart.min(0).sum()
+        if total >= least:
+            break
+        first = apart[0] <= apart[1]
+        second = ~first
+        best, least = (first, transforms), total
+    return best
+
+
+def covariance_of(
+    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
+) -> tuple[np.ndarray, bool, float]:
+    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
+
+    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
+    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
+    """
+    redundancy, used, scaled = float(inliers.redundancy), sigma, True
+    if inliers.sigma_mm is not None:
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)
+        if not scaled:
+            used, redundancy = inliers.sigma_mm, np.inf
+    matrix = used**2 * inliers.unit_covariance(b_from_a)
+    if used > 0 and threshold < WIDE * used:
+        matrix = matrix / variance_within(threshold / used)
+    return matrix, scaled, redundancy

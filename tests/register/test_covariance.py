@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.register import register
-from stcal.register.consensus import MODELS, covariance_of, problem_of, sigma_within
+from stcal.register.consensus import MODELS, problem_of, sigma_within
+from stcal.register.registration import covariance_of
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, make_scene, parameter_error

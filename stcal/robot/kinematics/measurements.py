@@ -32,8 +32,6 @@ STATUS, AMBIGUOUS = "status", "ambiguous"
 LONGEST_TOOL_MM = 10_000.0
 """Longest possible tool, by which a target may be farther than the arm reaches."""
 ORIENTED_BY = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
-FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
-"""Largest possible length and joint value: 10 km and a hundred turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -226,7 +224,6 @@ def read_measurements(
             base["stations"] = tuple(table.text("station"))
         notes = said + unread(table, (*columns, *own))
         data = Measurements(table.where, table.lines, q, targets, table.points(), notes=notes, **base)
-        within(table, "position", data.points(), "mm")
         for rows in data.by_station().values():
             _in_reach(data[rows], robot)
         return _usable(data, table)
@@ -237,7 +234,6 @@ def read_measurements(
             f"the header is {table.header()}{table.open_unit('x', LENGTHS)}",
         )
     distances = table.quantity("distance", LENGTHS)
-    within(table, "distance", distances, "mm")
     if rotation is not None:
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
@@ -258,16 +254,6 @@ def read_measurements(
 def targets_of(table: Table) -> tuple[str, ...]:
     """Returns the names (m,) of column ``target``, or of the robot's only target if there is no such column."""
     return tuple(table.text("target")) if "target" in table else ("",) * len(table)
-
-
-def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
-    """Refuses values (m,) or (m, k) beyond possible ones."""
-    most = FARTHEST[unit]
-    table.refuse(
-        (np.abs(values).reshape(len(values), -1) > most).any(axis=1),
-        "E-VALUE-TOO-FAR",
-        lambda _: f"{name} is beyond {most:.4g} {unit}; correct it, or remove the line",
-    )
 
 
 def _in_reach(data: Measurements, robot: Robot) -> None:
@@ -318,7 +304,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
         )
     columns = []
     for i, sliding in enumerate(robot.prismatic, 1):
-        units, unit = (LENGTHS, "mm") if sliding else (ANGLES, "rad")
+        units = LENGTHS if sliding else ANGLES
         values = table.quantity(f"q{i}", units)
         if not sliding and table.unit(f"q{i}", units) == "rad":
             table.refuse(
@@ -329,7 +315,6 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
                     f"q{i}_deg"
                 ),
             )
-        within(table, f"q{i}", values, unit)
         columns.append(values)
     return np.column_stack(columns)
 
@@ -524,15 +509,11 @@ def read_targets(
             "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTED_BY} needed"
         )
     tools = targets_of(table)
-    for line, tool in zip(table.lines, tools, strict=True):
-        if tool not in robot.tools:
-            known = ", ".join(repr(name) for name in robot.tools)
-            raise InputError(
-                "E-ROBOT-NO-TOOL",
-                f"{table.where}: line {line}: target {tool!r} is not in robot {robot.name}; there are {known}",
-            )
-    if poses is not None:
-        within(table, "position", poses.translation, "mm")
+    table.refuse(
+        np.array([tool not in robot.tools for tool in tools]),
+        "E-ROBOT-NO-TOOL",
+        lambda i: f"target {tools[i]!r} is not in robot {robot.name}; there are {', '.join(map(repr, robot.tools))}",
+    )
     return Targets(
         table.where,
         table.lines,

@@ -84,7 +84,7 @@ MOST_RAD = 2 * np.pi + 1e-6
 
 
 MOST_TURNS = 4.0
-"""Number of turns, as an angle, that joints are not expected to reach: 1440°, or 25 rad where degrees were meant."""
+"""Number of turns that joints are not expected to reach: 25 rad, where degrees were meant."""
 
 
 def warn_of_degrees(values: np.ndarray, turns: np.ndarray, what: str) -> None:
@@ -173,10 +173,9 @@ class Joint:
 class Elasticity:
     """Small rotations of the links of n joints in addition to the joints' own: by gravity and by gears.
 
-    Gravity acts on joint i with the torque T = M × g. M is the sum of the moments of its link and of all links that it
-    carries, each in its present orientation. The link deflects by the rotation c T, with one c about the joint's axis
-    and another across it. Gears add an angle with one and two periods per turn of the joint. A payload is a mass at a
-    point of the flange; its weight acts there, in addition to M.
+    The torque T = M × g of gravity deflects link i by the rotation c T, with one c about the joint's axis and another
+    across it; M is the sum of the moments of the link and of all that it carries, as they are oriented. Gears add an
+    angle with one and two periods per turn. A payload is a mass at a point of the flange, in addition to M.
 
     Parameters
     ----------
@@ -208,14 +207,12 @@ class Elasticity:
 
     def __post_init__(self):
         n = len(self.compliance)
-        if self.pivot is None:  # not given
-            object.__setattr__(self, "pivot", np.zeros((n, 3)))
-        if self.hysteresis is None:  # not given
-            object.__setattr__(self, "hysteresis", np.zeros(n))
         shapes = {"compliance": (n, 2), "moment": (n, 3), "periodic": (n, 4), "gravity": (3,), "payload_centre": (3,)}
         shapes |= {"hysteresis": (n,), "pivot": (n, 3)}
         loaded(self.payload_kg, 1)
         for name, shape in shapes.items():
+            if getattr(self, name) is None:  # not given
+                object.__setattr__(self, name, np.zeros(shape))
             freeze(self, name, shape, f"elasticity: {name}")
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
@@ -230,11 +227,10 @@ class Elasticity:
 class Tree:
     """Which joint carries which, of a robot with several arms on one trunk.
 
-    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the
-    branch's first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
-    before it. ``carriers`` : by tool the joint, from 0, that carries it; the last one where a tool is not named.
-
-    Raises InputError: a branch that is carried by a joint that does not come before it.
+    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where its
+    first row begins at the end of the carrier's row, mm; every other joint is carried by the one before it.
+    ``carriers`` : by tool the joint that carries it; the last one where a tool is not named. Raises InputError: a
+    branch that is carried by a joint that does not come before it.
     """
 
     mounts: Mapping[int, tuple[int, Rigid]]
@@ -335,7 +331,7 @@ class Robot(Brief):
         types: Sequence[JointType] = (),
         name: str = "robot",
     ) -> "Robot":
-        """Returns the robot of a table of Denavit–Hartenberg parameters.
+        """Returns the robot of a table of Denavit–Hartenberg parameters; warns of limits that seem to be degrees.
 
         Parameters
         ----------
@@ -345,12 +341,7 @@ class Robot(Brief):
         types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
         name : for messages and reports
 
-        Raises InputError: arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint`
-        refuse.
-
-        Warns
-        -----
-        InputNote : limits of many turns, which seem to be degrees.
+        Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
@@ -388,21 +379,14 @@ class Robot(Brief):
         return self.tools[name]
 
     def loaded(self, payload_kg: float) -> "Robot":
-        """Returns the robot with another mass at its flange, kg; a rigid robot does not deflect under it.
-
-        Raises InputError: a mass below 0, or beyond all that arms carry.
-        """
+        """Returns the robot with another mass at its flange, kg; raises InputError: a mass that no arm carries."""
         loaded(payload_kg, 1)
         if self.elasticity is None:
             return self
         return replace(self, elasticity=replace(self.elasticity, payload_kg=float(payload_kg)))
 
     def chain(self) -> "Chain":
-        """Returns the fixed transforms in order.
-
-        The frames of joints are at the pivots of the elasticity. A shift along the axis of a joint, or of a prismatic
-        joint in any direction, does not change the rigid arm.
-        """
+        """Returns the fixed transforms in order, with the frames of joints at the pivots of the elasticity."""
         gaps, ends = [], []
         pivots = np.zeros((len(self.rows), 3)) if self.elasticity is None else self.elasticity.pivot
         for i, row in enumerate(self.rows):
@@ -425,8 +409,7 @@ class Robot(Brief):
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, *branches)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
-        """Returns the joint, from 0, that carries another (−1: the base), and the start of the other's row after
-        its row."""
+        """Returns the joint, from 0, that carries another (−1: the base), and where the other's row begins."""
         found = None if self.tree is None else self.tree.mounts.get(joint)
         return found or (joint - 1, Rigid())
 
@@ -443,13 +426,12 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """The fixed transforms of an arm, which are all that calibration changes.
+    """The fixed transforms of an arm, which are all that calibration changes; joints turn about or move along z.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
-    first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
-    ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
-    frame; ``elasticity`` : deflection of the links; ``tree`` : if joints form one, with the ``ends`` (n,) of its rows,
-    each in its joint's frame; ``flange_joint`` : whose end is the flange.
+    first: in the world); ``last_from_flange`` : in the frame of the joint that carries the flange; ``prismatic`` :
+    (n,); ``coupling`` : (n, N), of all N values of the controller; ``elasticity`` : of the links; ``tree`` : if joints
+    form one, with the ``ends`` (n,) of its rows in their joints' frames; ``flange_joint`` : whose end is the flange.
     """
 
     rotation: np.ndarray

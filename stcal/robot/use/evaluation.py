@@ -38,7 +38,7 @@ from stcal.robot.identification.prior import Placed
 from stcal.robot.identification.result import Figures, PlacedPose
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
-from stcal.robot.kinematics.measurements import Measurements, unread, within
+from stcal.robot.kinematics.measurements import Measurements, unread
 from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.urdf import few
 
@@ -47,6 +47,8 @@ SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
 """Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
+OFF, OFF_MM = 6.0, 0.1
+"""Ratio of a pose's typical error to that of most, and its size, from which on the pose is named."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
 LEAST_SPREAD_MM = 20.0
@@ -93,7 +95,13 @@ class SetResult(Part):
         if self.elsewhere:
             said = self.elsewhere
         elif abs(self.scale - 1) > SCALE_WITHIN:
-            said = f"measured distances are {self.scale:.4g} times the commanded ones; {_remedy_of_scale(self.scale)}"
+            near = abs(self.scale - 1) < MISSES
+            remedy = "check the instrument's scale" if near else "check units and the order of the poses"
+            for unit, words in UNIT_WORDS.items():
+                for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
+                    if abs(self.scale / times - 1) < SCALE_WITHIN:
+                        remedy = f"check units, as if the {side} ones were {words}"
+            said = f"measured distances are {self.scale:.4g} times the commanded ones; {remedy}"
         elif self.pairs_rms_mm > allowed:
             said = (
                 f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs), "
@@ -161,15 +169,6 @@ class Verification(Brief):
         return found
 
 
-def _remedy_of_scale(scale: float) -> str:
-    """Returns what to check where measured distances are ``scale`` times the commanded ones."""
-    for unit, words in UNIT_WORDS.items():
-        for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
-            if abs(scale / times - 1) < SCALE_WITHIN:
-                return f"check units, as if the {side} ones were {words}"
-    return "check the instrument's scale" if abs(scale - 1) < MISSES else "check units and the order of the poses"
-
-
 def read_measured(path: str | Path | Table) -> MeasuredPoses:
     """Reads commanded and measured positions.
 
@@ -185,8 +184,6 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
     """
     table = read_table(path, WHAT)
     commanded, measured = table.points("commanded_"), table.points()
-    within(table, "commanded position", commanded, "mm")
-    within(table, "position", measured, "mm")
     sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
     names = _names(table, sets, commanded)
     return MeasuredPoses(table.where, table.lines, sets, names, commanded, measured, unread(table))
@@ -196,14 +193,16 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
     """Returns the names of poses from column ``pose``, or else by equal commanded positions, counted within a set."""
     if "pose" in table:
         names = tuple(table.text("pose"))
-        seen: dict[tuple[str, str], int] = {}
-        for line, key in zip(table.lines, zip(sets, names, strict=True), strict=True):
-            if seen.setdefault(key, line) != line:
-                raise InputError(
-                    "E-TABLE-ROW-REPEATED",
-                    f"{table.where}: line {line}: pose {key[1]} of set {key[0]} stands on line {seen[key]} already; "
-                    "give the sets different names",
-                )
+        keys, first = list(zip(sets, names, strict=True)), {}
+        before = [first.setdefault(key, row) for row, key in enumerate(keys)]
+        table.refuse(
+            np.array(before) != np.arange(len(table)),
+            "E-TABLE-ROW-REPEATED",
+            lambda i: (
+                f"pose {names[i]} of set {sets[i]} stands on line {table.lines[before[i]]} already; give the sets "
+                "different names"
+            ),
+        )
         return names
     places, numbers, times = {}, [], Counter()
     for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
@@ -266,11 +265,17 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
         return "measured positions are the commanded ones to the last digit; give those of the instrument"
     wanted, found = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, measured))
     missed = np.abs(found - wanted)
-    off = np.median(missed, axis=1) > max(MISSES * np.median(wanted), MISSES_MM)
+    typical = np.median(missed, axis=1)
+    off = typical > max(MISSES * np.median(wanted), MISSES_MM)
+    far = typical > max(OFF * np.median(typical), OFF_MM)
+    if not off.any() and len(names) >= 6 and 0 < far.mean() <= MOST_ELSEWHERE:
+        listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far))
+        most = f"{np.median(typical):.2g} mm"
+        return f"pose{'s' * int(far.sum() > 1)} {listed}: far worse than the others, {most} (median); measure again"
     if not off.any() or off.mean() > MOST_ELSEWHERE or missed[np.ix_(~off, ~off)].max() > MISSES_MM:
         return ""
     listed = few([name for name, wrong in zip(names, off, strict=True) if wrong])
-    return f"pose{'s' * (off.sum() > 1)} {listed}: not where commanded, the others are; correct or remove"
+    return f"pose{'s' * int(off.sum() > 1)} {listed}: not where commanded, the others are; correct or remove"
 
 
 def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
@@ -304,12 +309,8 @@ FALSE_ALARM, SURELY = 1e-3, 1.5
 """False-alarm probability per row, and factor on its limit, as a model's residuals have longer tails than noise."""
 LEAST_MM = 1e-3
 """Error below which a row is never wrong, as no instrument shows less."""
-ROUNDS = 5
-"""Largest number of rounds of fitting without gross errors; one or two are usually enough."""
-UNSEEN = 1e-12
-"""Relative visibility of a direction of parameters below which its σ is set to a huge value."""
-CHANCE = 0.05
-"""Probability of calling one of two equal robots better."""
+UNSEEN, CHANCE = 1e-12, 0.05
+"""Least relative visibility of parameters, below which σ is huge; probability of calling one of two equals better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,9 +333,8 @@ class Evaluated:
     """Errors of one robot at the r observations, with base and tools as fitted.
 
     ``residuals`` : (r, 3) measured minus modelled position in the base's axes, or (r, 1) distance; mm; ``good`` : (r,)
-    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, empty if none were measured;
-    ``left`` : effects found in the residuals, None if there are too few rows for a test; ``beyond`` : the same after a
-    fit of all kinematic parameters to these rows.
+    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, if measured; ``left`` : effects found
+    in the residuals, None of too few rows; ``beyond`` : the same after a fit of all kinematic parameters.
     """
 
     robot: Robot
@@ -376,9 +376,8 @@ class Evaluated:
 class Evaluation:
     """Robots, in the order given, on one set of r observations: positions or distances.
 
-    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains: they are wrong, or all
-    models lack an effect; nothing was fitted to them; ``differences`` : the robot of least mean error against each
-    other one, in order of their means.
+    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains, which were not fitted;
+    ``differences`` : the robot of least mean error against each other one, in order of their means.
     """
 
     format: ClassVar = "stcal evaluation 1"
@@ -487,7 +486,7 @@ def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[Sta
     """Returns the states of all robots, and a mask (r,) of rows (never of distances) that none explains: not fitted."""
     wrong, width, targets = np.zeros(len(measured), bool), WIDTH[measured.kind], np.array(measured.data.targets)
     freedom = width * len(measured) - _parameters(measured, fit)
-    for _ in range(ROUNDS):
+    for _ in range(5):
         kept = measured[~wrong].data
         states = [start(robot, kept, fit) for robot in robots]
         errors = np.array([position_errors(residuals(state, measured)) for state in states])
