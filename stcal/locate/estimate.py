@@ -15,14 +15,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.least_squares import (
-    Minima,
-    Normal,
-    NormalEquations,
-    block_diagonal,
-    minimise,
-    select_rows,
-)
+from stcal.geometry.least_squares import Minima, Normal, NormalEquations, block_diagonal, minimise, select_rows
 from stcal.geometry.plane import (
     MAX_OUTLIER_SHARE,
     MAX_SIGMA_RAD,

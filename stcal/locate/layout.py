@@ -211,8 +211,7 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
         corners[row] = place
         if np.linalg.det(np.diff(corners[row, :3], axis=0)) <= 0:
             raise InputError(
-                "E-TAG-CORNERS",
-                f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
+                "E-TAG-CORNERS", f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed"
             )
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)

@@ -17,26 +17,8 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
-from stcal.register.consensus import (
-    AFFINE,
-    BY_CHANCE,
-    CLEAN_SETS_WITH_OUTLIER,
-    LEAST_SHARE,
-    LEVERAGE_UP_TO,
-    MODELS,
-    RIGID,
-    SHOWN,
-    Fitted,
-    Model,
-    Problem,
-    Transform,
-    chance,
-    jacobian,
-    parts,
-    robust_fit,
-    rotation_of,
-    some_of,
-)
+from stcal.register import consensus
+from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem, Transform, parts
 from stcal.register.registered import Registration
 from stcal.row_order import Change, change_along
 
@@ -74,8 +56,9 @@ def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
     if len(problem) > IN_ORDER:
         return None
     from_middle = problem.xyz_a - problem.xyz_a.mean(0)
-    residuals, motions = problem.residuals(transform), jacobian(RIGID, Rigid(rotation_of(transform)), from_middle)
-    by_parameters = jacobian(problem.model, transform, from_middle)
+    residuals, turned = problem.residuals(transform), Rigid(consensus.rotation_of(transform))
+    motions = consensus.jacobian(RIGID, turned, from_middle)
+    by_parameters = consensus.jacobian(problem.model, transform, from_middle)
     change = change_along(*(problem.whitened(each) for each in (residuals, by_parameters, motions)))
     size = 0.0 if change is None else float(np.abs(motions @ change.motion).max())
     if change is None or change.p > LEVEL or size <= problem.rounding_mm():
@@ -266,13 +249,13 @@ def check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thresh
             return
     image = replace(problem, xyz_a=problem.xyz_a * FLIP)
     try:
-        mirrored = robust_fit(image, threshold, seed)
+        mirrored = consensus.robust_fit(image, threshold, seed)
     except DegenerateError:
         return
-    if mirrored.inliers.mean() < LEAST_SHARE:  # points near any one plane fit
+    if mirrored.inliers.mean() < consensus.LEAST_SHARE:  # points near any one plane fit
         return
-    usual = 0.0 if fitted is None else chance(problem, fitted)
-    if chance(image, mirrored) < 2 * usual + np.log(BY_CHANCE) and (
+    usual = 0.0 if fitted is None else consensus.chance(problem, fitted)
+    if consensus.chance(image, mirrored) < 2 * usual + np.log(consensus.BY_CHANCE) and (
         fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
     ):
         agreeing = problem[mirrored.inliers]
@@ -505,7 +488,7 @@ def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
         yield ASSUMED
     if result.method == "least-squares":  # rows that the robust method would examine
         square, redundancy = (result.residuals**2).sum(1), problem.redundancy
-        bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
+        bound = square.sum() / redundancy * 3 * ratio_limit(consensus.CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
         if square.max() > bound:
             worst = int(square.argmax())
             yield (
@@ -518,9 +501,9 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
     """Yields notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
     model, transform, rows = problem.model, result.b_from_a, np.flatnonzero(result.inliers)
     inside = problem.xyz_a[rows]
-    if len(rows) <= LEVERAGE_UP_TO and result.method != "liu2017":
+    if len(rows) <= consensus.LEVERAGE_UP_TO and result.method != "liu2017":
         kind = "plane" if model == AFFINE else "line"
-        for row in rows[single_supports(model, inside, sigma)[:SHOWN]]:
+        for row in rows[single_supports(model, inside, sigma)[: consensus.SHOWN]]:
             yield f"only {problem.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
     if model != AFFINE and spreads(inside)[2] < WIDER_THAN * sigma:
         yield "the points lie in a plane: a mirrored frame would not be noticed"
@@ -535,7 +518,7 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
     if found is not None:
         angle, to = found
         moved = np.flatnonzero(to != np.arange(len(to)))
-        names = some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
+        names = consensus.some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
         yield (
             f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names}); "
             "labels exchanged like that would fit as well, so check that rows are the same points"

@@ -60,12 +60,7 @@ class Pairs(Brief):
 
 
 @require_arguments
-def read_pairs(
-    path: str | Path | Table,
-    second: str | Path | Table | None = None,
-    *,
-    key: str = "name",
-) -> Pairs:
+def read_pairs(path: str | Path | Table, second: str | Path | Table | None = None, *, key: str = "name") -> Pairs:
     """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 
     Parameters

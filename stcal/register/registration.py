@@ -21,44 +21,8 @@ from stcal.geometry.arrays import frozen, require_arguments, require_fields, rms
 from stcal.geometry.rigid import Affine
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
-from stcal.register.consensus import (
-    BY_CHANCE,
-    FALSE_ALARMS,
-    MODELS,
-    RIGID,
-    SUBSET,
-    WIDE,
-    Fitted,
-    Model,
-    Problem,
-    Transform,
-    by_share,
-    by_threshold,
-    chance,
-    chernoff,
-    problem_of,
-    robust_fit,
-    rotation_of,
-    search,
-    settled,
-    sigma_within,
-    variance_within,
-)
-from stcal.register.doubts import (
-    TRIED,
-    by_chance,
-    check_extent,
-    check_mirrored,
-    check_mirrored_with_outliers,
-    check_supports,
-    check_units,
-    lies_together,
-    moved_meanwhile,
-    notes_of,
-    order_note,
-    shifted_rows,
-    wider,
-)
+from stcal.register import consensus, doubts
+from stcal.register.consensus import MODELS, RIGID, Fitted, Model, Problem, Transform, problem_of
 from stcal.register.registered import Alternative, Registration, held_out
 
 
@@ -206,13 +170,13 @@ def register(
     """
     problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances, lines)
     if problem.model == RIGID:
-        check_units(problem, seed)
+        doubts.check_units(problem, seed)
     second = None
     published = replace(
         liu2017_options or Liu2017Options(), **({} if threshold_mm is None else {"limit_mm": threshold_mm})
     )
     again: Callable[[Problem], Fitted] = {
-        "robust": partial(robust_fit, threshold=threshold_mm, seed=seed),
+        "robust": partial(consensus.robust_fit, threshold=threshold_mm, seed=seed),
         "least-squares": lambda part: replace(_as_assigned(part, np.ones(len(part), bool), None), threshold=np.inf),
         "liu2017": lambda part: liu2017(part.xyz_a, part.xyz_b, published, seed),
     }[method]
@@ -222,20 +186,20 @@ def register(
         fitted = again(problem)
     inside = problem[fitted.inliers]
     if method != "liu2017":  # the baseline runs as published
-        check_mirrored(inside)
-        check_extent(inside.model, inside.xyz_a, fitted.sigma)
+        doubts.check_mirrored(inside)
+        doubts.check_extent(inside.model, inside.xyz_a, fitted.sigma)
     if method == "robust" and not fitted.inliers.all():
-        check_supports(problem, fitted.inliers, fitted.sigma)
+        doubts.check_supports(problem, fitted.inliers, fitted.sigma)
     alternative = None
     if second is not None:
-        rotations = [rotation_of(each.transform) for each in (fitted, second)]
+        rotations = [consensus.rotation_of(each.transform) for each in (fitted, second)]
         apart = np.linalg.norm(fitted.transform @ problem.xyz_a - second.transform @ problem.xyz_a, axis=1)
         turn = float(Rotation.from_matrix(rotations[0] @ rotations[1].T).magnitude())
         alternative = Alternative(second.transform, np.flatnonzero(second.inliers), rms(apart), turn)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
-        change = moved_meanwhile(problem, fitted.transform)
-        moved = "" if change is None else f"; {order_note(change, problem)}"
+        change = doubts.moved_meanwhile(problem, fitted.transform)
+        moved = "" if change is None else f"; {doubts.order_note(change, problem)}"
         raise DegenerateError(
             "E-REGISTER-TWO-TRANSFORMS",
             f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
@@ -245,8 +209,9 @@ def register(
     covariance, scaled, redundancy = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
     other = shifted = None
     if method != "liu2017":
-        other = wider(inside, fitted.transform)
-        shifted = shifted_rows(*((inside, fitted.transform) if other is None else (other.problem, other.transform)))
+        other = doubts.wider(inside, fitted.transform)
+        explained = (inside, fitted.transform) if other is None else (other.problem, other.transform)
+        shifted = doubts.shifted_rows(*explained)
     if shifted is not None:  # the transform is off by so much if the smaller group is right
         off = np.zeros(len(covariance))
         along = slice(3, None, 4) if len(off) == 12 else slice(3, 6)
@@ -270,7 +235,7 @@ def register(
         seed=seed,
         samples=fitted.samples,
     )
-    return replace(result, notes=tuple(notes_of(result, problem, other, shifted)))
+    return replace(result, notes=tuple(doubts.notes_of(result, problem, other, shifted)))
 
 
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances, lines) -> Problem:
@@ -309,13 +274,13 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
 def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitted, Fitted | None]:
     """Returns the fit, and another fit on which other points agree."""
     try:
-        fitted = robust_fit(problem, threshold, seed)
-        if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
-            raise by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
+        fitted = consensus.robust_fit(problem, threshold, seed)
+        if len(problem) > problem.model.sample and consensus.chance(problem, fitted) > np.log(consensus.BY_CHANCE):
+            raise doubts.by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
     except DegenerateError:
-        check_mirrored_with_outliers(problem, None, threshold, seed)
+        doubts.check_mirrored_with_outliers(problem, None, threshold, seed)
         raise
-    check_mirrored_with_outliers(problem, fitted, threshold, seed)
+    doubts.check_mirrored_with_outliers(problem, fitted, threshold, seed)
     inside = np.flatnonzero(fitted.inliers)
     groups = two_groups(problem[inside], np.random.default_rng([seed, 4]))
     if groups is None:
@@ -324,7 +289,7 @@ def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitte
     first = np.zeros(len(problem), bool)
     first[inside[apart[0] <= apart[1]]] = True
     second = fitted.inliers & ~first
-    one = settled(problem, first, threshold)
+    one = consensus.settled(problem, first, threshold)
     if (one.inliers & second).sum() < second.sum() / 2:
         return one, alternative_fit(problem, one, seed)
     return _as_assigned(problem, first, threshold), _as_assigned(problem, second, threshold)
@@ -335,7 +300,7 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
     part = problem[group]
     transform = part.fit()
     square = part.squares(transform)
-    sigma = sigma_within(float(square.sum()), part.model, len(part), threshold or np.inf)
+    sigma = consensus.sigma_within(float(square.sum()), part.model, len(part), threshold or np.inf)
     return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
@@ -345,13 +310,14 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
     if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
         return None
     rng = np.random.default_rng(seed + 1)
-    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
+    most = consensus.SUBSET
+    tried = outside if len(outside) <= most else np.sort(rng.choice(outside, most, replace=False))
     redundancy = model.redundancy(int(fitted.inliers.sum()))
-    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
-    consensus = search(problem[tried], by_threshold(threshold), rng)
-    if consensus is None or consensus.inliers.sum() <= model.sample:
+    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - consensus.FALSE_ALARMS)))
+    agreed = consensus.search(problem[tried], consensus.by_threshold(threshold), rng)
+    if agreed is None or agreed.inliers.sum() <= model.sample:
         return None
-    transform = problem[tried[consensus.inliers]].fit()
+    transform = problem[tried[agreed.inliers]].fit()
     outliers = problem[outside]
     near = outliers.squares(transform) <= threshold**2
     if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
@@ -361,8 +327,8 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
         return None  # good points that a tight threshold cut off
     # wrong points lie anywhere as far off the transform found as the farthest of them
     off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
-    found = Fitted(transform, near, fitted.sigma, threshold, consensus.samples)
-    if chance(outliers, found, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+    found = Fitted(transform, near, fitted.sigma, threshold, agreed.samples)
+    if consensus.chance(outliers, found, np.full(3, 2 * off)) > np.log(consensus.BY_CHANCE):
         return None
     return replace(found, inliers=np.isin(np.arange(len(problem)), outside[near]))
 
@@ -376,7 +342,7 @@ def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Transform, T
     """Returns the transforms of the larger group of points and of the other; None if one transform explains all of them
     as well, or their places determine the group."""
     n, model = len(problem), problem.model
-    points = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
+    points = problem if n <= doubts.TRIED else problem[np.sort(rng.choice(np.arange(n), doubts.TRIED, replace=False))]
     n = len(points)
     if n < 2 * (model.sample + 1):
         return None
@@ -389,9 +355,9 @@ def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Transform, T
         return None
     first, (one, two) = assigned
     parted = points.whitened(np.where(first[:, None], points.residuals(one), points.residuals(two)))
-    if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(FALSE_ALARMS):
+    if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(consensus.FALSE_ALARMS):
         return None
-    if lies_together(points.xyz_a, first):
+    if doubts.lies_together(points.xyz_a, first):
         return None
     return (two, one) if first.sum() < n / 2 else (one, two)
 
@@ -407,7 +373,7 @@ def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
     bound = wilks_bound(np.linalg.slogdet(two)[1] - np.linalg.slogdet(one)[1], of_error, per_axis)
     if n <= FEW and sphericity(two, of_error) > SPHERICAL:
         share = np.trace(two) / np.trace(one)
-        bound = min(bound, float(chernoff(share, 1.5 * of_error, model.parameters / 2)))
+        bound = min(bound, float(consensus.chernoff(share, 1.5 * of_error, model.parameters / 2)))
     return bound
 
 
@@ -429,10 +395,12 @@ def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> floa
 def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Transform, Transform]] | None:
     """Returns the mask (n,) of one group, and the transforms of both; None if one becomes too small."""
     model, n = problem.model, len(problem)
-    core = search(problem, by_share(model, n), rng)
+    core = consensus.search(problem, consensus.by_share(model, n), rng)
     others = np.flatnonzero(~core.inliers) if core else np.zeros(0, int)
-    inner = search(problem[others], by_share(model, len(others)), rng) if len(others) > model.sample else None
-    if core is None or inner is None:
+    if core is None or len(others) <= model.sample:
+        return None
+    inner = consensus.search(problem[others], consensus.by_share(model, len(others)), rng)
+    if inner is None:
         return None
     first, second = core.inliers, np.isin(np.arange(n), others[inner.inliers])
     best, least = None, np.inf
@@ -464,6 +432,6 @@ def covariance_of(
         if not scaled:
             used, redundancy = inliers.sigma_mm, np.inf
     matrix = used**2 * inliers.unit_covariance(b_from_a)
-    if used > 0 and threshold < WIDE * used:
-        matrix = matrix / variance_within(threshold / used)
+    if used > 0 and threshold < consensus.WIDE * used:
+        matrix = matrix / consensus.variance_within(threshold / used)
     return matrix, scaled, redundancy

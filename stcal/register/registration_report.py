@@ -109,10 +109,7 @@ def _sigma_lines(found: Findings) -> list[str]:
         lines = [f"σ of its rotation about x, y, z: {three(1e3 * np.degrees(sigma[:3]))} mdeg"]
     if isinstance(found.b_from_a, Similarity):
         lines.append(f"scale {found.b_from_a.scale:.8f} ± {sigma[6] * found.b_from_a.scale:.2g}")
-    for place, xyz in (
-        ("the middle of the inliers", found.xyz_a[found.inliers].mean(0)),
-        ("a's origin", np.zeros(3)),
-    ):
+    for place, xyz in (("the middle of the inliers", found.xyz_a[found.inliers].mean(0)), ("a's origin", np.zeros(3))):
         lines.append(f"σ of a transformed point at {place}, along x, y, z: {three(found.sigma_mm_at(xyz))} mm")
     redundancy = f", {found.redundancy:.0f} degrees of freedom" if np.isfinite(found.redundancy) else ""
     factor = "" if found.sigma_factor is None else f", {found.sigma_factor:.2f} of the σ given"
@@ -293,9 +290,7 @@ class RegistrationFile(ResultFile):
     covariance_of: list[str] = Key(description="names of its rows: `rx_rad … z_mm`, `scale`, `m11 … m34_mm`")
     scales: Vector3 = Key(description="ratios of lengths in b to those in a, along three axes")
     sigma_mm: float = Key(description="σ per axis of a residual, estimated")
-    redundancy: Finite = Key(
-        description="degrees of freedom of the σ that the covariance rests on (null: given)",
-    )
+    redundancy: Finite = Key(description="degrees of freedom of the σ that the covariance rests on (null: given)")
     sigma_factor: float | None = Key(description="by how much residuals exceed the σ given with the data")
     scaled: bool = Key(description="whether the covariance rests on the residuals")
     threshold_mm: float | None = Key(description="inliers are nearer than this; null by least squares")

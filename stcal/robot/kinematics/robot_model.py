@@ -159,8 +159,7 @@ class Joint:
         require_fields(self, "joint")
         if not self.lower < self.upper:
             raise InputError(
-                "E-ROBOT-LIMITS",
-                f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them",
+                "E-ROBOT-LIMITS", f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them"
             )
         unknown = [name for name in self.fixed if name not in DHRow.__dataclass_fields__]
         if unknown:
