@@ -25,13 +25,6 @@ def test_exposure_times_are_a_geometric_series():
     refuses("E-EXPOSURES-VALUE", exposure_times, 1.0, 2.0, 1)
 
 
-def test_area_is_that_of_the_convex_hull():
-    assert triangulated_area(tag_at(0, 0)) == pytest.approx(100)
-    both = np.vstack([tag_at(0, 0), tag_at(90, 0)])
-    assert triangulated_area(both) == pytest.approx(1000)
-    assert triangulated_area(np.array([[0.0, 0], [1, 1], [2, 2], [3, 3]])) == 0
-
-
 def test_selection_by_number_and_area():
     small = np.stack([tag_at(0, 0), tag_at(20, 0)])
     large = np.stack([tag_at(0, 0), tag_at(90, 0)])

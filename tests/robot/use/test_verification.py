@@ -64,15 +64,6 @@ def test_figures_by_hand(tmp_path):
     assert "71.4 %" in text
 
 
-def test_no_common_frame_is_needed(tmp_path):
-    here = verify(read_measured(written(tmp_path, lines_of("before"))))
-    turned = Rigid.exp([1, 2, -0.5, 1e4, 0, 3]) @ measured("before")
-    rows = [f"before,{','.join(f'{v:.12g}' for v in (*c, *m))}" for c, m in zip(COMMANDED, turned, strict=True)]
-    there = verify(read_measured(written(tmp_path, rows)))
-    np.testing.assert_allclose(here.sets[0].error_mm, there.sets[0].error_mm, atol=1e-7)
-    assert len(here.sets) == 1
-
-
 def test_a_missing_pose_is_named_and_left_out_of_all(tmp_path):
     result = verify(read_measured(written(tmp_path, lines_of("before") + lines_of("after", leave_out=2))))
     assert result.poses == ("1", "2", "4", "5")
