@@ -57,14 +57,10 @@ ROTATION_WITHIN = 1e-6
 class GoalChain(Brief):
     """Chain of transforms from the camera to the robot's base, made by :func:`~stcal.locate.goal_chain`.
 
-    Parameters
-    ----------
-    mount : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
-    moving : whether the camera is on the flange.
-    flange : base_from_flange by scene, mm; empty for a fixed camera.
-    offset : obj_from_goal, mm, which is exact.
-    source : origin of ``mount``, for messages.
-    poses_source : origin of ``flange``, for messages.
+    ``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm; ``moving`` :
+    whether the camera is on the flange; ``flange`` : base_from_flange by scene, mm; empty for a fixed camera;
+    ``offset`` : obj_from_goal, mm, which is exact; ``source`` : origin of ``mount``, for messages; ``poses_source`` :
+    origin of ``flange``, for messages.
     """
 
     mount: UncertainRigid
@@ -313,12 +309,9 @@ def goal_chain(
 class Goals(Brief):
     """Goals of the accepted scenes in the robot's base.
 
-    Parameters
-    ----------
-    base_from_goal : pose by scene, mm.
-    covariance : covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the
-        errors of all links of the chain; the patent's method states none of its own.
-    notes : doubts about the robot's poses or the transform to it.
+    ``base_from_goal`` : pose by scene, mm; ``covariance`` : (6, 6) of each, rad and mm, left perturbation in the base,
+    with the errors of all links of the chain (the patent's method states none); ``notes`` : doubts about the robot's
+    poses or the transform.
     """
 
     base_from_goal: dict[str, Rigid]
@@ -328,19 +321,12 @@ class Goals(Brief):
 
 @require_arguments
 def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
-    """Returns where the robot has to go: the goal's pose in the robot's base, of each accepted scene.
+    """Returns the goal's pose in the robot's base of each accepted scene, so that no robot moves to a rejected one.
 
-    Parameters
-    ----------
-    results : results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's
-        poses are found.
-    chain : transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
+    ``results`` : of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses
+    are found; ``chain`` : to the robot's base, of :func:`~stcal.locate.goal_chain`.
 
-    Returns
-    -------
-    Goals : of accepted poses only, so that no robot moves to a rejected one.
-
-    Raises InputError: A scene has no robot pose; or the target stands still between the scenes only in another unit or
+    Raises InputError: a scene has no robot pose; or the target stands still between the scenes only in another unit or
     convention of the robot's poses or the transform, which the message names.
     """
     chain.require_poses([each.name for each in results])

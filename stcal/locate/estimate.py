@@ -151,13 +151,9 @@ START_PX = 2.0
 class SeenTags(Brief):
     """Corners of a layout's tags in one scene.
 
-    Parameters
-    ----------
-    rows : (k,); rows of the tags in the layout.
-    corners_px : (k, 4, 2); corners in the image, with distortion.
-    covariance_px2 : (k, 8, 8); covariances of the four corners of each tag, including the layout's additional σ of
-        single corners.
-    edge_sigma_px : (k,); σ of the common shift of all edges of a tag.
+    ``rows`` : (k,) of the tags in the layout; ``corners_px`` : (k, 4, 2), with distortion; ``covariance_px2`` : (k, 8,
+    8) of the four corners of each, with the layout's additional σ of single corners; ``edge_sigma_px`` : (k,) σ of the
+    common shift of all edges of a tag.
     """
 
     rows: np.ndarray
@@ -184,20 +180,14 @@ class SeenTags(Brief):
 class ObjPose(ImageFit, Brief):
     """Pose of the target in one scene.
 
-    Parameters
-    ----------
-    camera_from_obj : the pose, mm.
-    covariance : (6, 6); covariance, rad and mm, left perturbation in the camera frame.
-    rows : (k,); rows of the tags used in the layout.
-    outliers : rows of the tags that were left out because they contradict the others.
-    residuals_px : (4k, 2); measured minus projected corners.
-    weights : (4k,); Huber's weights.
-    chi2 : χ² of the residuals with their full covariance.
-    redundancy : number of measured coordinates minus the six unknowns of the pose.
-    foreshortening : cosine between the target's normal and the line of sight to the middle of its corners.
-    extent_px : extent of the corners in the image across their longer direction.
-    delta_chi2 : χ² of the second solution minus that of the pose; infinite if there is no second solution.
-    second : the second solution, camera_from_obj.
+    ``camera_from_obj`` : the pose, mm; ``covariance`` : (6, 6) covariance, rad and mm, left perturbation in the camera
+    frame; ``rows`` : (k,) rows of the tags used in the layout; ``outliers`` : rows of the tags that were left out
+    because they contradict the others; ``residuals_px`` : (4k, 2) measured minus projected corners; ``weights`` : (4k,)
+    Huber's weights; ``chi2`` : χ² of the residuals with their full covariance; ``redundancy`` : number of measured
+    coordinates minus the six unknowns of the pose; ``foreshortening`` : cosine between the target's normal and the line
+    of sight to the middle of its corners; ``extent_px`` : extent of the corners in the image across their longer
+    direction; ``delta_chi2`` : χ² of the second solution minus that of the pose; infinite if there is no second
+    solution; ``second`` : the second solution, camera_from_obj.
     """
 
     camera_from_obj: Rigid

@@ -272,18 +272,12 @@ MIN_BOARD_POINTS = 4
 class CalibratedLayout(Brief):
     """Result of a target's calibration.
 
-    Parameters
-    ----------
-    layout : layout with the covariance of all corners.
-    published : (n, 4, 2); corners in {obj} by the method of the patent, before the adjustment, mm.
-    board_from_obj : pose of {obj} on the board.
-    adjusted : poses and residuals of the adjustment.
-    images : names of the images used.
-    counts : (n,); number of images that show each tag.
-    unseen : rows of the plan whose tags no image shows; the layout lacks them.
-    deviation_mm : (n,); largest distance of a tag's corner from its nominal place, after the nominal target is fitted
-        to the calibrated one; NaN if the plan has no place.
-    left_out : images that were not used, and why.
+    ``layout`` : layout with the covariance of all corners; ``published`` : (n, 4, 2) corners in {obj} by the method of
+    the patent, before the adjustment, mm; ``board_from_obj`` : pose of {obj} on the board; ``adjusted`` : poses and
+    residuals of the adjustment; ``images`` : names of the images used; ``counts`` : (n,) number of images that show
+    each tag; ``unseen`` : rows of the plan whose tags no image shows; the layout lacks them; ``deviation_mm`` : (n,)
+    largest distance of a tag's corner from its nominal place, after the nominal target is fitted to the calibrated one;
+    NaN if the plan has no place; ``left_out`` : images that were not used, and why.
     """
 
     format: ClassVar = "stcal layout calibration 1"

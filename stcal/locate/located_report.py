@@ -28,17 +28,10 @@ BASE = "base_from_goal_"
 
 @require_arguments
 def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str:
-    """Returns a table of the accepted poses only, so that no robot moves to a rejected one; the others are comments.
+    """Returns the CSV of the accepted poses only, so that no robot moves to a rejected one; the others are comments.
 
-    Parameters
-    ----------
-    results : results of :func:`~stcal.locate.run`.
-    chain : transforms to the robot's base, of :func:`~stcal.locate.goal_chain`, for further columns
-        ``base_from_goal_…``.
-
-    Returns
-    -------
-    str : cSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
+    ``results`` : of :func:`~stcal.locate.run`; ``chain`` : of :func:`~stcal.locate.goal_chain`, for further columns
+    ``base_from_goal_…``. The poses are camera_from_obj, mm, with covariance (form: ``data_layout.md``).
     """
     refused = ""
     for scene in results:

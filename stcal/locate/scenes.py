@@ -52,11 +52,7 @@ from stcal.locate.verdict import (
 class SceneFiles(Brief):
     """The exposures of one scene, not yet read.
 
-    Parameters
-    ----------
-    name : name of the scene.
-    files : files of the exposures.
-    skipped : files beside them that are not exposures, with reasons.
+    ``name`` : of the scene; ``files`` : of the exposures; ``skipped`` : files beside them that are none, with reasons.
     """
 
     name: str
@@ -91,18 +87,9 @@ CAPTURED = "capture.json"
 
 @require_arguments
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
-    """Returns exposure times in a geometric series.
+    """Returns ``count`` exposure times in a geometric series from ``shortest`` to ``longest``, in their unit.
 
-    Parameters
-    ----------
-    shortest, longest : first and last exposure time, in any unit.
-    count : number of exposure times.
-
-    Returns
-    -------
-    (count,) array : in the unit of the arguments.
-
-    Raises InputError: times are not positive or not in order, or ``count`` does not fit them.
+    Raises InputError: times that are not positive or not in order, or a count that does not fit them.
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
         raise InputError(
@@ -115,11 +102,7 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
 
 @require_arguments
 def find_scenes(path: str | Path) -> list[SceneFiles]:
-    """Finds the scenes in a folder.
-
-    Parameters
-    ----------
-    path : one image; a folder of exposures; or a folder of such folders, each a scene.
+    """Finds the scenes of ``path``: one image, a folder of exposures, or a folder of such folders, each a scene.
 
     Raises InputError: the path does not exist, or holds no image.
     """
@@ -298,14 +281,9 @@ class LocateOptions:
 class Located(Brief):
     """Result of one scene.
 
-    Parameters
-    ----------
-    tags : tags that its exposures show.
-    merged : merged corners of all exposures; None if the exposures do not belong together.
-    pose : pose by the joint method; None if it failed, or another method was asked for.
-    verdict : whether the pose may be used.
-    notes : what was left out, and other notes.
-    patent : result of the patent's method, if it was asked for.
+    ``tags`` : that its exposures show; ``merged`` : their corners, None if the exposures do not belong together;
+    ``pose`` : by the joint method, None if it failed or another was asked for; ``verdict`` : whether the pose may be
+    used; ``notes`` : what was left out, and others; ``patent`` : result of the patent's method, if asked for.
     """
 
     tags: SceneTags
@@ -372,7 +350,7 @@ def locate_image(
 
     Parameters
     ----------
-    image : (height, width) or (height, width, 3); grey or RGB, 8 or 16 bit.
+    image : (height, width) or (height, width, 3) grey or RGB, 8 or 16 bit.
     layout : the target.
     camera : the camera that took the image.
     options : options of the method; the defaults if None.

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtri
 
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, InputError
@@ -91,11 +91,8 @@ class PoseCheck:
 class Verdict(Brief):
     """Verdict on whether a pose may be used.
 
-    Parameters
-    ----------
-    decision : {"accept", "ambiguous", "reject"}; ambiguous: χ² of the second solution is not sufficiently larger.
-    checks : all values with their limits.
-    reasons : failed checks, in words.
+    ``decision`` : accept, reject, or ambiguous if χ² of the second solution is not sufficiently larger; ``checks`` :
+    all values with their limits; ``reasons`` : failed checks, in words.
     """
 
     decision: Decision
@@ -112,7 +109,7 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
         apart_deg = float(np.degrees(np.linalg.norm(difference[:3])))
         if apart_deg <= options.equal_deg:
             pose = covering_both(pose)
-    chi2_limit = options.sigma_margin**2 * float(chi_square.isf(options.max_p, pose.redundancy) / pose.redundancy)
+    chi2_limit = options.sigma_margin**2 * float(chdtri(pose.redundancy, options.max_p) / pose.redundancy)
     checks = [
         PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
         PoseCheck("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
@@ -241,18 +238,11 @@ class PatentExposure:
 class PatentPose(Brief):
     """Result of the patent's method for one scene.
 
-    Parameters
-    ----------
-    exposure : index of the exposure that was chosen.
-    candidates : indices of the exposures whose poses were compared.
-    camera_from_obj : the better pose.
-    second : the second solution.
-    errors_px : (float, float); RMS errors of both poses in the chosen exposure, the smaller first.
-    det_j : determinant of the homography's derivative at the normalised centre, 1/mm².
-    tags : number of tags used.
-    verdict : verdict of the patent's gate.
-    exposures : results of all exposures, in their order.
-    same : whether both poses are the same.
+    ``exposure`` : index of the exposure that was chosen; ``candidates`` : indices of the exposures whose poses were
+    compared; ``camera_from_obj`` : the better pose; ``second`` : the second solution; ``errors_px`` : (float, float)
+    RMS errors of both poses in the chosen exposure, the smaller first; ``det_j`` : determinant of the homography's
+    derivative at the normalised centre, 1/mm²; ``tags`` : number of tags used; ``verdict`` : verdict of the patent's
+    gate; ``exposures`` : results of all exposures, in their order; ``same`` : whether both poses are the same.
     """
 
     exposure: int

@@ -24,16 +24,10 @@ COVARIANCE = tuple(f"cov_{a}_{b}" for a, b in combinations_with_replacement(OF_P
 class Pairs(Brief):
     """Pairs of points of two frames from a file, with weights, covariances or neither.
 
-    Parameters
-    ----------
-    where : name of the file.
-    lines : lines of the file.
-    xyz_a, xyz_b : (n, 3); points in mm, each in its own frame; row i of both is the same point.
-    weights : (n,); weights, proportional to 1/σ².
-    covariances : (n, 3, 3) or (n,); covariances, or variances per axis, of b − b_from_a a in frame b, mm².
-    notes : on points of only one of two files.
-
-    Raises InputError: shapes do not fit, or values are not finite.
+    ``where`` : name of the file; ``lines`` : lines of the file; ``xyz_a``, ``xyz_b`` : (n, 3) points in mm, each in its
+    own frame; row i of both is the same point; ``weights`` : (n,) weights, proportional to 1/σ²; ``covariances`` : (n,
+    3, 3) or (n,) covariances, or variances per axis, of b − b_from_a a in frame b, mm²; ``notes`` : on points of only
+    one of two files. Raises InputError: shapes do not fit, or values are not finite.
     """
 
     where: str
@@ -152,12 +146,8 @@ class ErrorFigures:
 class HeldOutPoints(ByValue):
     """Errors |b − b_from_a a| of points that were left out of the fit, by cross-validation.
 
-    Parameters
-    ----------
-    folds : number of parts, each of which is left out once.
-    rows : (m,); indices of the tested points, a sample of very many.
-    error_mm : (m,) array
-    of_inliers, of_all : ErrorFigures
+    ``folds`` : parts, each left out once; ``rows`` : (m,) of the tested points, a sample of very many; ``error_mm`` :
+    (m,); ``of_inliers``, ``of_all`` : their figures.
     """
 
     folds: int
@@ -173,14 +163,10 @@ class HeldOutPoints(ByValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative(ByValue):
-    """Another transform that fits other points as well as the result fits its own.
+    """Another transform ``b_from_a`` that fits other points as well as the result fits its own.
 
-    Parameters
-    ----------
-    b_from_a : transform as in :class:`Registration`.
-    rows : (m,); indices of its points.
-    apart_mm : RMS distance between the two transforms over all points.
-    turn_rad : angle between their rotations.
+    ``rows`` : (m,) of its points; ``apart_mm`` : RMS distance between the transforms over all points; ``turn_rad`` :
+    angle between their rotations.
     """
 
     b_from_a: Transform
@@ -200,12 +186,12 @@ class Registration(Brief):
     ----------
     model, method : ``rigid``, ``similarity`` or ``affine``; ``robust``, ``least-squares`` or ``liu2017``.
     b_from_a : Rigid, Similarity or Affine
-    covariance : (6, 6), (7, 7) or (12, 12); covariance of a left perturbation in frame b: rotation vector (rad),
+    covariance : (6, 6), (7, 7) or (12, 12) covariance of a left perturbation in frame b: rotation vector (rad),
         translation (mm), and a similarity's relative scale; affine: rows of the 3×4 matrix. σ is estimated with
         ``redundancy`` degrees of freedom, so that a confidence region takes its bound from F(p, redundancy), not from
         χ².
-    inliers : (n,); points that the transform is fitted to.
-    residuals : (n, 3); b − b_from_a a of all points, mm, frame b.
+    inliers : (n,) points that the transform is fitted to.
+    residuals : (n, 3) b − b_from_a a of all points, mm, frame b.
     sigma_mm : σ per axis of a residual; the RMS for points of different σ.
     sigma_factor : ratio of the inliers' residuals to the σ given with the data; None if none was given. The covariance
         is scaled by it only if the data contradict the given σ (``scaled``).

@@ -150,13 +150,13 @@ def register(
 
     Parameters
     ----------
-    xyz_a, xyz_b : (n, 3); mm; row i of both is the same point.
+    xyz_a, xyz_b : (n, 3) mm; row i of both is the same point.
     model : ``rigid``, ``similarity`` or ``affine``; the method ``liu2017`` is always affine.
     method : ``robust``, ``least-squares`` or ``liu2017``.
     threshold_mm : largest distance of inliers; estimated from the data if not given (``liu2017``: in place of its
         limit).
-    weights : (n,); weights, proportional to 1/σ², positive.
-    covariances : (n, 3, 3) or (n,); covariance, or variance per axis, of b − b_from_a a in frame b, mm².
+    weights : (n,) weights, proportional to 1/σ², positive.
+    covariances : (n, 3, 3) or (n,) covariance, or variance per axis, of b − b_from_a a in frame b, mm².
     seed : seed of the random samples; the same seed gives the same result.
     folds : number of folds of the cross-validation; 0 for none.
     allow_ambiguous : whether to return the transform of the larger set if another one is about as good, instead of an

@@ -38,18 +38,11 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
-    """Returns the geometric Jacobian: the derivative of base_from_tool by the controller's values.
+    """Returns the geometric Jacobian (m, 6, n): the derivative of base_from_tool by the controller's values.
 
-    Parameters
-    ----------
-    robot, q, tool : as of :func:`forward`.
-
-    Returns
-    -------
-    (m, 6, n) array : rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base
-        (left perturbation), by rad or mm of each joint. The deflection of links is taken as constant.
-
-    Raises InputError: joint values of another shape or not finite; an unknown tool.
+    ``robot``, ``q``, ``tool`` : as of :func:`forward`. Rotation vector (rad) over translation (mm) of the tool's
+    origin, in the axes of the base (left perturbation), by rad or mm of each joint; the deflection of links is taken as
+    constant. Raises InputError: joint values of another shape or not finite; an unknown tool.
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)

@@ -97,7 +97,7 @@ def inverse(
     ----------
     robot : an arm of n joints; where its base stands does not matter.
     poses : m transforms base_from_tool, mm.
-    near : (m, n) or (n,); reference values of the controller, rad or mm. Without it the first pose gets the branch
+    near : (m, n) or (n,) reference values of the controller, rad or mm. Without it the first pose gets the branch
         nearest to the middle of the limits (0 where unlimited), and every other the one nearest to that of the pose
         before.
     tool : name of the tool.
@@ -132,22 +132,13 @@ def inverse(
 
 @require_arguments
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
-    """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
+    """Returns all joint vectors (k, n) within the limits that bring the tool to a pose, one for each branch.
 
-    Values that differ by 2π are one branch, with the value nearest to the middle of the limits. At a singular pose only
-    some of the continuum of solutions are returned. The search has many starts, the same every time.
-
-    Parameters
-    ----------
-    robot : an arm of n joints, at most six; where its base stands does not matter.
-    pose : base_from_tool, mm.
-    tool : name of the tool.
-
-    Returns
-    -------
-    Inverse : joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
-
-    Raises InputError: more than six joints, and so infinitely many solutions; or an unknown tool.
+    ``robot`` : an arm of at most six joints; where its base stands does not matter; ``pose`` : base_from_tool, mm;
+    ``tool`` : its name. Values that differ by 2π are one branch, with the value nearest to the middle of the limits;
+    the branch nearest to it is the first. At a singular pose only some of the continuum of solutions are returned. The
+    search has many starts, the same every time. Raises InputError: more than six joints, and so infinitely many
+    solutions; or an unknown tool.
     """
     problem = InverseProblem.of(robot, tool)
     problem.refuse_redundant()

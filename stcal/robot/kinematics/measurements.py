@@ -44,10 +44,10 @@ class Measurements(Brief):
     lines : (m,) its lines.
     q : (m, n) array: values of the controller, rad or mm.
     targets : (m,) names of the reflector or target seen.
-    positions : (m, 3); of the targets in the instrument's frame, mm; None where only distances were measured.
+    positions : (m, 3) of the targets in the instrument's frame, mm; None where only distances were measured.
     rotations : (m, 3, 3) array, optional: instrument_from_target, where poses were measured.
     covariance : (m, 6, 6) array, optional: of the poses, rad and mm, left perturbation.
-    common : (m, 6, r); common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r
+    common : (m, 6, r) common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r
         normal numbers z of σ 1 for all, and by itself.
     distances : (m,) array, optional: where only these were measured, mm.
     from_row : (m,) array of int, optional: row, from 0, at whose position each distance starts.
@@ -402,16 +402,10 @@ NAMES = ("pose", "image", "name", "scene", PAYLOAD)
 class Targets(Brief):
     """Target poses, one for each row of a file; given by joint values if the file has no poses.
 
-    Parameters
-    ----------
-    where : the file, for messages.
-    lines : (m,) its lines.
-    tools : (m,) names.
-    poses : base_from_tool, mm; None where joint values command.
-    q : (m, n) array or None: commanded joint values, or those whose branch is wanted, rad or mm.
-    names : of the columns :data:`NAMES` that are there, (m,) each.
-    notes : on columns that were not read, and angles by their convention.
-    conditions : what the flange carries.
+    ``where`` : the file, for messages; ``lines`` : (m,) its lines; ``tools`` : (m,) names; ``poses`` : base_from_tool,
+    mm; None where joint values command; ``q`` : (m, n) array or None: commanded joint values, or those whose branch is
+    wanted, rad or mm; ``names`` : of the columns :data:`NAMES` that are there, (m,) each; ``notes`` : on columns that
+    were not read, and angles by their convention; ``conditions`` : what the flange carries.
     """
 
     where: str

@@ -270,7 +270,7 @@ class Robot(Brief):
     convention : of all rows; see :class:`DHRow`.
     rows : one for each joint, from the base; mm, rad.
     joints : one for each row: type and range.
-    coupling : (n, n); kinematic joint values from the controller's, a regular matrix; the identity if not given.
+    coupling : (n, n) kinematic joint values from the controller's, a regular matrix; the identity if not given.
     world_from_base : base in the frame of the measuring instrument, mm.
     tools : flange_from_tool by name, mm; ``""`` is the tool if none is named.
     elasticity : rigid if not given.

@@ -189,17 +189,12 @@ MEANING = {
 class Compensated(Brief):
     """The commanded poses with the corrected values for the controller.
 
-    Parameters
-    ----------
-    targets : Targets
-    poses : commanded base_from_tool.
-    found : by the identified robot.
-    nominal : by the nominal robot: what would be commanded without calibration.
-    before_mm, before_rad : (m,); error of the nominal joint values by the identified robot, which compensation removes;
-        empty without a nominal robot.
-    identified : the identified robot, with the tools that were taken.
-    beyond : joints, and their values, of rows that only joint values beyond the limits reach.
-    doubts : notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
+    ``targets`` : as given; ``poses`` : commanded base_from_tool; ``found`` : by the identified robot; ``nominal`` : by
+    the nominal robot: what would be commanded without calibration; ``before_mm``, ``before_rad`` : (m,) error of the
+    nominal joint values by the identified robot, which compensation removes; empty without a nominal robot;
+    ``identified`` : the identified robot, with the tools that were taken; ``beyond`` : joints, and their values, of
+    rows that only joint values beyond the limits reach; ``doubts`` : notes on targets that may have another meaning,
+    and on tools and arms that differ from the nominal robot.
     """
 
     targets: Targets
@@ -436,16 +431,10 @@ def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
 
 @require_arguments
 def compensated_csv(result: Compensated, robot: Robot) -> str:
-    """Returns the table of compensated joint values; those of poses not reached are empty.
+    """Returns the CSV of the joint values of ``result`` for its identified ``robot``, empty where a pose is not
+    reached.
 
-    Parameters
-    ----------
-    result : of :func:`~stcal.robot.compensate`.
-    robot : the identified robot.
-
-    Returns
-    -------
-    str : CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    Joint values in degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
     columns, names = joint_columns(robot), result.targets.names
     head = [*names, "line", "target", *columns, "status", "error_mm", "error_deg"]

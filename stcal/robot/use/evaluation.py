@@ -170,17 +170,10 @@ class Verification(Brief):
 
 
 def read_measured(path: str | Path | Table) -> MeasuredPoses:
-    """Reads commanded and measured positions.
+    """Reads commanded positions in the robot's base and measured ones in the instrument's frame, mm.
 
-    Parameters
-    ----------
-    path : table (CSV; form: ``data_layout.md``).
-
-    Returns
-    -------
-    MeasuredPoses : positions, mm, commanded ones in the robot's base and measured ones in the instrument's frame.
-
-    Raises InputError: missing columns, bad rows, or a pose twice in one set; the message names the line.
+    ``path`` : table (CSV; form: ``data_layout.md``). Raises InputError: missing columns, bad rows, or a pose twice in
+    one set; the message names the line.
     """
     table = read_table(path, WHAT)
     commanded, measured = table.points("commanded_"), table.points()
@@ -212,18 +205,9 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
 
 
 def verify(data: MeasuredPoses) -> Verification:
-    """Returns the distance errors of each set, over the poses that all sets have.
+    """Returns the distance errors of each set of ``data``, over the poses that all sets have, mm.
 
     Distances from the first position need no common frame of robot and instrument (Zhang & Wei 2017, section 4.3).
-
-    Parameters
-    ----------
-    data : commanded and measured positions of one or more sets, mm.
-
-    Returns
-    -------
-    Verification : mean, standard deviation and maximum of each set's distance errors, mm.
-
     Raises InputError: fewer than three poses in common, or one pose commanded to different places.
     """
     rows: dict[str, dict[str, int]] = {}

@@ -92,7 +92,7 @@ class DesignOptions:
     box : lowest x, y, z and highest x, y, z of the tool in the base, mm.
     tool : name of the tool that is measured.
 
-    Raises InputError: A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box
+    Raises InputError: a choice that does not exist, no more candidates than poses, a σ that is not positive, or a box
     that is empty.
     """
 
@@ -270,16 +270,9 @@ def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
 
 @require_arguments
 def design_csv(result: PoseDesign, robot: Robot) -> str:
-    """Returns the table of the poses to measure.
+    """Returns the CSV of the poses of ``result`` to measure with ``robot``, for which they were designed.
 
-    Parameters
-    ----------
-    result : of :func:`~stcal.robot.design`.
-    robot : the robot for which they were designed.
-
-    Returns
-    -------
-    str : CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
+    Joint values in degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
     """
     rows: list[Sequence] = [["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)]]
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
