@@ -37,6 +37,7 @@ class Liu2017Options:
     share : share of inliers among the points outside the sample, above which a sample is acceptable.
     orthogonal_within : largest entry of |RᵀR − 1| that passes; not stated in the paper.
     tries : number of samples drawn; not stated in the paper.
+
     Raises InputError: a sample of fewer than four points, or a number that is not positive.
     """
 

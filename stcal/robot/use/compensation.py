@@ -431,8 +431,7 @@ def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
 
 @require_arguments
 def compensated_csv(result: Compensated, robot: Robot) -> str:
-    """Returns the CSV of the joint values of ``result`` for its identified ``robot``, empty where a pose is not
-    reached.
+    """Returns the CSV of the joint values of ``result`` for its ``robot``, empty where a pose is not reached.
 
     Joint values in degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
