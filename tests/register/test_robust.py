@@ -37,10 +37,10 @@ def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share, sets):
 
 @pytest.mark.slow
 def test_clean_points_are_kept():
-    """One set in a thousand may lose a point: of 80 more than 2 would with a chance of 1e-4."""
-    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(80)))
+    """One set in a thousand may lose a point: of 40 more than 1 would with a chance of 1e-3."""
+    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(40)))
     assert CLEAN_SETS_WITH_OUTLIER == 0.001
-    assert lost <= 2
+    assert lost <= 1
 
 
 def test_outliers_just_beyond_noise_are_found():

@@ -253,7 +253,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     off = typical > max(MISSES * np.median(wanted), MISSES_MM)
     far = typical > max(OFF * np.median(typical), OFF_MM)
     if not off.any() and len(names) >= 6 and 0 < far.mean() <= MOST_ELSEWHERE:
-        listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far))
+        listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far).tolist())
         most = f"{np.median(typical):.2g} mm"
         return f"pose{'s' * int(far.sum() > 1)} {listed}: far worse than the others, {most} (median); measure again"
     if not off.any() or off.mean() > MOST_ELSEWHERE or missed[np.ix_(~off, ~off)].max() > MISSES_MM:
