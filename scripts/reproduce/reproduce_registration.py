@@ -25,8 +25,8 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.register import register
-from stcal.register.liu2017 import Liu2017Options, affine_least_squares, liu2017
-from stcal.register.transforms import MODELS, problem_of
+from stcal.register.consensus import MODELS, problem_of
+from stcal.register.registration import Liu2017Options, affine_least_squares, liu2017
 from stcal.register.workspace import residual_field
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
@@ -111,7 +111,7 @@ def by_paper(points: Points, limits=LIMITS):
     """
     for limit in limits:
         try:
-            return liu2017(points.a, points.b, Liu2017Options(SAMPLE, limit)).b_from_a, limit
+            return liu2017(points.a, points.b, Liu2017Options(SAMPLE, limit)).transform, limit
         except DegenerateError as error:
             last = error
     raise last

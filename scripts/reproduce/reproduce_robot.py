@@ -27,12 +27,11 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.measurements import Measurements, Targets
 from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
-from stcal.robot.use.targets import Targets
-from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
+from stcal.robot.use.evaluation import MeasuredPoses, SetResult, verify
 from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene

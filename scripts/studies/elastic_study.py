@@ -32,9 +32,8 @@ from stcal.robot.identification.adjustment import State, jacobian, observed, par
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.robot_model import Robot, mh80
+from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, elastic, two_arms

@@ -27,9 +27,8 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.locate.layout import LayoutPlan
 from stcal.locate.layout_calibration import CalibrationImages
-from stcal.locate.patent import PatentOptions
 from stcal.locate.scenes import locate_image
-from stcal.locate.verdict import VerdictOptions
+from stcal.locate.verdict import PatentOptions, VerdictOptions
 from stcal.parallel import one_thread
 from stcal.workflows.board_views import calibration_images
 from tests.support.areas import homography, rendered, squares_nees, warped

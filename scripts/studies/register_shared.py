@@ -28,7 +28,7 @@ from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.liu2017 import affine_least_squares
+from stcal.register.registration import affine_least_squares
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.dh import robot_from_chain

@@ -27,7 +27,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.parallel import one_thread
 from stcal.register import Registration, register
-from stcal.register.transforms import MODELS, jacobian
+from stcal.register.consensus import MODELS, jacobian
 from tests.support.point_pairs import cube, directions, make_scene, random_rigid
 
 KINDS = ("anywhere", "one half", "one axis", "turned")

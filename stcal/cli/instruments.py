@@ -28,7 +28,7 @@ def schedule(
     count: Annotated[int, "Print this many exposure times.", Arg(min=1, max=1000)],
 ) -> None:
     """Print exposure times in a geometric series."""
-    from stcal.locate.exposures import exposure_times
+    from stcal.locate.scenes import exposure_times
 
     for time in exposure_times(shortest, longest, count):
         say(f"{time:.6g}")
@@ -52,7 +52,7 @@ def capture(
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
     from stcal.io.device import OpenCVSource, SimulatedSource
-    from stcal.locate.exposures import capture, exposure_times, scene_folder
+    from stcal.locate.scenes import capture, exposure_times, scene_folder
 
     folder = scene_folder(out, scene)
     exposures = exposure_times(shortest, longest, count)
@@ -167,13 +167,11 @@ def run(
     from stcal.io.device import images_or_frames
     from stcal.io.table import require_pose_table_written
     from stcal.locate.base_chain import accepted, goal_chain, goals, uncertain
-    from stcal.locate.exposures import find_scenes
     from stcal.locate.layout import load_layout
     from stcal.locate.located_report import LocatedFile, poses_csv, run_report
-    from stcal.locate.patent import PatentOptions
-    from stcal.locate.scenes import LocateOptions
+    from stcal.locate.scenes import LocateOptions, find_scenes
     from stcal.locate.scenes import run as located
-    from stcal.locate.verdict import VerdictOptions
+    from stcal.locate.verdict import PatentOptions, VerdictOptions
 
     chain = None
     if hand_eye or registration or robot_poses or offset:
@@ -252,8 +250,8 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
-    from stcal.register.liu2017 import Liu2017Options
-    from stcal.register.point_pairs import read_pairs
+    from stcal.register.registered import read_pairs
+    from stcal.register.registration import Liu2017Options
     from stcal.register.registration_report import OF_ROBOT, RegistrationFile, registration_report, sample_size_section
     from stcal.register.workspace import findings
 

@@ -314,12 +314,12 @@ def verify(
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
     from stcal.robot.robot_report import verification_figure, verification_report
-    from stcal.robot.use import verification
+    from stcal.robot.use import evaluation
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
         tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
-    result = verification.verify(verification.read_measured(tables))
+    result = evaluation.verify(evaluation.read_measured(tables))
     document = verification_report(result)
     say(document.text())
     print_each("note", result.notes)
@@ -329,7 +329,7 @@ def verify(
 
         save(verification_figure(result), plot)
         say(f"written: {plot}")
-    write_if(json_file, lambda: verification.VerificationFile.model_validate(result))
+    write_if(json_file, lambda: evaluation.VerificationFile.model_validate(result))
     write_if(report, document.page)
 
 

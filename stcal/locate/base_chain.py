@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -56,20 +57,10 @@ ROTATION_WITHIN = 1e-6
 class GoalChain(Brief):
     """Chain of transforms from the camera to the robot's base, made by :func:`~stcal.locate.goal_chain`.
 
-    Parameters
-    ----------
-    mount : UncertainRigid
-        flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
-    moving : bool
-        Whether the camera is on the flange.
-    flange : dict of UncertainRigid
-        base_from_flange by scene, mm; empty for a fixed camera.
-    offset : Rigid
-        obj_from_goal, mm, which is exact.
-    source : str
-        Origin of ``mount``, for messages.
-    poses_source : str
-        Origin of ``flange``, for messages.
+    ``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm; ``moving`` :
+    whether the camera is on the flange; ``flange`` : base_from_flange by scene, mm; empty for a fixed camera;
+    ``offset`` : obj_from_goal, mm, which is exact; ``source`` : origin of ``mount``, for messages; ``poses_source`` :
+    origin of ``flange``, for messages.
     """
 
     mount: UncertainRigid
@@ -80,10 +71,7 @@ class GoalChain(Brief):
     poses_source: str = "robot poses"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
-        """Returns the goal's pose in the robot's base. Its covariance holds the errors of all links of the chain.
-
-        Raises InputError: the robot has no pose for this scene.
-        """
+        """Returns the goal's pose in the robot's base, with the errors of all links; InputError: no robot pose."""
         self.require_poses([scene])
         chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
         return self.flange[scene] @ chain if self.moving else chain
@@ -116,8 +104,7 @@ def _mounted(hand_eye: object, robot_poses: object) -> tuple[str, UncertainRigid
 
 
 def _registered(registration: object) -> UncertainRigid:
-    """Returns base_from_camera by ``stcal register`` of a fixed camera (a) and the robot's base (b); raises InputError:
-    not rigid, or a file not as in ``data_layout.md``."""
+    """Returns base_from_camera by a registration of camera (a) and base (b); raises InputError: not rigid."""
     if isinstance(registration, str | Path):
         advice = "give the file of stcal register --out"
         read = read_result(registration, RegistrationRead, "registration file", advice)
@@ -155,41 +142,33 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "
 
 
 NEAR_BASE_MM, NEAR_FLANGE_MM = 20.0, 2.0
-"""Least distances of flange or camera from the base's origin, which is in the robot's foot, and of a camera with its
-housing from the flange's origin. Lengths in metres that are read as mm are smaller: 20 m become 20 mm, 2 m become 2 mm.
-Exact zeros are taken as intended."""
+"""Least distances of flange or camera from the base's origin in the robot's foot, and of a camera from the flange's.
+Metres that are read as mm are less: 20 m become 20 mm, 2 m become 2 mm. Exact zeros are taken as intended."""
 STILL, STILL_RAD = 0.02, np.radians(2)
 """Largest RMS variation between scenes of a target that stands still: share of its distance from the camera, angle."""
 FAR_BETTER, BETTER = 30.0, 5.0
-"""Factors by which the product of both variations, and the variation in position, must shrink in another convention.
-A target that moves does not stand still to 2 % of its distance in another convention by chance."""
+"""Factors by which the product of both variations, and that in position, must shrink in another convention."""
 UNITS = ("m", "in")
 """Units in which lengths may be given by mistake instead of mm."""
 
 
 def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str, ...]:
-    """Returns notes on doubtful robot poses or hand-eye transforms by camera_from_obj of scenes: a target that stands
-    still while the flange turns reveals the convention. Raises InputError: it stands still in another unit or
-    convention only."""
+    """Returns notes on doubtful robot poses or hand-eye transforms by camera_from_obj of scenes. Raises InputError: a
+    target stands still, while the flange turns, in another unit or convention only."""
     scenes = [scene for scene in seen if scene in chain.flange]
     if chain.moving and len(scenes) > 1:
         flange = Poses.of([chain.flange[scene].rigid for scene in scenes])
         _require_standing(chain.mount.rigid, flange, Poses.of([seen[scene].rigid for scene in scenes]))
-    notes = []
     apart = max((float(np.linalg.norm(each.rigid.translation)) for each in chain.flange.values()), default=0.0)
-    if 0 < apart < NEAR_BASE_MM:
-        notes.append(
-            f"robot poses: the flange is within {apart:.2g} mm of the base's origin in all scenes, more than "
-            f"{NEAR_BASE_MM:g} mm expected: if lengths are metres, name the columns _m"
-        )
-    apart = float(np.linalg.norm(chain.mount.rigid.translation))
+    mounted = float(np.linalg.norm(chain.mount.rigid.translation))
     frame, least = ("flange", NEAR_FLANGE_MM) if chain.moving else ("base", NEAR_BASE_MM)
-    if 0 < apart < least:
-        notes.append(
-            f"{chain.source}: the camera is {apart:.2g} mm from the origin of the {frame}, more than {least:g} mm "
-            "expected: if its lengths are metres, multiply them by 1000"
-        )
-    return tuple(notes)
+    notes = {
+        f"robot poses: the flange is within {apart:.2g} mm of the base's origin in all scenes, more than "
+        f"{NEAR_BASE_MM:g} mm expected: if lengths are metres, name the columns _m": 0 < apart < NEAR_BASE_MM,
+        f"{chain.source}: the camera is {mounted:.2g} mm from the origin of the {frame}, more than {least:g} mm "
+        "expected: if its lengths are metres, multiply them by 1000": 0 < mounted < least,
+    }
+    return tuple(note for note, doubtful in notes.items() if doubtful)
 
 
 def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
@@ -204,33 +183,30 @@ def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
         stands = left_mm < min(still_mm, mm / BETTER) and left_rad < STILL_RAD
         return left_mm * left_rad if stands else np.inf
 
-    found = explain(_mistakes(mount, flange), variation, mm * rad / FAR_BETTER)
-    if found:
-        robot, camera = found[0][0].change()
+    for mistake, _ in explain(_mistakes(mount, flange), variation, mm * rad / FAR_BETTER)[:1]:
+        robot, camera = mistake.change()
         left_mm, left_rad = _varies(robot @ camera @ seen)
         raise InputError(
             "E-LOCATE-VARIES",
             f"robot poses and hand-eye: the target's pose in the base varies by {mm:.3g} mm and "
             f"{np.degrees(rad):.3g}° (RMS of {len(seen)} scenes), but by {left_mm:.2g} mm and "
-            f"{np.degrees(left_rad):.2g}° if {found[0][0].words}",
+            f"{np.degrees(left_rad):.2g}° if {mistake.words}",
         )
 
 
 def _mistakes(mount: Rigid, flange: Poses) -> Iterator[Candidate]:
     """Yields frequent mistakes with their remedy, and base_from_flange and flange_from_camera after the remedy."""
-    for reading in READINGS:
-        words = f"the robot's quaternions were {reading.held}; {reading.remedy}"
-        yield Candidate(words, lambda reading=reading: (reading.poses(flange), mount))
-    words = "the robot's poses were flange_from_base; give base_from_flange"
-    yield Candidate(words, lambda: (flange.inverse(), mount))
-    words = "the hand-eye were camera_from_flange; give flange_from_camera"
-    yield Candidate(words, lambda: (flange, mount.inverse()))
+    cases = [(f"the robot's quaternions were {r.held}; {r.remedy}", r.poses(flange), mount) for r in READINGS]
+    cases.append(("the robot's poses were flange_from_base; give base_from_flange", flange.inverse(), mount))
+    cases.append(("the hand-eye were camera_from_flange; give flange_from_camera", flange, mount.inverse()))
     for unit in UNITS:
         by, named = LENGTHS[unit], UNIT_WORDS[unit]
-        words = f"the robot's lengths were {named}; name the columns _{unit}"
-        yield Candidate(words, lambda by=by: (replace(flange, translation=by * flange.translation), mount))
-        words = f"the hand-eye's lengths were {named}; multiply them by {by:g}"
-        yield Candidate(words, lambda by=by: (flange, Rigid(mount.rotation, by * mount.translation)))
+        longer = replace(flange, translation=by * flange.translation)
+        cases.append((f"the robot's lengths were {named}; name the columns _{unit}", longer, mount))
+        farther = Rigid(mount.rotation, by * mount.translation)
+        cases.append((f"the hand-eye's lengths were {named}; multiply them by {by:g}", flange, farther))
+    for words, *case in cases:
+        yield Candidate(words, partial(tuple, case))
 
 
 def _varies(found: Poses) -> tuple[float, float]:
@@ -269,32 +245,23 @@ def goal_chain(
 
     Parameters
     ----------
-    hand_eye : HandEye, Rigid, str or Path, optional
-        Result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
+    hand_eye : result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
         ``robot_poses``, base_from_camera without.
-    registration : Registration, str or Path, optional
-        Result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a is the
-        frame of a fixed camera, b the robot's base.
-    robot_poses : dict of Rigid, str or Path, optional
-        base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are used.
-        Needed for a camera on the flange only.
-    offset : Rigid, str or Path, optional
-        obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
-    key : str
-        Column of the table that names the scenes.
-    quaternions : {"wxyz", "xyzw"}
-        Order of the table's quaternions: by the names of their columns, or x, y, z, w in the order of the columns.
+    registration : result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a
+        is the frame of a fixed camera, b the robot's base.
+    robot_poses : base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are
+        used. Needed for a camera on the flange only.
+    offset : obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
+    key : column of the table that names the scenes.
+    quaternions : {"wxyz", "xyzw"}; order of the table's quaternions: by the names of their columns, or x, y, z, w in
+        the order of the columns.
 
     Returns
     -------
-    GoalChain
-        For :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
+    GoalChain : for :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
 
-    Raises
-    ------
-    InputError
-        Neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not needed, the
-        registration is not rigid, or a file does not follow ``data_layout.md``.
+    Raises InputError: neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not
+    needed, the registration is not rigid, or a file does not follow ``data_layout.md``.
     """
     if hand_eye is not None and registration is not None:
         raise InputError(
@@ -342,15 +309,9 @@ def goal_chain(
 class Goals(Brief):
     """Goals of the accepted scenes in the robot's base.
 
-    Parameters
-    ----------
-    base_from_goal : dict of Rigid
-        Pose by scene, mm.
-    covariance : dict of (6, 6) array
-        Covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the errors
-        of all links of the chain; the patent's method states none of its own.
-    notes : tuple of str
-        Doubts about the robot's poses or the transform to it.
+    ``base_from_goal`` : pose by scene, mm; ``covariance`` : (6, 6) of each, rad and mm, left perturbation in the base,
+    with the errors of all links of the chain (the patent's method states none); ``notes`` : doubts about the robot's
+    poses or the transform.
     """
 
     base_from_goal: dict[str, Rigid]
@@ -360,26 +321,13 @@ class Goals(Brief):
 
 @require_arguments
 def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
-    """Returns where the robot has to go: the goal's pose in the robot's base, of each accepted scene.
+    """Returns the goal's pose in the robot's base of each accepted scene, so that no robot moves to a rejected one.
 
-    Parameters
-    ----------
-    results : sequence of Located
-        Results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses are
-        found.
-    chain : GoalChain
-        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
+    ``results`` : of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses
+    are found; ``chain`` : to the robot's base, of :func:`~stcal.locate.goal_chain`.
 
-    Returns
-    -------
-    Goals
-        Of accepted poses only, so that no robot moves to a rejected one.
-
-    Raises
-    ------
-    InputError
-        A scene has no robot pose; or the target stands still between the scenes only in another unit or convention of
-        the robot's poses or the transform, which the message names.
+    Raises InputError: a scene has no robot pose; or the target stands still between the scenes only in another unit or
+    convention of the robot's poses or the transform, which the message names.
     """
     chain.require_poses([each.name for each in results])
     seen = {each.name: uncertain(each) for each in accepted(results)}

@@ -15,14 +15,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.least_squares import (
-    Minima,
-    Normal,
-    NormalEquations,
-    block_diagonal,
-    minimise,
-    select_rows,
-)
+from stcal.geometry.least_squares import Minima, Normal, NormalEquations, block_diagonal, minimise, select_rows
 from stcal.geometry.plane import (
     MAX_OUTLIER_SHARE,
     MAX_SIGMA_RAD,
@@ -42,19 +35,17 @@ SETTLED = 1e-5
 """Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
 NEAR_DEPTH = 1e-9
 """Depth that stands for a smaller one, mm."""
-WEIGH_STEPS, WEIGHED = 60, 1e-6
-"""Largest number of steps, and the least decrease of χ²: a step of less than σ/1000 is the last. Errors that many
-corners share, such as those of the intrinsics, can move a pose by many σ due to single corners."""
+WEIGHED = 1e-6
+"""Least decrease of χ²: a step of less than σ/1000 is the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarProblem:
     """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
 
-    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (2n, 2n)
-    covariance of ``seen``; ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) covariance of ``xy``,
-    mm²; ``common`` : (n, 2, q) derivative of ``seen`` by parameters that several corners share: shifts of each tag's
-    edges and of each tag, and the intrinsics if they are not exact; ``prior`` : (q, q) covariance of these parameters.
+    ``xy`` : (n, 2) in {obj}, mm, of covariance ``shape`` (2n, 2n); ``seen`` : (n, 2), of covariance ``noise`` (2n, 2n);
+    ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``common`` : (n, 2, q) derivative of ``seen`` by what corners share
+    (shifts of each tag's edges and of each tag, inexact intrinsics), of covariance ``prior`` (q, q).
     """
 
     xy: np.ndarray
@@ -146,7 +137,7 @@ def weighed(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed
 
     # A second solution that is far worse need not converge: it only shows that the first one is better.
     minimum = minimise(
-        pose, linearise, Poses.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
+        pose, linearise, Poses.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=60
     ).state
     view = project(problem, minimum)
     return weigh(view.residual, view.by_pose, full, minimum)
@@ -160,16 +151,9 @@ START_PX = 2.0
 class SeenTags(Brief):
     """Corners of a layout's tags in one scene.
 
-    Parameters
-    ----------
-    rows : (k,) int array
-        Rows of the tags in the layout.
-    corners_px : (k, 4, 2) array
-        Corners in the image, with distortion.
-    covariance_px2 : (k, 8, 8) array
-        Covariances of the four corners of each tag, including the layout's additional σ of single corners.
-    edge_sigma_px : (k,) array
-        σ of the common shift of all edges of a tag.
+    ``rows`` : (k,) of the tags in the layout; ``corners_px`` : (k, 4, 2), with distortion; ``covariance_px2`` : (k, 8,
+    8) of the four corners of each, with the layout's additional σ of single corners; ``edge_sigma_px`` : (k,) σ of the
+    common shift of all edges of a tag.
     """
 
     rows: np.ndarray
@@ -196,32 +180,14 @@ class SeenTags(Brief):
 class ObjPose(ImageFit, Brief):
     """Pose of the target in one scene.
 
-    Parameters
-    ----------
-    camera_from_obj : Rigid
-        The pose, mm.
-    covariance : (6, 6) array
-        Covariance, rad and mm, left perturbation in the camera frame.
-    rows : (k,) int array
-        Rows of the tags used in the layout.
-    outliers : tuple of int
-        Rows of the tags that were left out because they contradict the others.
-    residuals_px : (4k, 2) array
-        Measured minus projected corners.
-    weights : (4k,) array
-        Huber's weights.
-    chi2 : float
-        χ² of the residuals with their full covariance.
-    redundancy : int
-        Number of measured coordinates minus the six unknowns of the pose.
-    foreshortening : float
-        Cosine between the target's normal and the line of sight to the middle of its corners.
-    extent_px : float
-        Extent of the corners in the image across their longer direction.
-    delta_chi2 : float
-        χ² of the second solution minus that of the pose; infinite if there is no second solution.
-    second : Rigid or None
-        The second solution, camera_from_obj.
+    ``camera_from_obj`` : the pose, mm; ``covariance`` : (6, 6) covariance, rad and mm, left perturbation in the camera
+    frame; ``rows`` : (k,) rows of the tags used in the layout; ``outliers`` : rows of the tags that were left out
+    because they contradict the others; ``residuals_px`` : (4k, 2) measured minus projected corners; ``weights`` : (4k,)
+    Huber's weights; ``chi2`` : χ² of the residuals with their full covariance; ``redundancy`` : number of measured
+    coordinates minus the six unknowns of the pose; ``foreshortening`` : cosine between the target's normal and the line
+    of sight to the middle of its corners; ``extent_px`` : extent of the corners in the image across their longer
+    direction; ``delta_chi2`` : χ² of the second solution minus that of the pose; infinite if there is no second
+    solution; ``second`` : the second solution, camera_from_obj.
     """
 
     camera_from_obj: Rigid
@@ -258,28 +224,18 @@ def locate(
 
     Parameters
     ----------
-    seen : SeenTags
-        Corners of the layout's tags, px.
-    layout : TargetLayout
-        The target, with the covariance of its corners.
-    camera : Camera
-        The camera at the size of the image.
-    prior : CameraPrior, optional
-        Covariance of the intrinsics; they are exact if None.
-    where : str
-        Name of the scene, for messages.
+    seen : corners of the layout's tags, px.
+    layout : the target, with the covariance of its corners.
+    camera : the camera at the size of the image.
+    prior : covariance of the intrinsics; they are exact if None.
+    where : name of the scene, for messages.
 
     Returns
     -------
-    ObjPose
-        The better minimum, with the second solution if there is one.
+    ObjPose : the better minimum, with the second solution if there is one.
 
-    Raises
-    ------
-    DegenerateError
-        There is no tag, the tags contradict one another, or the corners do not determine the rotation.
-    ConvergenceError
-        No minimum is reached.
+    Raises DegenerateError: there is no tag, the tags contradict one another, or the corners do not determine the
+    rotation. Raises ConvergenceError: no minimum is reached.
     """
     if not len(seen):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
@@ -425,12 +381,11 @@ class Shift:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """Result of :func:`merge`: the merged corners of all exposures.
+    """Corners of all exposures by :func:`merge`: ``seen``, of the layout's tags.
 
-    ``seen`` : the layout's tags with merged corners; ``counts`` : (e,) number of the layout's tags in each exposure;
-    ``share`` : share of the corners' variance that differs between exposures; ``shifts`` : shift of each exposure
-    against the one with the most tags in common; ``repeated`` : tags of the layout that an exposure shows more than
-    once; ``unknown`` : tags that are not in the layout.
+    ``counts`` : (e,) of these tags in each exposure; ``share`` : of the corners' variance that differs between
+    exposures; ``shifts`` : of each exposure against the one with the most tags in common; ``repeated`` : tags that an
+    exposure shows more than once; ``unknown`` : tags that the layout lacks.
     """
 
     seen: SeenTags
@@ -446,9 +401,8 @@ class Merged:
 
 
 def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
-    """Returns weighted means of the corners over the exposures, with their covariance. The part of their errors that
-    exposures share (print, lens, sampling), by differences against stated σ, does not average out; larger differences
-    increase the σ."""
+    """Returns weighted means of the corners, with their covariance. Errors that exposures share (print, lens),
+    by differences against stated σ, do not average out; larger differences increase the σ."""
     rows = layout.rows()
     used = np.array(sorted({rows[tag] for tags in exposures for tag in tags.tags if tag in rows}), int)
     # corners, NaN if unseen; covariances of each and of a tag's four, px²; σ of the edges' common shift

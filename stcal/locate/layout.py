@@ -25,20 +25,10 @@ WRITTEN_MM = 1e-6
 class LayoutPlan(Brief):
     """Nominal target, for its calibration.
 
-    Parameters
-    ----------
-    name : str
-        Name of the target.
-    tags : tuple of (str, int)
-        Dictionary and id of the n tags.
-    size_mm : (n,) array
-        Side lengths, NaN if not given.
-    origin : int
-        Row of the tag whose centre is the origin of {obj}.
-    corners_mm : (n, 4, 2) array
-        Nominal corners in the plane of the target, NaN if a place is not given.
-    unusual_size : bool
-        True if unusually long or short sides are not a mistake of units.
+    ``name`` : name of the target; ``tags`` : dictionary and id of the n tags; ``size_mm`` : (n,) side lengths, NaN if
+    not given; ``origin`` : row of the tag whose centre is the origin of {obj}; ``corners_mm`` : (n, 4, 2) nominal
+    corners in the plane of the target, NaN if a place is not given; ``unusual_size`` : true if unusually long or short
+    sides are not a mistake of units.
     """
 
     name: str
@@ -65,21 +55,14 @@ class TargetLayout(Brief):
 
     Parameters
     ----------
-    name : str
-        Name of the target.
-    tags : tuple of (str, int)
-        Dictionary and id of the n tags; the ids differ.
-    corners_mm : (n, 4, 2) array
-        Top left, top right, bottom right, bottom left corner as printed, in {obj}.
-    covariance_mm2 : (8n, 8n) array
-        Covariance of all coordinates, mm², tag by tag, corner by corner, x before y.
-    origin : int
-        Row of the tag that holds the origin.
-    sigma_px, tag_sigma_px : float
-        σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
-        the four corners of a tag together. Estimated from the residuals of the calibration.
-    unusual_size : bool
-        True if unusually long or short sides are not a mistake of units.
+    name : name of the target.
+    tags : dictionary and id of the n tags; the ids differ.
+    corners_mm : (n, 4, 2) top left, top right, bottom right, bottom left corner as printed, in {obj}.
+    covariance_mm2 : (8n, 8n) covariance of all coordinates, mm², tag by tag, corner by corner, x before y.
+    origin : row of the tag that holds the origin.
+    sigma_px, tag_sigma_px : σ due to print, lens and flatness, in addition to the measured σ of a corner: of each
+        corner by itself, and of the four corners of a tag together. Estimated from the residuals of the calibration.
+    unusual_size : true if unusually long or short sides are not a mistake of units.
     """
 
     name: str
@@ -120,42 +103,17 @@ class TargetLayout(Brief):
 
 
 def load_plan(path: str | Path) -> LayoutPlan:
-    """Reads a layout file whose tags may lack a place.
+    """Reads a layout file (``path`` : TOML, or YAML of apriltag_ros) whose tags may lack a place.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file: TOML, or YAML of apriltag_ros.
-
-    Returns
-    -------
-    LayoutPlan
-
-    Raises
-    ------
-    InputError
-        The file is unreadable, does not follow ``data_layout.md``, or repeats an id.
+    Raises InputError: the file is unreadable, does not follow ``data_layout.md``, or repeats an id.
     """
     return _plan(load_tags(path, WHAT), f"{WHAT} {path}")
 
 
 def load_layout(path: str | Path) -> TargetLayout:
-    """Reads a layout file: a calibrated one, or one whose tags have nominal places.
+    """Reads a layout file (``path`` : TOML, or YAML of apriltag_ros) with calibrated or nominal places of all tags.
 
-    Parameters
-    ----------
-    path
-        The file: TOML, or YAML of apriltag_ros.
-
-    Returns
-    -------
-    TargetLayout
-        Corners in {obj}, mm, with their covariance.
-
-    Raises
-    ------
-    InputError
-        See :func:`load_plan`; or a tag has no place.
+    The corners are in {obj}, mm, with their covariance. Raises InputError: as :func:`load_plan`; or a tag has no place.
     """
     where = f"{WHAT} {path}"
     data = load_tags(path, WHAT)
@@ -237,8 +195,7 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
         corners[row] = place
         if np.linalg.det(np.diff(corners[row, :3], axis=0)) <= 0:
             raise InputError(
-                "E-TAG-CORNERS",
-                f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
+                "E-TAG-CORNERS", f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed"
             )
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)

@@ -26,19 +26,16 @@ from stcal.locate.estimate import normalised
 from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
 
-MAX_STEPS = 60
-HUBER_TAIL = 0.011
-"""Share of inlier points, or tags, whose residuals Huber's loss damps: 3 σ in the plane."""
-GROSS = 4.0
-"""Multiple of Huber's limit beyond which a residual is gross, such as a misread tag or a hidden corner: weight 0."""
-VARIANCE_ROUNDS = 6
+HUBER_TAIL, GROSS = 0.011, 4.0
+"""Share of inliers whose residuals Huber's loss damps, 3 σ in the plane; multiple of its limit beyond which a residual
+is gross, such as a misread tag or a hidden corner: weight 0."""
+VARIANCE_ROUNDS, NEAR_PX = 6, 0.005
 LEAST_FACTOR = 1e-3
 """Least factor on the stated σ of the board's points. Exact data would give 0, and rounding would be weighed."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
 APART = null_space(TOGETHER.T)
 """Basis (8, 6) of all other displacements of a tag's corners."""
-NEAR_PX = 0.005
 TINY_MM2 = 1e-12
 """Variance of a mode of the print at an amplitude of 0, for an inverse."""
 
@@ -47,10 +44,9 @@ TINY_MM2 = 1e-12
 class ImageCorners:
     """Board and tags in one image, in normalised coordinates without distortion.
 
-    ``pose`` : camera_from_board; ``board_xyz`` : (b, 3) points of the board, mm; ``board_seen`` : (b, 2) their image;
-    ``board_noise`` : (b, 2, 2) covariance of ``board_seen`` up to a factor; ``rows`` : (k,) rows of the tags;
-    ``seen`` : (4k, 2) corners of the tags; ``noise`` : (k, 8, 8) covariance of each tag's corners, px²; ``focal_px`` :
-    approximate ratio of pixels to normalised coordinates.
+    ``pose`` : camera_from_board; ``board_xyz`` : (b, 3) mm; ``board_seen`` : (b, 2), with ``board_noise`` (b, 2, 2) up
+    to a factor; ``rows`` : (k,) of the tags; ``seen`` : (4k, 2) their corners; ``noise`` : (k, 8, 8) covariance, px²;
+    ``focal_px`` : approximate ratio of pixels to normalised coordinates.
     """
 
     name: str
@@ -68,13 +64,12 @@ class ImageCorners:
 class AdjustedLayout:
     """Result of the adjustment: corners of the tags, and poses of the board.
 
-    ``corners_mm`` : (n, 4, 2) corners in the frame of the board; ``stretch``, ``shear`` : how much longer the board is
-    printed along its rows than across, and its shear, relative; ``covariance_mm2`` : (8n, 8n); ``poses`` :
-    camera_from_board; ``board_factor`` : estimated factor on the stated σ of the board's points; ``sigma_px``,
-    ``tag_sigma_px`` : estimated σ due to print, lens and flatness, of single corners and of the four of a tag together;
-    ``board_rms_px``, ``tag_rms_px`` : RMS residuals per coordinate; ``image_rms_px`` : (m,) RMS of the tags by image;
-    ``downweighted`` : share of the tags that are damped as outliers; ``settled`` : whether the σ converged within
-    :data:`VARIANCE_ROUNDS`.
+    ``corners_mm`` : (n, 4, 2) in the frame of the board, with ``covariance_mm2`` (8n, 8n); ``poses`` :
+    camera_from_board; ``board_factor`` : on the stated σ of the board's points; ``sigma_px``, ``tag_sigma_px`` : σ due
+    to print, lens and flatness, of single corners and of the four of a tag together; ``board_rms_px``, ``tag_rms_px`` :
+    residuals per coordinate; ``image_rms_px`` : (m,) of the tags by image; ``downweighted`` : share of the tags that
+    are damped; ``settled`` : whether the σ converged; ``stretch``, ``shear`` : how much longer the board is printed
+    along its rows than across, and its shear, relative.
     """
 
     corners_mm: np.ndarray
@@ -202,12 +197,6 @@ class _Layout:
         board, tags = (rows.focal_px[:, None] * rows.off(pose, places)[0] for rows, places in pairs)
         return board, tags
 
-    def first_noise(self, start: Mapping[str, Any]) -> _Noise:
-        """Returns first σ from the medians of the residuals."""
-        solution = self.problem(start, _Noise(1.0, 0.0, 0.0, 1.0)).at(start)
-        tags = np.linalg.norm(self.px(solution)[1].reshape(-1, 2), axis=1)
-        return _Noise(max(robust_sigma(solution.rows[0].length, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0, 1.0)
-
     def noise(self, solution: Solution, noise: _Noise) -> _Noise:
         """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
         board, tags = solution.rows
@@ -224,16 +213,17 @@ class _Layout:
 
 
 def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
-    """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated. The board is the datum, exact but for how
-    printers stretch and bend. Variance components (Förstner 1979) give a factor on its points' σ, and additional σ of
-    tags. Raises ConvergenceError."""
+    """Minimises Huber's loss over 6m + 8n unknowns, the board being the datum but for stretch and bend of its print.
+    Variance components (Förstner 1979) give its factor and the additional σ of tags. Raises ConvergenceError."""
     layout, poses = _Layout.of(images), Poses.of(image.pose for image in images)
     prints = Vector(np.zeros((1, len(layout.print.spread_mm))))
     values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
-    noise = layout.first_noise(values)
+    first = layout.problem(values, _Noise(1.0, 0.0, 0.0, 1.0)).at(values)
+    apart = np.linalg.norm(layout.px(first)[1].reshape(-1, 2), axis=1)
+    noise = _Noise(max(robust_sigma(first.rows[0].length, 2), LEAST_FACTOR), robust_sigma(apart, 2), 0.0, 1.0)
     settled = False
     for round_ in range(VARIANCE_ROUNDS):
-        minimum = layout.problem(values, noise).minimum(max_steps=MAX_STEPS)
+        minimum = layout.problem(values, noise).minimum(max_steps=60)
         solution = minimum.required("layout", "check board file and camera file").linear
         values = solution.values
         previous, noise = noise, layout.noise(solution, noise)
@@ -282,27 +272,12 @@ MIN_BOARD_POINTS = 4
 class CalibratedLayout(Brief):
     """Result of a target's calibration.
 
-    Parameters
-    ----------
-    layout : TargetLayout
-        Layout with the covariance of all corners.
-    published : (n, 4, 2) array
-        Corners in {obj} by the method of the patent, before the adjustment, mm.
-    board_from_obj : Rigid
-        Pose of {obj} on the board.
-    adjusted : AdjustedLayout
-        Poses and residuals of the adjustment.
-    images : tuple of str
-        Names of the images used.
-    counts : (n,) int array
-        Number of images that show each tag.
-    unseen : tuple of int
-        Rows of the plan whose tags no image shows; the layout lacks them.
-    deviation_mm : (n,) array
-        Largest distance of a tag's corner from its nominal place, after the nominal target is fitted to the calibrated
-        one; NaN if the plan has no place.
-    left_out : tuple of str
-        Images that were not used, and why.
+    ``layout`` : layout with the covariance of all corners; ``published`` : (n, 4, 2) corners in {obj} by the method of
+    the patent, before the adjustment, mm; ``board_from_obj`` : pose of {obj} on the board; ``adjusted`` : poses and
+    residuals of the adjustment; ``images`` : names of the images used; ``counts`` : (n,) number of images that show
+    each tag; ``unseen`` : rows of the plan whose tags no image shows; the layout lacks them; ``deviation_mm`` : (n,)
+    largest distance of a tag's corner from its nominal place, after the nominal target is fitted to the calibrated one;
+    NaN if the plan has no place; ``left_out`` : images that were not used, and why.
     """
 
     format: ClassVar = "stcal layout calibration 1"
@@ -332,28 +307,19 @@ def calibrate(
 
     Parameters
     ----------
-    plan : LayoutPlan
-        Tags of the target, and the tag that holds the origin of {obj}.
-    views : sequence of BoardView or None
-        Views of the board in m images; None if it is not seen.
-    tags : sequence of Tags
-        Tags in the m images.
-    names : sequence of str
-        Names of the images.
-    camera : Camera
-        Camera that took the images, at their size.
-    symmetries : sequence of Rigid
-        All board_from_board that map the board onto itself. The tags then decide the board's numbering in each image.
+    plan : tags of the target, and the tag that holds the origin of {obj}.
+    views : views of the board in m images; None if it is not seen.
+    tags : tags in the m images.
+    names : names of the images.
+    camera : camera that took the images, at their size.
+    symmetries : all board_from_board that map the board onto itself. The tags then decide the board's numbering in each
+        image.
 
     Returns
     -------
-    CalibratedLayout
-        Corners in mm, with their covariance.
+    CalibratedLayout : corners in mm, with their covariance.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than two images show board and tags, or none of them shows the tag that holds {obj}.
+    Raises DegenerateError: fewer than two images show board and tags, or none of them shows the tag that holds {obj}.
     """
     rows = {tag: row for row, tag in enumerate(plan.tags)}
     images, left_out = [], []
@@ -467,6 +433,12 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         plan.unusual_size,
     )
     obj_from_board = Rigid(np.asarray(block_diag(turn, 1.0)), np.append(shift, 0.0))
+    nominal = plan.corners_mm[tag_rows]
+    placed, deviation = np.isfinite(nominal).all((1, 2)), np.full(len(nominal), np.nan)
+    if placed.any():
+        pair = layout.corners_mm, nominal
+        a, b = (np.pad(each[placed].reshape(-1, 2), ((0, 0), (0, 1))) for each in pair)
+        deviation[placed] = np.linalg.norm(align_rigid(a, b) @ b - a, axis=1).reshape(-1, 4).max(1)
     return CalibratedLayout(
         layout,
         in_obj(start, origin),
@@ -475,7 +447,7 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         tuple(image.name for image in images),
         np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows)),
         tuple(row for row in range(len(plan.tags)) if row not in tag_rows),
-        _deviation(plan.corners_mm[tag_rows], layout.corners_mm),
+        deviation,
         tuple(left_out),
     )
 
@@ -497,17 +469,6 @@ def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.
     swing = (flat - middle) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     jacobian[:, :, rows] -= swing[:, :, None, None] * by_angle[None, None]
     return np.einsum("ij,njmk->nimk", turn, jacobian).reshape(2 * n, 2 * n)
-
-
-def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Returns the largest distance of each tag's corners from their nominal places, after one fit of all tags."""
-    placed = np.isfinite(nominal).all((1, 2))
-    deviation = np.full(len(nominal), np.nan)
-    if placed.any():
-        a, b = (np.pad(each[placed].reshape(-1, 2), ((0, 0), (0, 1))) for each in (corners, nominal))
-        distance = np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
-        deviation[placed] = distance.reshape(-1, 4).max(1)
-    return deviation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,12 +15,10 @@ from stcal.io.json import Finite, Named, Part, Pose, ResultFile, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
 from stcal.locate.base_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.estimate import Merged, ObjPose
-from stcal.locate.exposures import Exposure, SceneFiles
 from stcal.locate.layout import TargetLayout
 from stcal.locate.layout_calibration import AdjustedLayout, CalibratedLayout
-from stcal.locate.patent import ASSUMED, PatentPose
-from stcal.locate.scenes import Located
-from stcal.locate.verdict import Verdict
+from stcal.locate.scenes import Exposure, Located, SceneFiles
+from stcal.locate.verdict import ASSUMED, PatentPose, Verdict
 from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, columns, macro, verdict_word
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
@@ -30,19 +28,10 @@ BASE = "base_from_goal_"
 
 @require_arguments
 def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str:
-    """Returns a table of the accepted poses only, so that no robot moves to a rejected one; the others are comments.
+    """Returns the CSV of the accepted poses only, so that no robot moves to a rejected one; the others are comments.
 
-    Parameters
-    ----------
-    results : sequence of Located
-        Results of :func:`~stcal.locate.run`.
-    chain : GoalChain, optional
-        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`, for further columns ``base_from_goal_…``.
-
-    Returns
-    -------
-    str
-        CSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
+    ``results`` : of :func:`~stcal.locate.run`; ``chain`` : of :func:`~stcal.locate.goal_chain`, for further columns
+    ``base_from_goal_…``. The poses are camera_from_obj, mm, with covariance (form: ``data_layout.md``).
     """
     refused = ""
     for scene in results:
@@ -53,14 +42,12 @@ def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str
     base = [BASE + column for column in columns] if chain else []
     rows: list[Sequence] = [["scene", "tags", "exposures", *columns, "rms_px", "chi2_per_dof", *base]]
     for scene in accepted(results):
-        pose = uncertain(scene)
+        pose, fit = uncertain(scene), ["", ""]
+        if scene.pose is not None:
+            fit = [f"{scene.pose.rms_px():.4f}", f"{scene.pose.chi2_per_redundancy():.4f}"]
+        tags = len(scene.merged.seen) if scene.merged else 0
         cells = pose_cells(pose.rigid, pose.covariance if full else None)
-        fit = (
-            ["", ""]
-            if scene.pose is None
-            else [f"{scene.pose.rms_px():.4f}", f"{scene.pose.chi2_per_redundancy():.4f}"]
-        )
-        row = [scene.name, len(scene.merged.seen) if scene.merged else 0, len(scene.exposures), *cells, *fit]
+        row = [scene.name, tags, len(scene.exposures), *cells, *fit]
         if chain:
             goal = chain.base_from_goal(scene.name, pose)
             row += pose_cells(goal.rigid, goal.covariance if full else None)
@@ -85,7 +72,16 @@ def run_report(
         [name, *(number(v, 2) for v in pose.translation), *(number(v, 3) for v in np.degrees(pose.log()[:3]))]
         for name, pose in (goals.base_from_goal if goals else {}).items()
     ]
-    scenes_and_goals = [Table(heads, _overview(results), css="text"), Table(goal_heads, goal_rows)]
+    rows = []
+    for each in results:
+        pose, fit = each.camera_from_obj, each.pose
+        place = [None] * 3 if pose is None else pose.translation
+        sigma = [None] * 3 if fit is None else [fit.sigma_mm(), np.degrees(fit.sigma_rad()), fit.rms_px()]
+        tags = len(each.merged.seen) if each.merged else 0
+        figures = [*(number(v, 2) for v in place), *(number(v, 3) for v in sigma)]
+        why = "; ".join((*each.verdict.reasons, *each.notes))
+        rows.append([each.name, verdict_word(each.verdict.decision), tags, len(each.exposures), *figures, why])
+    scenes_and_goals = [Table(heads, rows, css="text"), Table(goal_heads, goal_rows)]
     good = len(accepted(results))
     count = f"{len(results)} scene{'s' * (len(results) != 1)}, {good} accepted"
     return Document(
@@ -100,26 +96,6 @@ def run_report(
         ],
         [Answer("yes" if good == len(results) else "part" if good else "no", count)],
     )
-
-
-def _overview(results: Sequence[Located]) -> list[list]:
-    rows = []
-    for located in results:
-        pose, fit = located.camera_from_obj, located.pose
-        place = [None] * 3 if pose is None else pose.translation
-        sigma = [None] * 3 if fit is None else [fit.sigma_mm(), np.degrees(fit.sigma_rad()), fit.rms_px()]
-        rows.append(
-            [
-                located.name,
-                verdict_word(located.verdict.decision),
-                len(located.merged.seen) if located.merged else 0,
-                len(located.exposures),
-                *(number(v, 2) for v in place),
-                *(number(v, 3) for v in sigma),
-                "; ".join((*located.verdict.reasons, *located.notes)),
-            ]
-        )
-    return rows
 
 
 def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> list[Block]:
@@ -277,27 +253,19 @@ class CalibratedLayoutFile(ResultFile):
     )
 
 
-FEW_IMAGES = 3
-
-
 def calibrated_text(result: CalibratedLayout) -> str:
     """Returns the report as text: totals, and a line for each tag."""
     layout, adjusted = result.layout, result.adjusted
     moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
     sigma = np.sqrt((layout.sigma_mm() ** 2).sum(2).mean(1))
     side = np.linalg.norm(np.roll(layout.corners_mm, -1, axis=1) - layout.corners_mm, axis=2).mean(1)
-    rows = [
-        [
-            str(tag),
-            dictionary + (", origin" if row == layout.origin else ""),
-            result.counts[row],
-            number(side[row], 3),
-            number(1000 * sigma[row], 1),
-            number(1000 * moved[row], 1),
-            number(result.deviation_mm[row], 3),
-        ]
-        for row, (dictionary, tag) in enumerate(layout.tags)
-    ]
+    rows = []
+    for row, (dictionary, tag) in enumerate(layout.tags):
+        um = number(1000 * sigma[row], 1), number(1000 * moved[row], 1)
+        name = dictionary + (", origin" if row == layout.origin else "")
+        rows.append(
+            [str(tag), name, result.counts[row], number(side[row], 3), *um, number(result.deviation_mm[row], 3)]
+        )
     heads = ["id", "<dictionary", "images", "side_mm", "sigma_um", "adjusted by_um", "from nominal_mm"]
     about = (
         f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
@@ -317,9 +285,9 @@ def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> li
     if result.unseen:
         tags = ", ".join(str(names[row][1]) for row in result.unseen)
         messages.append(f"tags that no image shows, left out of the layout: {tags}")
-    few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < FEW_IMAGES]
+    few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < 3]
     if few:
-        messages.append(f"tags in fewer than {FEW_IMAGES} images, so that a misread one would not be noticed: {few}")
+        messages.append(f"tags in fewer than 3 images, so that a misread one would not be noticed: {few}")
     if result.adjusted.downweighted > 0.1:
         messages.append(
             f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; are target and board in one plane?"

@@ -1,26 +1,248 @@
-"""Pipeline from exposures to poses with verdicts: the stages in order."""
+"""Scenes of exposures: schedules of times, capture, and the pipeline from exposures to poses with verdicts."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+import stcal
 from stcal.boards.board_designs import TagLayout
 from stcal.boards.finders import shift_by_curves
-from stcal.boards.tags import seen_otherwise
+from stcal.boards.tags import Tags, find_tags, seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
-from stcal.io.images import decode, grey_8bit, grey_of, size_fault
-from stcal.locate.estimate import Merged, ObjPose, locate, merge
-from stcal.locate.exposures import Exposure, SceneFiles, SceneTags, detect, read_scenes
+from stcal.io.device import DARK, SATURATED, Source, png
+from stcal.io.files import json_text, real_place, save
+from stcal.io.images import (
+    SUFFIXES,
+    TOP_GROUP,
+    USUAL,
+    ImageFile,
+    decode,
+    find_images,
+    grey_8bit,
+    grey_of,
+    image_file,
+    size_fault,
+)
+from stcal.io.json import Part, ResultFile, require_result_written
+from stcal.locate.estimate import Merged, ObjPose, SeenTags, locate, merge
 from stcal.locate.layout import TargetLayout
-from stcal.locate.patent import PatentOptions, PatentPose, locate_as_patent
-from stcal.locate.verdict import Verdict, VerdictOptions, judge, likely_mistake
+from stcal.locate.verdict import (
+    PatentOptions,
+    PatentPose,
+    Verdict,
+    VerdictOptions,
+    judge,
+    likely_mistake,
+    locate_as_patent,
+)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SceneFiles(Brief):
+    """The exposures of one scene, not yet read.
+
+    ``name`` : of the scene; ``files`` : of the exposures; ``skipped`` : files beside them that are none, with reasons.
+    """
+
+    name: str
+    files: tuple[ImageFile, ...]
+    skipped: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        require_fields(self, "scene")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """One readable image: the ``tags`` that it shows, and its ``size`` (width and height, px)."""
+
+    name: str
+    tags: Tags
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneTags:
+    """The readable exposures of one scene; ``unreadable`` : why others could not be read."""
+
+    name: str
+    exposures: tuple[Exposure, ...]
+    unreadable: tuple[str, ...] = ()
+
+
+CAPTURED = "capture.json"
+"""Name of the file that ``capture`` writes beside the images of a scene."""
+
+
+@require_arguments
+def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
+    """Returns ``count`` exposure times in a geometric series from ``shortest`` to ``longest``, in their unit.
+
+    Raises InputError: times that are not positive or not in order, or a count that does not fit them.
+    """
+    if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
+        raise InputError(
+            "E-EXPOSURES-VALUE",
+            f"exposures: {count} from {shortest:g} to {longest:g}; two or more, from a positive shortest time to a "
+            "longest that is not shorter, needed",
+        )
+    return np.geomspace(shortest, longest, count)
+
+
+@require_arguments
+def find_scenes(path: str | Path) -> list[SceneFiles]:
+    """Finds the scenes of ``path``: one image, a folder of exposures, or a folder of such folders, each a scene.
+
+    Raises InputError: the path does not exist, or holds no image.
+    """
+    path = Path(path)
+    if path.is_file():
+        if path.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(USUAL)} needed"
+            )
+        return [SceneFiles(path.stem, (image_file(path),))]
+    files, skipped = find_images(path)
+    scenes = []
+    for group in dict.fromkeys(file.group for file in files):
+        skipped_in_group = [s for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group]
+        left_out = tuple(f"{s.name}: {s.reason}" for s in skipped_in_group if Path(s.name).name != CAPTURED)
+        name = real_place(path).name if group == TOP_GROUP else group
+        scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
+    return scenes
+
+
+def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int | None = None) -> Iterator[SceneTags]:
+    """Yields the tags of each scene. Each image is decoded once, while other threads search earlier images for tags."""
+    dictionaries = layout.dictionaries()
+    with ThreadPoolExecutor(workers) as pool:
+        for scene in scenes:
+            pending, unreadable = [], []
+            for file in scene.files:
+                # Decoding stays in this thread, because it captures what the decoders write to standard error.
+                try:
+                    image = grey_8bit(decode(file.read(), file.name))
+                except (InputError, OSError) as error:
+                    unreadable.append(" ".join(str(error).split()))
+                else:
+                    pending.append(pool.submit(detect, image, file.name, dictionaries))
+            yield SceneTags(scene.name, tuple(each.result() for each in pending), tuple(unreadable))
+
+
+def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
+    """Finds the tags of a decoded image."""
+    return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
+
+
+class CapturedRow(Part):
+    image: str
+    exposure: float
+    exposure_set: float
+    saturated_share: float
+    dark_share: float
+
+
+class CaptureFile(ResultFile):
+    """Content of ``capture.json`` of a scene: the settings asked for, and those really set."""
+
+    format: Literal["stcal capture 1"] = Field(description="the file's form and its version")
+    version: str = Field(description="of stcal")
+    camera: str = Field(description="what took the images")
+    gain: float | None = Field(description="asked for; null: as it was")
+    settle_s: float = Field(description="waited after each change of exposure, s")
+    exposures: list[CapturedRow] = Field(
+        description="`image`, `exposure` asked for and `exposure_set` by the driver, in its unit; `saturated_share` "
+        "and `dark_share` of the pixels"
+    )
+
+
+def scene_folder(out: Path, scene: str) -> Path:
+    """Returns a scene's new folder; raises InputError: the name is invalid, or the scene exists."""
+    if not re.fullmatch(r"[\w][\w .-]{0,99}", scene):
+        raise InputError(
+            "E-DEVICE-NAME", f"scene {scene!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
+        )
+    folder = out / scene
+    if folder.exists():
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
+    return folder
+
+
+@require_arguments
+def capture(
+    source: Source,
+    exposures: Sequence[float],
+    folder: str | Path,
+    gain: float | None = None,
+    settle_s: float = 0.3,
+    taken: Callable[[CapturedRow], None] | None = None,
+) -> CaptureFile:
+    """Takes an exposure series and writes ``<folder>/<exposure>.png`` and ``capture.json`` with the settings used.
+
+    Parameters
+    ----------
+    source : the camera; or anything else with a ``name`` and their methods.
+    exposures : exposures in the unit of the camera's driver, as of :func:`stcal.locate.exposure_times`.
+    folder : new folder of the scene. It is written only after all images are taken.
+    gain : gain that ``source`` was told, for ``capture.json``.
+    settle_s : time that the camera is given after each change of exposure, s.
+    taken : called with the row of each image.
+
+    Returns
+    -------
+    CaptureFile : the exposures asked for and those set, and shares of saturated and dark pixels.
+
+    Raises InputError: the camera refuses an exposure or gives no image, an exposure comes twice, or the folder exists.
+    """
+    folder = Path(folder)
+    if not 0 <= settle_s <= 60:
+        raise InputError("E-OPTION-RANGE", f"--settle-s {settle_s:g}: 0 to 60 s needed")
+    if folder.exists():
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
+    rows, images = [], []
+    for exposure in exposures:
+        image, exposure_set = source.expose(float(exposure), settle_s)
+        row = CapturedRow(
+            image=f"{exposure:.6g}.png",
+            exposure=float(exposure),
+            exposure_set=exposure_set,
+            saturated_share=float((image >= SATURATED).mean()),
+            dark_share=float((image <= DARK).mean()),
+        )
+        if any(each.image == row.image for each in rows):
+            raise InputError(
+                "E-EXPOSURES-VALUE", f"exposure {exposure:.6g} comes twice; take fewer --count, or a wider range"
+            )
+        rows.append(row)
+        images.append(image)
+        if taken:
+            taken(row)
+    content = CaptureFile(
+        format="stcal capture 1",
+        version=stcal.__version__,
+        camera=source.name,
+        gain=gain,
+        settle_s=settle_s,
+        exposures=rows,
+    )
+    folder.mkdir(parents=True)
+    for row, image in zip(rows, images, strict=True):
+        save(folder / row.image, png(image))
+    save(folder / CAPTURED, json_text(content.content()))
+    require_result_written(folder / CAPTURED, content)
+    return content
+
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0
@@ -33,16 +255,12 @@ class LocateOptions:
 
     Parameters
     ----------
-    method : {"joint", "patent"}
-        One pose from all exposures together, or the method of the patent.
-    verdict : VerdictOptions
-        Limits of the joint method.
-    patent : PatentOptions
-        Limits of the patent's method.
-    moved_px : float
-        A scene has moved if its tags shift by more than this between exposures, and by more than :data:`MOVED_SIGMAS`.
-    workers : int or None
-        Number of threads that search for tags; as many as cores if None.
+    method : {"joint", "patent"}; one pose from all exposures together, or the method of the patent.
+    verdict : limits of the joint method.
+    patent : limits of the patent's method.
+    moved_px : A scene has moved if its tags shift by more than this between exposures, and by more than
+        :data:`MOVED_SIGMAS`.
+    workers : number of threads that search for tags; as many as cores if None.
     """
 
     method: Method = "joint"
@@ -63,20 +281,9 @@ class LocateOptions:
 class Located(Brief):
     """Result of one scene.
 
-    Parameters
-    ----------
-    tags : SceneTags
-        Tags that its exposures show.
-    merged : Merged or None
-        Merged corners of all exposures; None if the exposures do not belong together.
-    pose : ObjPose or None
-        Pose by the joint method; None if it failed, or another method was asked for.
-    verdict : Verdict
-        Whether the pose may be used.
-    notes : tuple of str
-        What was left out, and other notes.
-    patent : PatentPose or None
-        Result of the patent's method, if it was asked for.
+    ``tags`` : that its exposures show; ``merged`` : their corners, None if the exposures do not belong together;
+    ``pose`` : by the joint method, None if it failed or another was asked for; ``verdict`` : whether the pose may be
+    used; ``notes`` : what was left out, and others; ``patent`` : result of the patent's method, if asked for.
     """
 
     tags: SceneTags
@@ -114,29 +321,21 @@ def run(
 
     Parameters
     ----------
-    scenes : sequence of SceneFiles
-        Scenes from :func:`~stcal.locate.find_scenes`.
-    layout : TargetLayout or TagLayout
-        The target.
-    camera : Camera
-        The camera that took the exposures.
-    options : LocateOptions, optional
-        Options of the method; the defaults if None.
+    scenes : scenes from :func:`~stcal.locate.find_scenes`.
+    layout : the target.
+    camera : the camera that took the exposures.
+    options : options of the method; the defaults if None.
 
     Yields
     ------
-    Located
-        One result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and never
-        ends the run.
+    Located : one result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and
+        never ends the run.
     """
     options, model = options or LocateOptions(), camera_model(camera)
     layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        located = locate_scene(tags, layout, model, options)
-        if _without_tag(located):
-            first = next(file for file in files.files if file.name == tags.exposures[0].name)
-            located = _explained(located, layout, decode(first.read(), first.name))
-        yield located
+        by_name = {file.name: file for file in files.files}
+        yield locate_scene(tags, layout, model, options, lambda name, own=by_name: decode(own[name].read(), name))
 
 
 @require_arguments
@@ -151,26 +350,17 @@ def locate_image(
 
     Parameters
     ----------
-    image : (height, width) or (height, width, 3) array
-        Grey or RGB, 8 or 16 bit.
-    layout : TargetLayout or TagLayout
-        The target.
-    camera : Camera
-        The camera that took the image.
-    options : LocateOptions, optional
-        Options of the method; the defaults if None.
-    name : str
-        Name of the image, for messages.
+    image : (height, width) or (height, width, 3) grey or RGB, 8 or 16 bit.
+    layout : the target.
+    camera : the camera that took the image.
+    options : options of the method; the defaults if None.
+    name : name of the image, for messages.
 
     Returns
     -------
-    Located
-        Its ``pose`` is None if there is none; the verdict says why.
+    Located : its ``pose`` is None if there is none; the verdict says why.
 
-    Raises
-    ------
-    InputError
-        The image is no grey or RGB array, or its size is not the camera's.
+    Raises InputError: the image is no grey or RGB array, or its size is not the camera's.
     """
     grey = grey_of(image, name)
     target = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
@@ -180,45 +370,78 @@ def locate_image(
     if size != wanted:
         raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
     exposure = detect(grey_8bit(grey), name, target.dictionaries())
-    located = locate_scene(SceneTags(name, (exposure,)), target, model, options)
-    return _explained(located, target, grey) if _without_tag(located) else located
+    return locate_scene(SceneTags(name, (exposure,)), target, model, options, lambda _: grey)
 
 
 def locate_scene(
-    scene: SceneTags, layout: TargetLayout, camera: CameraModel, options: LocateOptions | None = None
+    scene: SceneTags,
+    layout: TargetLayout,
+    camera: CameraModel,
+    options: LocateOptions | None = None,
+    image_of: Callable[[str], np.ndarray] | None = None,
 ) -> Located:
-    """Locates the target in one scene and judges the pose."""
+    """Locates the target in one scene and judges the pose; in an image without its tags, others are looked for."""
     options = options or LocateOptions()
     used, notes = scene.exposures, [f"left out: {trouble}" for trouble in scene.unreadable]
+    merged = None
 
-    def rejected(merged: Merged | None, *reasons: str) -> Located:
+    def rejected(*reasons: str) -> Located:
         return Located(scene, merged, None, Verdict("reject", (), reasons), tuple(notes))
 
-    if trouble := _size_trouble(scene, camera):
-        return rejected(None, trouble)
+    if not used:
+        return rejected("no readable image; 1 needed")
+    sizes = {exposure.size: exposure.name for exposure in reversed(used)}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} {size[0]}×{size[1]}" for size, name in sorted(sizes.items()))
+        return rejected(f"exposures of different sizes ({shown} px); one size needed, as the camera file's")
+    width, height = used[0].size
+    if (camera.width or width, camera.height or height) != (width, height):
+        return rejected(
+            f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
+            "give the camera that took them"
+        )
     merged = merge([exposure.tags for exposure in used], layout, [exposure.name for exposure in used])
-    if merged.unknown:
-        notes.append(f"tags in view that the layout does not have: {_first_ids(merged.unknown)}")
+    unknown = ", ".join(str(tag) for _, tag in merged.unknown[:5]) + (", …" if len(merged.unknown) > 5 else "")
+    if unknown:
+        notes.append(f"tags in view that the layout does not have: {unknown}")
     notes += [
         f"{each.name}: motion during the exposure blurs edges by {each.tags.smear_px:.1f} px, which σ contain; "
         "camera and target at rest, or a shorter exposure"
         for each in used
         if each.tags.smear_px
     ]
-    if trouble := _scene_trouble(merged, options):
-        return rejected(merged, trouble)
+    if not sum(merged.counts) and image_of:
+        if unknown:
+            return rejected(
+                f"no tag of the layout, but others of its dictionaries ({unknown}); is it the layout of this target?"
+            )
+        shown = seen_otherwise(image_of(used[0].name), layout.rows(), "the layout file")
+        more = f", and {used[0].name} shows {shown}" if shown else ""
+        return rejected(f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed{more}")
+    if merged.repeated:
+        names = ", ".join(str(tag) for _, tag in merged.repeated)
+        return rejected(f"tags seen twice: {names}; every id once in view needed; cover the copy")
+    if not len(merged.seen):
+        return rejected("no tag of the layout; 1 needed")
+    moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
+    if moved:
+        shift = max(moved, key=lambda shift: shift.shift_px)
+        further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
+        return rejected(
+            f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
+            f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
+        )
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
 
-    def mistakes(pose: ObjPose | None) -> list[str]:
+    def mistakes(seen: SeenTags, pose: ObjPose | None) -> list[str]:
         try:
-            mistake = likely_mistake(merged.seen, layout, camera.sized(*used[0].size), prior, pose)
+            mistake = likely_mistake(seen, layout, camera.sized(width, height), prior, pose)
         except StcalError:  # it is the camera's fault
             return []
         return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
 
     try:
-        sized = camera.sized(*used[0].size)
-        corners = merged.seen.corners_px
+        sized, corners = camera.sized(width, height), merged.seen.corners_px
         straight = corners - shift_by_curves(corners, sized)
         merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
         if options.method == "patent":
@@ -226,69 +449,14 @@ def locate_scene(
             return Located(scene, merged, None, found.verdict, tuple(notes), found)
         pose = locate(merged.seen, layout, sized, prior, scene.name)
     except StcalError as error:
-        return rejected(merged, str(error).removeprefix(f"{scene.name}: "), *mistakes(None))
+        return rejected(str(error).removeprefix(f"{scene.name}: "), *mistakes(merged.seen, None))
     if pose.outliers:
-        notes.append(
-            f"tags that contradict the others, left out: {', '.join(str(layout.tags[r][1]) for r in pose.outliers)}"
-        )
-    explained = mistakes(pose) if pose.outliers else []
+        ids = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
+        notes.append(f"tags that contradict the others, left out: {ids}")
+    explained = mistakes(merged.seen, pose) if pose.outliers else []
     pose, verdict = judge(pose, options.verdict)
     if verdict.decision == "reject":
-        explained = explained or mistakes(pose)
+        explained = explained or mistakes(merged.seen, pose)
     if explained:
         verdict = replace(verdict, decision="reject", reasons=(*verdict.reasons, *explained))
     return Located(scene, merged, pose, verdict, tuple(notes))
-
-
-def _first_ids(tags: Sequence[tuple[str, int]]) -> str:
-    return ", ".join(str(tag) for _, tag in tags[:5]) + (", …" if len(tags) > 5 else "")
-
-
-def _size_trouble(scene: SceneTags, camera: CameraModel) -> str | None:
-    used = scene.exposures
-    if not used:
-        return "no readable image; 1 needed"
-    sizes = {exposure.size: exposure.name for exposure in reversed(used)}
-    if len(sizes) > 1:
-        shown = ", ".join(f"{name} {size[0]}×{size[1]}" for size, name in sorted(sizes.items()))
-        return f"exposures of different sizes ({shown} px); one size needed, as the camera file's"
-    width, height = used[0].size
-    if (camera.width or width, camera.height or height) != (width, height):
-        return (
-            f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
-            "give the camera that took them"
-        )
-    return None
-
-
-def _scene_trouble(merged: Merged, options: LocateOptions) -> str | None:
-    if merged.repeated:
-        names = ", ".join(str(tag) for _, tag in merged.repeated)
-        return f"tags seen twice: {names}; every id once in view needed; cover the copy"
-    if not len(merged.seen):
-        return "no tag of the layout; 1 needed"
-    moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
-    if not moved:
-        return None
-    shift = max(moved, key=lambda shift: shift.shift_px)
-    further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
-    return (
-        f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
-        f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
-    )
-
-
-def _without_tag(located: Located) -> bool:
-    return located.merged is not None and not sum(located.merged.counts)
-
-
-def _explained(located: Located, layout: TargetLayout, image: np.ndarray) -> Located:
-    """Returns the result of a scene without a tag with the reason: tags in its image may be of another dictionary."""
-    if located.merged and located.merged.unknown:
-        names = _first_ids(located.merged.unknown)
-        reason = f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
-    else:
-        reason = f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed"
-        if shown := seen_otherwise(image, layout.rows(), "the layout file"):
-            reason = f"{reason}, and {located.exposures[0].name} shows {shown}"
-    return replace(located, verdict=Verdict("reject", (), (reason,)))

@@ -1,18 +1,21 @@
-"""Verdict on a pose, each value with its limit, and accept, ambiguous or reject; and the mistake in a layout that would
-explain why it fits badly."""
+"""Verdict on a pose, and the mistake in a layout that explains a bad fit; for comparison, the method of the CN patent
+"monocular visual target positioning" (Anhui Yuanguji), steps S5 to S9."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
+from scipy.spatial import Delaunay, QhullError
+from scipy.special import chdtri
 
-from stcal.errors import InputError
+from stcal.boards.tags import Tags
+from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import deciding_delta
-from stcal.geometry.rigid import Poses
+from stcal.geometry.plane import PlanePoses, deciding_delta, poses_of_plane
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import ObjPose, SeenTags, covering_both, locate, reprojection_rms
 from stcal.locate.layout import TargetLayout
@@ -26,23 +29,15 @@ class VerdictOptions:
 
     Parameters
     ----------
-    min_tags : int
-        Least number of tags used.
-    min_spread_px : float
-        Least extent of the corners across their longer direction.
-    min_foreshortening : float
-        Least cosine between the target's normal and the line of sight. It replaces det J for a target of any size
-        and distance.
-    max_p : float
-        Significance level: a pose is rejected if its residuals are so large that chance makes them more rarely.
-    flip_odds : float
-        Largest odds of the second solution, for Gaussian errors.
-    sigma_margin : float
-        Factor by which all σ may be too small while ``flip_odds`` still holds.
-    equal_deg : float
-        Two solutions nearer than this count as one, whose covariance covers both.
-    max_sigma_deg, max_sigma_mm : float
-        Largest σ of rotation and position in their worst direction; no limit if None.
+    min_tags : least number of tags used.
+    min_spread_px : least extent of the corners across their longer direction.
+    min_foreshortening : least cosine between the target's normal and the line of sight. It replaces det J for a target
+        of any size and distance.
+    max_p : significance level: a pose is rejected if its residuals are so large that chance makes them more rarely.
+    flip_odds : largest odds of the second solution, for Gaussian errors.
+    sigma_margin : factor by which all σ may be too small while ``flip_odds`` still holds.
+    equal_deg : two solutions nearer than this count as one, whose covariance covers both.
+    max_sigma_deg, max_sigma_mm : largest σ of rotation and position in their worst direction; no limit if None.
     """
 
     min_tags: int = 1
@@ -96,14 +91,8 @@ class PoseCheck:
 class Verdict(Brief):
     """Verdict on whether a pose may be used.
 
-    Parameters
-    ----------
-    decision : {"accept", "ambiguous", "reject"}
-        Ambiguous: χ² of the second solution is not sufficiently larger.
-    checks : tuple of PoseCheck
-        All values with their limits.
-    reasons : tuple of str
-        Failed checks, in words.
+    ``decision`` : accept, reject, or ambiguous if χ² of the second solution is not sufficiently larger; ``checks`` :
+    all values with their limits; ``reasons`` : failed checks, in words.
     """
 
     decision: Decision
@@ -120,7 +109,7 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
         apart_deg = float(np.degrees(np.linalg.norm(difference[:3])))
         if apart_deg <= options.equal_deg:
             pose = covering_both(pose)
-    chi2_limit = options.sigma_margin**2 * float(chi_square.isf(options.max_p, pose.redundancy) / pose.redundancy)
+    chi2_limit = options.sigma_margin**2 * float(chdtri(pose.redundancy, options.max_p) / pose.redundancy)
     checks = [
         PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
         PoseCheck("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
@@ -140,13 +129,9 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     return pose, Verdict("ambiguous", tuple(checks), (f"two poses {apart_deg:.1f}° apart: {checks[-1].text()}",))
 
 
-LEAST_TAGS = 2
-"""A single tag fits each way round."""
-FITS = 0.02
-"""Largest RMS distance of corners from where a layout has them, over the mean side of the tags in the image. A tag that
-is turned or elsewhere misses by half a side and more; lens and print by less than a hundredth."""
-BETTER = 3.0
-"""Factor by which this distance must shrink for a mistake to be named."""
+FITS, BETTER = 0.02, 3.0
+"""Largest RMS distance of corners from where a layout has them, over the mean side of the tags; factor by which it must
+shrink for a mistake to be named. A wrong tag misses by half a side and more; lens and print by less than 0.01."""
 ALIKE = 1.5
 """Mistakes that fit within this factor of the best one fit as well: the first of them is named, the simplest."""
 TURNS = {
@@ -162,7 +147,7 @@ def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
     """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by it as it is."""
-    if len(detected) < LEAST_TAGS:
+    if len(detected) < 2:  # a single tag fits each way round
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()
     allowed = FITS * float(side)
@@ -197,3 +182,158 @@ def _mistakes(corners: np.ndarray) -> list[Candidate]:
     for words, other in ((MIRRORED.format(" and angle_deg"), mirrored), (MIRRORED.format(""), moved)):
         found += [(words, other), (f"{words} and {TURNS[2]}", np.roll(other, 2, axis=1))]
     return [Candidate(words, lambda other=other: other) for words, other in found]
+
+
+ASSUMED = (
+    "assumed where the text has no formula or no value: E_res is the larger reprojection error over the smaller; "
+    "errors are RMS over the corners; exposures form a geometric series; S_dis, J_lim, E_lim and E_ratio as given"
+)
+SAME_RAD, SAME_SHARE = 1e-3, 1e-3
+"""T_a and T_b are the same pose if they differ by less: in rotation, and in translation as a share of the distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatentOptions:
+    """Thresholds of the patent, which names them but gives no values.
+
+    Parameters
+    ----------
+    area_share : S_dis, least area that an exposure's tags span, as a share of the largest area.
+    min_det_j : J_lim, 1/mm². A target of any size that is seen frontally from 10 m has 10⁻⁸.
+    max_error_px : E_lim, largest RMS error.
+    min_error_ratio : E_ratio, least ratio of the second solution's error to the first's.
+    """
+
+    area_share: float = 0.8
+    min_det_j: float = 1e-8
+    max_error_px: float = 1.0
+    min_error_ratio: float = 2.0
+
+    def __post_init__(self):
+        require_fields(self, "patent", min_det_j=0)
+        if not (0 <= self.area_share < 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
+            raise InputError(
+                "E-OPTION-RANGE",
+                f"patent: S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}: "
+                "0 to less than 1, a positive number and 1 or more needed",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatentExposure:
+    """``tags`` : of the layout in exposure number ``exposure``; ``area_px2`` : of their triangles; None if others show
+    more; ``candidate`` : compared with others; ``poses`` : T_a, T_b by ``errors_px``, or None; ``det_j`` : of the
+    homography's derivative at the normalised centre, 1/mm²."""
+
+    exposure: int
+    tags: int
+    area_px2: float | None = None
+    candidate: bool = False
+    poses: tuple[Rigid, Rigid] | None = None
+    errors_px: tuple[float, float] | None = None
+    det_j: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PatentPose(Brief):
+    """Result of the patent's method for one scene.
+
+    ``exposure`` : index of the exposure that was chosen; ``candidates`` : indices of the exposures whose poses were
+    compared; ``camera_from_obj`` : the better pose; ``second`` : the second solution; ``errors_px`` : (float, float)
+    RMS errors of both poses in the chosen exposure, the smaller first; ``det_j`` : determinant of the homography's
+    derivative at the normalised centre, 1/mm²; ``tags`` : number of tags used; ``verdict`` : verdict of the patent's
+    gate; ``exposures`` : results of all exposures, in their order; ``same`` : whether both poses are the same.
+    """
+
+    exposure: int
+    candidates: tuple[int, ...]
+    camera_from_obj: Rigid
+    second: Rigid
+    errors_px: tuple[float, float]
+    det_j: float
+    tags: int
+    verdict: Verdict
+    exposures: tuple[PatentExposure, ...] = ()
+    same: bool = False
+
+
+def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
+    """Returns the indices of the exposures with the most tags (S5); ``corners`` : (k, 4, 2) px of each exposure."""
+    most = max(len(each) for each in corners)
+    return [i for i, each in enumerate(corners) if len(each) == most]
+
+
+def largest_area(corners: Sequence[np.ndarray], chosen: Sequence[int], share: float) -> list[int]:
+    """Returns the chosen exposures whose tags span more than ``share`` of the largest area (S5)."""
+    area = {i: triangulated_area(corners[i].reshape(-1, 2)) for i in chosen}
+    return [i for i in chosen if area[i] > share * max(area.values())]
+
+
+def triangulated_area(points: np.ndarray) -> float:
+    """Returns the sum of the Delaunay triangles' areas by Heron's formula, px²; 0 for collinear points."""
+    try:
+        triangles = points[Delaunay(points).simplices]
+    except QhullError:
+        return 0.0
+    a, b, c = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).T
+    s = (a + b + c) / 2
+    return float(np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0)).sum())
+
+
+def locate_as_patent(
+    exposures: Sequence[Tags],
+    layout: TargetLayout,
+    camera: Camera,
+    options: PatentOptions | None = None,
+    where: str = "scene",
+    solve: Callable[[np.ndarray, np.ndarray], PlanePoses] = poses_of_plane,
+) -> PatentPose:
+    """Applies the gate (S5 to S9) to the exposure of least IPPE error; raises DegenerateError: no tag, or no pose."""
+    options = options or PatentOptions()
+    rows = layout.rows()
+    listed = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
+    corners = [tags.corners_px[of_layout] for tags, of_layout in zip(exposures, listed, strict=True)]
+    if not any(listed):
+        raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
+    most = most_tags(corners)
+    chosen = largest_area(corners, most, options.area_share)
+    results = [PatentExposure(i, len(of_layout)) for i, of_layout in enumerate(listed)]
+    for i in most:
+        results[i] = replace(results[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
+    best: PatentPose | None = None
+    for i in chosen:
+        xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in listed[i]]].reshape(-1, 2)
+        pixels = corners[i].reshape(-1, 2)
+        try:
+            found = solve(xy, camera.normalised_from_pixel(pixels))
+        except DegenerateError:
+            continue
+        (low, first), (high, second) = sorted(
+            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in found.poses), key=lambda each: each[0]
+        )
+        results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=found.determinant)
+        if best is None or low < best.errors_px[0]:
+            shift = np.linalg.norm(first.translation - second.translation)
+            same = (first @ second.inverse()).angle_rad() < SAME_RAD  # T_a and T_b are equivalent (S8)
+            same = bool(same and shift < SAME_SHARE * np.linalg.norm(first.translation))
+            verdict = gate(found.determinant, low, high / max(low, 1e-9), same, options)
+            pair, count = (first, second, (low, high)), len(listed[i])
+            best = PatentPose(i, tuple(chosen), *pair, found.determinant, count, verdict, same=same)
+    if best is None:
+        raise DegenerateError(
+            "E-LOCATE-NO-POSE",
+            f"{where}: no pose explains the tags' corners in any exposure; check layout and camera file",
+        )
+    return replace(best, exposures=tuple(results))
+
+
+def gate(det_j: float, error_px: float, error_ratio: float, same: bool, options: PatentOptions) -> Verdict:
+    """Accepts if det J, the error, and (for two different poses) the ratio of the errors keep their limits (S9)."""
+    checks = [
+        PoseCheck("det J", det_j, at_least=options.min_det_j, unit="/mm²"),
+        PoseCheck("error", error_px, at_most=options.max_error_px, unit=" px"),
+    ]
+    if not same:
+        checks.append(PoseCheck("error ratio", error_ratio, at_least=options.min_error_ratio))
+    failed = tuple(check.text() for check in checks if not check.passed)
+    return Verdict("reject" if failed else "accept", tuple(checks), failed)

@@ -1,7 +1,7 @@
-from .liu2017 import Liu2017Options as Liu2017Options
-from .point_pairs import Pairs as Pairs
-from .point_pairs import read_pairs as read_pairs
 from .registered import Alternative as Alternative
 from .registered import HeldOutPoints as HeldOutPoints
+from .registered import Pairs as Pairs
 from .registered import Registration as Registration
+from .registered import read_pairs as read_pairs
+from .registration import Liu2017Options as Liu2017Options
 from .registration import register as register

@@ -1,40 +1,304 @@
-"""The robust method: consensus of a subset, then σ, inliers and the final fit over all points together.
+"""Fits of a registration's three models to point pairs, and the pairs that agree on one (the robust method).
 
 1. A consensus, point pairs that agree on one transform, is searched, and again within itself until its points are
    consistent with one σ.
-2. Fit, σ and inliers are updated in turn until the set stays the same. A point is an outlier if its residual, with the
-   fit's own uncertainty (deletion residual), exceeds the F(3, ν) bound that any point of a clean set exceeds in one
-   case of a thousand (5 σ for a hundred points), or if it exceeds the given threshold.
-3. The consensus is tested for chance: a-contrario again, now against points that lie anywhere among the others
-   (Moisan & Stival 2004).
+2. Fit, σ and inliers are updated in turn until the set stays the same. An outlier's deletion residual exceeds the
+   F(3, ν) bound that any point of a clean set exceeds in one case of a thousand, or its residual the given threshold.
+3. The consensus is tested for chance, now against points that lie anywhere among the others.
 4. The other points are searched for another transform on which they agree as well.
 
-In the search, random minimal samples are scored, and the best are concentrated. The score needs no threshold. For a
-transform and the k points nearest to it, x = RSS_k / RSS_n compares their square sum with that of the least-squares fit
-to all n. Were all residuals Gaussian of one σ, x would follow Beta((3k − p)/2, 3(n − k)/2) for a set chosen beforehand;
-for the best of all C(n, k) sets of all sizes the chance is at most Σ C(n, k) P(x): a number of false alarms in the
-sense of Moisan & Stival (2004, a-contrario RANSAC), but with Gaussian least squares as the background, so that neither
-a threshold nor a volume enters. The set that minimises it is the consensus; a minimum above ``FALSE_ALARMS`` means that
-nothing contradicts one σ for all points. Chernoff's bound stands for the Beta distribution (it is never below it, and
-has no underflow). Refinement is the concentration step of least trimmed squares (Rousseeuw & Van Driessen 2006): fit to
-the set, choose the set anew.
+In the search, random minimal samples are scored without a threshold, and the best are concentrated as in least trimmed
+squares (Rousseeuw & Van Driessen 2006). Were all residuals Gaussian of one σ, x = RSS_k / RSS_n of the k points nearest
+to a transform, over that of the fit to all n, would follow Beta((3k − p)/2, 3(n − k)/2) for a set chosen beforehand;
+for the best of all C(n, k) sets the chance is at most Σ C(n, k) P(x), a number of false alarms in the sense of Moisan &
+Stival (2004, a-contrario RANSAC). The set that minimises it is the consensus; above ``FALSE_ALARMS``, nothing
+contradicts one σ for all points. Chernoff's bound stands for the Beta distribution: it has no underflow.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
+from typing import Any
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.special import chdtr, chdtrc, chdtri, gammaln
+from scipy.special import chdtr, gammaln
 
-from stcal.errors import ConvergenceError, DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.arrays import OF_POINT, first_fault
+from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.rigid import (
+    Affine,
+    Rigid,
+    Similarity,
+    align_affine,
+    align_rigid,
+    align_similarity,
+    best_rotations,
+    skew,
+)
 from stcal.geometry.robust import ratio_limit
-from stcal.register.transforms import Model, Problem, Transform, hypotheses
 
-CONTRADICTED_AT = 0.01
-"""Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
+Transform = Rigid | Similarity | Affine
+EXACT = 1e-11
+"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
+SHOWN = 5
+"""Number of rows that a message names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """``sample`` : least number of point pairs; ``align`` : fit to points b and a with weights (n,)."""
+
+    name: str
+    parameters: int
+    sample: int
+    align: Callable[[np.ndarray, np.ndarray, np.ndarray], Transform]
+
+    @property
+    def needed(self) -> int:
+        """Least number of point pairs of a fit with redundancy."""
+        return max(self.sample, self.parameters // 3 + 1)
+
+    def redundancy(self, n: int) -> int:
+        """Returns the redundancy of a fit to n point pairs."""
+        return 3 * n - self.parameters
+
+
+RIGID, SIMILARITY, AFFINE = (
+    Model("rigid", 6, 3, align_rigid),
+    Model("similarity", 7, 3, align_similarity),
+    Model("affine", 12, 4, align_affine),
+)
+MODELS = {model.name: model for model in (RIGID, SIMILARITY, AFFINE)}
+
+
+def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the linear part (3, 3) and the translation (3,)."""
+    matrix = transform.matrix()
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def rotation_of(transform: Transform) -> np.ndarray:
+    """Returns the rotation (3, 3) nearest to the linear part."""
+    return best_rotations(parts(transform)[0])[0]
+
+
+def some_of(items: Sequence | np.ndarray, say: Callable[[Any], str]) -> str:
+    """Returns the first of some items in words, and the number of others."""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(say(item) for item in items[:SHOWN]) + more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Point pairs (n, 3) mm of a model, neither copied nor checked, as subsets are taken in inner loops.
+
+    ``precision`` : (n,) inverse variances per axis, or (n, 3, 3) inverse covariances in frame b, scaled to mean σ 1
+    (RMS), so that whitened residuals are mm of such a point; ``sigma_mm`` : mean σ if given; ``lines`` : of a file, by
+    which messages name points; subsets have none.
+    """
+
+    model: Model
+    xyz_a: np.ndarray
+    xyz_b: np.ndarray
+    precision: np.ndarray
+    sigma_mm: float | None = None
+    lines: Sequence[int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.xyz_a)
+
+    def __getitem__(self, rows: np.ndarray) -> "Problem":
+        """Returns the point pairs selected by a mask or by indices."""
+        return Problem(self.model, self.xyz_a[rows], self.xyz_b[rows], self.precision[rows], self.sigma_mm)
+
+    def name(self, row: Any) -> str:
+        """Returns a point's name for messages: its line in the file, else its row from 1."""
+        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+    def names(self, rows: np.ndarray) -> str:
+        """Returns the names of the first of some points, and the number of others."""
+        return some_of(rows, self.name)
+
+    @property
+    def redundancy(self) -> int:
+        """Redundancy of a fit to all points."""
+        return self.model.redundancy(len(self))
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights (n,) of the points, proportional to 1/σ²."""
+        return self.precision if self.precision.ndim == 1 else np.trace(self.precision, axis1=1, axis2=2)
+
+    def rounding_mm(self) -> float:
+        """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
+        return EXACT * float(max(np.median(np.abs(xyz).max(1)) for xyz in (self.xyz_a, self.xyz_b)))
+
+    def residuals(self, b_from_a: Transform) -> np.ndarray:
+        """Returns b − b_from_a a, (n, 3) mm, frame b."""
+        return self.xyz_b - b_from_a @ self.xyz_a
+
+    def squares(self, b_from_a: Transform) -> np.ndarray:
+        """Returns rᵀ P r, (n,), mm² of a point of mean σ."""
+        residuals = self.residuals(b_from_a)
+        if self.precision.ndim == 3:
+            return np.einsum("ni,nij,nj->n", residuals, self.precision, residuals)
+        return np.einsum("ni,ni->n", residuals, residuals) * self.precision
+
+    def whitened(self, values: np.ndarray) -> np.ndarray:
+        """Returns Lᵀ v of values (n, 3, …), with the precision P = L Lᵀ; residuals become mm of a point of mean σ."""
+        if self.precision.ndim == 3:
+            return np.einsum("nij,ni...->nj...", np.linalg.cholesky(self.precision), values)
+        return values * np.sqrt(self.precision).reshape(-1, *[1] * (values.ndim - 1))
+
+    def fit(self) -> Transform:
+        """Returns the b_from_a of least Σ rᵢᵀ Pᵢ rᵢ. Raises DegenerateError; ConvergenceError with covariances."""
+        start = self.model.align(self.xyz_b, self.xyz_a, self.weights)
+        if self.precision.ndim == 1:
+            return start
+        origin = self.weights @ self.xyz_a / self.weights.sum()
+
+        def equations(transform: Transform) -> NormalEquations:
+            force = np.einsum("nrs,ns->nr", self.precision, self.residuals(transform))
+            pull = np.einsum("nr,nk->rk", force, _homogeneous(self.xyz_a - origin))
+            gradient = -_motions(self.model, transform).T @ pull.ravel()
+            return NormalEquations(float(self.squares(transform).sum()), self._normal(transform, origin), gradient)
+
+        fitted = minimise(start, equations, lambda transform, step: _moved(transform, origin, step))
+        return fitted.required("registration", "are the covariances true, or some of them huge?").state
+
+    def unit_covariance(self, transform: Transform) -> np.ndarray:
+        """Returns the covariance (p, p) of a fit's parameters at unit noise.
+
+        Parameters of a left perturbation in frame b: rotation vector (rad), translation (mm), and of a similarity the
+        relative scale. Affine: rows of the 3×4 matrix.
+        """
+        origin = self._middle()
+        normal, motions, shift = self._normal(transform, origin), _motions(self.model, transform), np.eye(4)
+        shift[:3, 3] = -origin
+        to_origin = np.linalg.pinv(motions) @ np.kron(np.eye(3), shift.T) @ motions
+        scale = 1 / np.sqrt(np.diag(normal))
+        covariance = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
+        return to_origin @ covariance @ to_origin.T
+
+    def leverages(self, transform: Transform, used: np.ndarray) -> np.ndarray:
+        """Returns H (n, 3, 3) = Lᵀ J N⁻¹ Jᵀ L, P = L Lᵀ: whitened residuals have covariance 1 − H for points that were
+        ``used`` (n,) in the fit, and 1 + H for others. By an eigenvalue of 1, no other point checks this one."""
+        origin = self[used]._middle()
+        by_step = jacobian(self.model, transform, self.xyz_a - origin)
+        added = by_step @ np.linalg.inv(self[used]._normal(transform, origin)) @ np.swapaxes(by_step, 1, 2)
+        if self.precision.ndim == 1:
+            return added * self.precision[:, None, None]
+        root = np.linalg.cholesky(self.precision)
+        return np.swapaxes(root, 1, 2) @ added @ root
+
+    def _middle(self) -> np.ndarray:
+        """Returns the weighted mean of a, about which the parameters correlate least."""
+        return np.average(self.xyz_a, axis=0, weights=self.weights)
+
+    def _normal(self, transform: Transform, origin: np.ndarray) -> np.ndarray:
+        """Returns the normal matrix (p, p) about the origin, from the points' second moments."""
+        places, motions = _homogeneous(self.xyz_a - origin), _motions(self.model, transform)
+        if self.precision.ndim == 3:
+            moments = np.einsum("nk,nrs,nl->rksl", places, self.precision, places)
+        else:
+            moments = np.einsum("rs,kl->rksl", np.eye(3), (places * self.precision[:, None]).T @ places)
+        return motions.T @ moments.reshape(12, 12) @ motions
+
+
+def problem_of(
+    model: Model,
+    xyz_a: np.ndarray,
+    xyz_b: np.ndarray,
+    weights: np.ndarray | None = None,
+    covariances: np.ndarray | None = None,
+    lines: Sequence[int] | None = None,
+) -> Problem:
+    """Returns the problem of pairs with (n,) weights, in 1/σ², or (n, 3, 3) covariances, or variances per axis (n,), of
+    b − b_from_a a in frame b, mm². Raises InputError: both are given, a wrong shape, or not positive."""
+    n = len(xyz_a)
+    if weights is not None and covariances is not None:
+        raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")
+    if weights is None and covariances is None:
+        return Problem(model, xyz_a, xyz_b, np.ones(n), None, lines)
+    name = "weights" if covariances is None else "covariances"
+    given = np.asarray(weights if covariances is None else covariances, float)
+    if given.shape != (n,) and (name == "weights" or given.shape != (n, 3, 3)):
+        raise InputError(
+            "E-ARRAY-SHAPE", f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed"
+        )
+    if given.ndim == 3:
+        fault = first_fault(given, OF_POINT, definite=True)
+        trouble = fault and f"row {fault.row + 1}: {fault.reason}"
+    else:
+        bad = np.flatnonzero(~(np.isfinite(given) & (given > 0)))
+        trouble = f"row {bad[0] + 1} has {given[bad[0]]:.3g}, a positive number needed" if len(bad) else None
+    if trouble:
+        raise InputError("E-REGISTER-WEIGHTS", f"registration: {name}: {trouble}; leave a row out to give it no weight")
+    if name == "weights":
+        return Problem(model, xyz_a, xyz_b, given * np.mean(1 / given), None, lines)
+    variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if given.ndim == 3 else given))
+    precision = (np.linalg.inv(given) if given.ndim == 3 else 1 / given) * variance
+    return Problem(model, xyz_a, xyz_b, precision, float(np.sqrt(variance)), lines)
+
+
+def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fits s minimal samples (s, m, 3) at once: linear parts (s, 3, 3), translations (s, 3) of b_from_a. Results for
+    degenerate samples are finite and wrong."""
+    mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
+    a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
+    cross = np.swapaxes(b, 1, 2) @ a
+    if model == AFFINE:
+        linear = cross @ np.linalg.pinv(np.swapaxes(a, 1, 2) @ a, hermitian=True)
+    else:
+        linear, product = best_rotations(cross)
+        if model == SIMILARITY:
+            linear = linear * (product / np.maximum((a**2).sum((1, 2)), 1e-300))[:, None, None]
+    return linear, mean_b - (linear @ mean_a[:, :, None])[:, :, 0]
+
+
+def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
+    """Returns the derivative (n, 3, p) of b_from_a a by the parameters of :meth:`Problem.unit_covariance` about a point
+    of a, for points (n, 3) minus that point."""
+    return np.einsum("nk,rkp->nrp", _homogeneous(from_origin), _motions(model, transform).reshape(3, 4, -1))
+
+
+def _homogeneous(xyz: np.ndarray) -> np.ndarray:
+    return np.column_stack([xyz, np.ones(len(xyz))])
+
+
+def _motions(model: Model, transform: Transform) -> np.ndarray:
+    """Returns the derivative (12, p) of the 3×4 matrix, row by row, by the parameters."""
+    if model == AFFINE:
+        return np.eye(12)
+    linear = parts(transform)[0]
+    motions = np.zeros((model.parameters, 3, 4))
+    motions[:3, :, :3] = skew(np.eye(3)) @ linear
+    motions[3:6, :, 3] = np.eye(3)
+    motions[6:, :, :3] = linear
+    return motions.reshape(model.parameters, 12).T
+
+
+def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
+    """Returns the transform after a step of the parameters about ``origin``."""
+    there = transform @ origin
+    if isinstance(transform, Affine):
+        rows = step.reshape(3, 4)
+        linear = transform.linear + rows[:, :3]
+        return Affine(linear, there + rows[:, 3] - linear @ origin)
+    scale, rigid = (1.0, transform) if isinstance(transform, Rigid) else (transform.scale, transform.rigid)
+    scale *= 1 + step[6:].sum()
+    if scale <= 0:
+        raise DegenerateError(
+            "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
+        )
+    rotation = Rigid.exp([*step[:3], 0, 0, 0]).rotation @ rigid.rotation
+    moved = Rigid(rotation, there + step[3:6] - scale * rotation @ origin)
+    return moved if isinstance(transform, Rigid) else Similarity(scale, moved)
+
+
 WIDE = 8.0
 """Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
 
@@ -42,57 +306,33 @@ WIDE = 8.0
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
     """Returns σ per axis, mm, of ``count`` points whose residuals were cut off at a threshold, which may be infinite.
 
-    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ.
-    Below c = 1 the points fill the sphere almost uniformly and give no information on σ.
+    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance; below c = 1 they tell nothing of σ.
     """
     sigma = float(np.sqrt(square_sum / model.redundancy(count)))
     if sigma == 0 or threshold > WIDE * sigma:
         return sigma
 
     def excess(candidate: float) -> float:
-        return candidate**2 * _variance_within(threshold / candidate) - sigma**2
+        return candidate**2 * variance_within(threshold / candidate) - sigma**2
 
     if excess(threshold) < 0:
         return threshold
-    bracket = (sigma, threshold)
-    return float(root_scalar(excess, method="brentq", bracket=bracket, xtol=1e-9 * sigma, rtol=1e-9).root)
+    return float(root_scalar(excess, method="brentq", bracket=(sigma, threshold), xtol=1e-9 * sigma, rtol=1e-9).root)
 
 
-def _variance_within(cut: float) -> float:
+def variance_within(cut: float) -> float:
     """Returns the variance of residuals within ``cut`` σ, over that of all."""
     return float(chdtr(5, cut**2) / chdtr(3, cut**2))
 
 
-def covariance_of(
-    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
-) -> tuple[np.ndarray, bool, float]:
-    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
-
-    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
-    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
-    """
-    redundancy, used, scaled = float(inliers.redundancy), sigma, True
-    if inliers.sigma_mm is not None:
-        scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)
-        if not scaled:
-            used, redundancy = inliers.sigma_mm, np.inf
-    matrix = used**2 * inliers.unit_covariance(b_from_a)
-    if used > 0 and threshold < WIDE * used:
-        matrix = matrix / _variance_within(threshold / used)
-    return matrix, scaled, redundancy
-
-
 FALSE_ALARMS = 1e-4
-"""Expectation of sets declared in data without outliers. It is small because a chance set of few points claims a
-σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
+"""Expectation of sets declared in data without outliers: small, as a chance set of few points claims too small a σ."""
 LEAST_REDUNDANCY = 6
 """Redundancy of the smallest consensus: four points rigidly, five in similarity, six affinely."""
 MISSED = 1e-9
 """Chance that no sample is free of outliers, for which the number of samples is chosen."""
 LEAST_SHARE = 0.25
 """Smallest share of a consensus that the number of samples is chosen to find. A smaller one may be missed."""
-CLEAN_PER_WIDE = 3
-"""Number of clean samples assumed for each one wide enough to lead to the optimum; measured: every second one does."""
 EXHAUSTIVE, BATCH, MOST_SAMPLES, REFINED = 2000, 500, 20_000, 6
 """Number of possible samples that are all tried (23 points rigidly); number scored at once; largest number, above any
 need, as ``LEAST_SHARE`` takes 15 900 of four points; number of the best ones of a batch that are refined."""
@@ -170,7 +410,7 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
         best = _best_of(problem, score, samples, best)
         share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
         clean = min(share, 1 - 1e-9) ** size
-        needed = min(CLEAN_PER_WIDE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
+        needed = min(3 * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)  # every third clean sample is wide enough
     return best and replace(best, samples=drawn)
 
 
@@ -185,26 +425,19 @@ def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensu
     else:
         square = np.einsum("sin,sin->sn", residual, residual) * problem.precision
     value, cut = score(square)
-    for i in np.argsort(value, kind="stable")[:REFINED]:
-        found = _concentrated(problem, score, square[i] <= cut[i])
-        if found is not None and (best is None or found.value < best.value):
-            best = found
-    return best
-
-
-def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consensus | None:
-    """Alternates between fitting and selecting the set until the score decreases no more."""
-    best = None
-    while inliers.sum() >= problem.model.sample:  # ends after a few: each lowers the score, and the sets are finite
-        try:
-            square = problem.squares(problem[inliers].fit())
-        except (DegenerateError, ConvergenceError):
-            break
-        value, cut = score(square[None])
-        if best is not None and value[0] >= best.value:
-            break
-        inliers = square <= cut[0]
-        best = Consensus(inliers, float(value[0]))
+    for i in np.argsort(value, kind="stable")[:REFINED]:  # fit and set in turn until the score decreases no more
+        inliers, least = square[i] <= cut[i], np.inf
+        while inliers.sum() >= problem.model.sample:
+            try:
+                refined = problem.squares(problem[inliers].fit())
+            except (DegenerateError, ConvergenceError):
+                break
+            (now,), (limit,) = score(refined[None])
+            if now >= least:
+                break
+            inliers, least = refined <= limit, float(now)
+        if least < (np.inf if best is None else best.value):
+            best = Consensus(inliers, least)
     return best
 
 
@@ -213,20 +446,11 @@ SUBSET = 500
 CLEAN_SETS_WITH_OUTLIER = 0.001
 """Probability that a clean set has any point that is called an outlier."""
 LEVERAGE_UP_TO = 10_000
-"""Largest number of points for which leverage is considered; beyond it the fit's uncertainty adds under 0.02 % to a
-residual."""
+"""Largest number of points for which leverage is considered: beyond, it adds under 0.02 % to a residual."""
 MAX_ROUNDS = 50
 """Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
 BY_CHANCE = 0.01
 """Largest number of false alarms of a consensus that is accepted, per file."""
-DISTINCT = 5.0
-"""Least distance between two distinct transforms, in σ."""
-MOST_OF_REST = 0.5
-"""Least share of the outliers that must agree on another transform. A few of many outliers always lie near some
-transform by chance; half of them do not."""
-AS_GOOD = 0.5
-"""Share of the result's points with which a second transform makes the result ambiguous. If 60 % of the points are
-wrong and all in one other motion, the true ones are 40 : 60 of the wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,10 +466,9 @@ class Fitted:
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
-    """Returns the transform with its inliers and σ; ``threshold`` : largest distance, mm of a point of mean σ,
-    estimated if None.
+    """Returns the transform with its inliers and σ; ``threshold`` : mm of a point of mean σ, estimated if None.
 
-    Raises DegenerateError: too few points agree, or no more than by chance. Raises ConvergenceError.
+    Raises DegenerateError: too few points agree. Raises ConvergenceError.
     """
     rng, count = np.random.default_rng(seed), len(problem)
     subset = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
@@ -340,9 +563,8 @@ def _chosen(
 
 
 def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
-    """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise:
-    r (1 − H)⁻¹ r for points used, r (1 + H)⁻¹ r for others, with whitened residuals and H of
-    :meth:`~stcal.register.transforms.Problem.leverages` (Cook & Weisberg 1982)."""
+    """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise
+    (Cook & Weisberg 1982)."""
     own = np.where(used, -1.0, 1.0)[:, None, None]
     value, vector = np.linalg.eigh(np.eye(3) + own * problem.leverages(transform, used))
     turned = np.einsum("nij,ni->nj", vector, problem.whitened(problem.residuals(transform)))
@@ -367,31 +589,3 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     choices = _log_choices(count, k) + _log_choices(k, size)
     value = np.log(count - size) + choices + (k - size) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
-
-
-def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
-    model, outside = problem.model, np.flatnonzero(~fitted.inliers)
-    if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
-        return None
-    rng = np.random.default_rng(seed + 1)
-    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
-    redundancy = model.redundancy(int(fitted.inliers.sum()))
-    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
-    consensus = search(problem[tried], by_threshold(threshold), rng)
-    if consensus is None or consensus.inliers.sum() <= model.sample:
-        return None
-    transform = problem[tried[consensus.inliers]].fit()
-    outliers = problem[outside]
-    near = outliers.squares(transform) <= threshold**2
-    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
-        return None
-    points = outliers.xyz_a[near]
-    if np.sqrt(((transform @ points - fitted.transform @ points) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
-        return None  # good points that a tight threshold cut off
-    # wrong points lie anywhere as far off the transform found as the farthest of them
-    off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
-    found = Fitted(transform, near, fitted.sigma, threshold, consensus.samples)
-    if chance(outliers, found, np.full(3, 2 * off)) > np.log(BY_CHANCE):
-        return None
-    return replace(found, inliers=np.isin(np.arange(len(problem)), outside[near]))

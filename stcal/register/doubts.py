@@ -1,4 +1,7 @@
-"""What is doubtful in a registration: mistakes in the data, points that do not determine the transform, and notes."""
+"""What is doubtful in a registration: rows that moved together, mistakes in the data, points that do not determine it.
+
+Rows that moved together are sought along their order, in two groups that overlap, and shifted against the others.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -8,32 +11,179 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
-from scipy.special import bdtrc
+from scipy.special import bdtrc, ndtr
 
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.explain import Candidate, explain
-from stcal.geometry.rigid import Affine, Similarity, best_rotations
+from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
-from stcal.register.consensus import (
-    BY_CHANCE,
-    CLEAN_SETS_WITH_OUTLIER,
-    LEAST_SHARE,
-    LEVERAGE_UP_TO,
-    Fitted,
-    chance,
-    robust_fit,
-)
-from stcal.register.liu2017 import ASSUMED
+from stcal.register import consensus
+from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem, Transform, parts
 from stcal.register.registered import Registration
-from stcal.register.row_groups import Shifted, moved_meanwhile, neighbours_alike, order_note
-from stcal.register.transforms import AFFINE, MODELS, SHOWN, Model, Problem, Transform, parts, some_of
+from stcal.row_order import Change, change_along
+
+NEIGHBOURS = 2000
+"""Largest number of points whose residuals are compared with the nearest neighbour's."""
+FEWEST_NEIGHBOURS = 20
+"""Least number of points for this comparison, as the sum of fewer products is not normal."""
+BY_NEIGHBOURS = 1e-4
+"""Probability of calling clean data bent."""
+
+
+def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
+    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance."""
+    rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
+    xyz, r = xyz_a[rows], residuals[rows]
+    if len(xyz) < FEWEST_NEIGHBOURS:
+        return False
+    pairs = np.column_stack([np.arange(len(xyz)), _nearest(xyz)])
+    one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
+    product = np.einsum("ni,ni->n", r[one], r[two])  # the variance of their sum is the sum of their squares
+    return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
+
+
+def _nearest(xyz: np.ndarray) -> np.ndarray:
+    return np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
+
+
+LEVEL, IN_ORDER = 0.01, 10_000
+"""Probability that sound points seem to move along their rows; largest number examined, as more are clouds."""
+
+
+def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
+    """Returns the jump or drift of one frame against the other along the order of the rows; None if there is none
+    beyond chance, or the frames are bent and it explains no bend."""
+    if len(problem) > IN_ORDER:
+        return None
+    from_middle = problem.xyz_a - problem.xyz_a.mean(0)
+    residuals, turned = problem.residuals(transform), Rigid(consensus.rotation_of(transform))
+    motions = consensus.jacobian(RIGID, turned, from_middle)
+    by_parameters = consensus.jacobian(problem.model, transform, from_middle)
+    change = change_along(*(problem.whitened(each) for each in (residuals, by_parameters, motions)))
+    size = 0.0 if change is None else float(np.abs(motions @ change.motion).max())
+    if change is None or change.p > LEVEL or size <= problem.rounding_mm():
+        return None
+    rest = residuals - change.moves[:, None] * (motions @ change.motion)
+    alike = [neighbours_alike(problem.xyz_a[change.good], each[change.good]) for each in (residuals, rest)]
+    return None if all(alike) else change
+
+
+def order_note(change: Change, problem: Problem) -> str:
+    """Returns one line on a change along the order of the rows."""
+    size = f"{np.linalg.norm(change.motion[3:]):.3g} mm and {np.degrees(np.linalg.norm(change.motion[:3])):.2g}°"
+    share = f"{change.share:.0%} of the squared residuals, p {'< 0.001' if change.p < 1e-3 else f'= {change.p:.2g}'}"
+    if change.kind == "drift":
+        return f"one frame drifts against the other along the rows, by {size} from the first to the last ({share})"
+    first, row, last = (problem.name(row) for row in (change.first, change.row, change.last))
+    likely = f" ({first} to {last} as likely)" if first != last else ""
+    return (
+        f"from {row} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows before it, and "
+        "those from it on, separately"
+    )
+
+
+TRIED = 200
+"""Largest number of points that are examined for groups."""
+TOGETHER = 0.01
+"""Probability that scattered groups seem to lie together."""
+
+
+def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
+    """Returns whether neighbours are in the same group more often than by chance."""
+    same = int((group[_nearest(xyz_a)] == group).sum())
+    share = group.mean()
+    return bool(bdtrc(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
+
+
+NEEDED, ALONG = 14.5, 9.2
+"""Least gain in log likelihood: along any direction, and along the first principal axis."""
+SMALLEST_GROUP, NARROWEST = 0.15, 0.01
+"""Smallest fraction of the points in a group, and smallest ratio of its variance to that of all along the shift."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shifted:
+    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b."""
+
+    rows: np.ndarray
+    count: int
+    by_mm: np.ndarray
+    together: bool
+
+
+def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
+    """Returns the rows that are shifted together; None if there is no such group, a bent frame, or too few points."""
+    count = len(problem)
+    plain = problem.residuals(transform)
+    residuals = problem.whitened(plain)
+    if count < FEWEST_NEIGHBOURS or np.abs(residuals).max() <= problem.rounding_mm():
+        return None
+    sample = np.unique(np.linspace(0, count - 1, min(count, TRIED)).astype(int))
+    middle = residuals[sample].mean(0)
+    centred = residuals[sample] - middle
+    variances, axes = np.linalg.eigh(centred.T @ centred / len(sample))
+    if variances[0] <= 1e-12 * variances[2]:
+        return None
+    to_unit = axes / np.sqrt(variances) @ axes.T
+    unit = centred @ to_unit
+    best = _clear(unit, axes)
+    if best is None or neighbours_alike(problem.xyz_a, plain):
+        return None
+    _, axis, border = best
+    second = (residuals - middle) @ to_unit @ axis < border
+    if second.sum() > count / 2:
+        second = ~second
+    by_mm = plain[second].mean(0) - plain[~second].mean(0)
+    return Shifted(np.flatnonzero(second), count, by_mm, lies_together(problem.xyz_a, second))
+
+
+Parted = tuple[float, np.ndarray, float]
+"""Gain of log likelihood by two groups, the axis of their shift, and the border between them along it."""
+
+
+def _clear(unit: np.ndarray, axes: np.ndarray) -> Parted | None:
+    """Divides residuals (n, 3) of unit scatter into two groups, or None; ``axes`` : principal, longest last."""
+    best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found[0])
+    across = unit - (unit @ best[1])[:, None] * best[1]
+    rest = max(_parted(across, axis)[0] for axis in _by_kurtosis(across).T[1:])
+    if best[0] - max(rest, 0.0) > NEEDED:
+        return best
+    *others, (gain, sign, border) = (_parted(unit @ axis[:, None], np.ones(1)) for axis in axes.T)
+    if gain - max(0.0, *(each[0] for each in others)) > ALONG:
+        return gain, sign[0] * axes[:, 2], border
+    return None
+
+
+def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
+    """Returns directions as columns (3, 3), by ascending kurtosis (Cardoso 1989), those without variance first."""
+    return np.linalg.eigh((unit * (unit**2).sum(1)[:, None]).T @ unit)[1]
+
+
+def _parted(unit: np.ndarray, axis: np.ndarray) -> Parted:
+    """Divides residuals (n, d) of unit scatter into two groups, starting from the median along ``axis``."""
+    along = unit @ axis
+    first = (along > np.median(along)).astype(float)
+    low, high, apart = 0.0, 0.0, 0.0
+    for _ in range(60):
+        share = float(np.clip(first.mean(), SMALLEST_GROUP, 1 - SMALLEST_GROUP))
+        shift = first @ unit / max(first.sum(), 1e-300) - (1 - first) @ unit / max(len(first) - first.sum(), 1e-300)
+        apart = max(float(np.linalg.norm(shift)), 1e-12)
+        axis, narrow = shift / apart, max(1 - share * (1 - share) * apart**2, NARROWEST)
+        high, low = (1 - share) * apart, -share * apart
+        along = unit @ axis
+        one = np.log(share) - (along - high) ** 2 / (2 * narrow)
+        two = np.log1p(-share) - (along - low) ** 2 / (2 * narrow)
+        both = np.logaddexp(one, two)
+        first = np.exp(one - both)
+    gain = float((both + along**2 / 2).sum() - len(unit) / 2 * np.log(narrow))
+    border = (high + low) / 2 - narrow / apart * np.log(share / (1 - share))
+    return gain, axis, float(border)
+
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
 """Units by their length in mm, with name and suffix of their columns."""
-UNIT_WITHIN = 0.08
-"""Relative tolerance of the ratio. Outliers move the median ratio by a few per cent; the factors are far apart."""
-PAIRS = 4000
-"""Number of pairs of points whose distances are compared."""
+UNIT_WITHIN, PAIRS = 0.08, 4000
+"""Relative tolerance of the median ratio of so many pairs' distances; outliers move it by a few per cent."""
 
 
 def mistaken_unit(ratio: float) -> str | None:
@@ -64,42 +214,29 @@ def check_units(problem: Problem, seed: int) -> None:
         )
 
 
-MIRROR_RATIO = 4.0
-"""Ratio of misfits that indicates a mirrored frame. Mirrored points fit a mirrored frame to noise, and a correct frame
-only to their thickness; bent frames never gain so much."""
-MIRROR_CHANCE = 1e-4
-"""Probability of calling right frames mirrored if the points had thickness only by noise."""
-NAMED_BELOW_RAD = np.radians(15)
-"""Largest remaining turn of the frames with which a change of sign or exchange of axes is named as the likely cause."""
+MIRROR_RATIO, MIRROR_CHANCE = 4.0, 1e-4
+"""Least ratio of misfits of a mirrored frame, more than bent frames gain, and its probability for right frames."""
 SUSPICIOUS_SHARE, SUSPICIOUS_SIGMA = 0.5, 0.05
-"""Inlier share below which, and σ as a fraction of the points' RMS distance from their centroid above which, a mirrored
-frame is tried. Both are met long before a mirrored frame is found; the trial costs time only."""
+"""Inlier share below which, and σ over the points' RMS distance from their middle above which, a mirror is tried."""
 FLIP = np.array([1, 1, -1.0])
-MIRRORED = [(f"the sign of a{axis}", np.diag(np.where(np.arange(3) == k, -1.0, 1.0))) for k, axis in enumerate("xyz")]
-MIRRORED += [
-    (f"a{'xyz'[i]} and a{'xyz'[j]} with each other", np.eye(3)[order])
-    for i, j, order in ((0, 1, [1, 0, 2]), (1, 2, [0, 2, 1]), (0, 2, [2, 1, 0]))
-]
-"""Changes of a that mend a mirrored frame, with the matrix of each."""
 
 
-def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Returns the square sum of the best rotation over that of the best reflection, and this reflection (3, 3)."""
+def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
+    """Returns the square sum of the best rotation over that of the best reflection."""
     a, b = xyz_a - xyz_a.mean(0), xyz_b - xyz_b.mean(0)
     total = (a**2).sum() + (b**2).sum()
-    proper = total - 2 * best_rotations(b.T @ a)[1]
-    turn, product = best_rotations(b.T @ (a * FLIP))
+    proper, mirrored = (total - 2 * best_rotations(b.T @ each)[1] for each in (a, a * FLIP))
     floor = 1e-20 * total  # rounding of exact data
-    return float(max(proper, floor) / max(total - 2 * product, floor)), turn * FLIP
+    return float(max(proper, floor) / max(mirrored, floor))
 
 
 def check_mirrored(problem: Problem) -> None:
     """Raises InputError if a reflection explains all points far better than any rotation."""
     if problem.model == AFFINE or len(problem) <= problem.model.sample:
         return
-    ratio, reflection = mirrored_ratio(problem.xyz_a, problem.xyz_b)
+    ratio = mirrored_ratio(problem.xyz_a, problem.xyz_b)
     if ratio > max(MIRROR_RATIO, ratio_limit(MIRROR_CHANCE, problem.redundancy, problem.redundancy)):
-        raise _mirrored(reflection, len(problem), len(problem), np.sqrt(ratio))
+        raise _mirrored(len(problem), len(problem), ratio)
 
 
 def check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:
@@ -112,48 +249,34 @@ def check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thresh
             return
     image = replace(problem, xyz_a=problem.xyz_a * FLIP)
     try:
-        mirrored = robust_fit(image, threshold, seed)
+        mirrored = consensus.robust_fit(image, threshold, seed)
     except DegenerateError:
         return
-    if mirrored.inliers.mean() < LEAST_SHARE:  # points near any one plane fit
+    if mirrored.inliers.mean() < consensus.LEAST_SHARE:  # points near any one plane fit
         return
-    usual = 0.0 if fitted is None else chance(problem, fitted)
-    if chance(image, mirrored) < 2 * usual + np.log(BY_CHANCE) and (
+    usual = 0.0 if fitted is None else consensus.chance(problem, fitted)
+    if consensus.chance(image, mirrored) < 2 * usual + np.log(consensus.BY_CHANCE) and (
         fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
     ):
         agreeing = problem[mirrored.inliers]
-        times = float(np.sqrt(mirrored_ratio(agreeing.xyz_a, agreeing.xyz_b)[0]))
-        linear = parts(mirrored.transform)[0]
-        raise _mirrored(linear / np.cbrt(np.linalg.det(linear)) * FLIP, len(agreeing), len(problem), times)
+        raise _mirrored(len(agreeing), len(problem), mirrored_ratio(agreeing.xyz_a, agreeing.xyz_b))
 
 
-def _mirrored(reflection: np.ndarray, agree: int, count: int, times: float) -> InputError:
-    """Returns the error for mirrored data, which names the axis to change if one change makes the frames nearly
-    parallel. ``reflection`` : (3, 3), b from a, determinant −1."""
-    candidates = [Candidate(words, lambda mend=mend: mend) for words, mend in MIRRORED]
-    found = explain(candidates, lambda mend: Rotation.from_matrix(reflection @ mend).magnitude(), NAMED_BELOW_RAD)
-    advice = "change the sign of one axis of a or of b"
-    if found:
-        (mend, turn), *_ = found
-        advice = f"change {mend.words}: the frames are then turned by only {np.degrees(turn):.1f}°"
+def _mirrored(agree: int, count: int, ratio: float) -> InputError:
     return InputError(
         "E-REGISTER-MIRRORED",
-        f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit {times:.3g} "
-        f"times better; {advice}",
+        f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit "
+        f"{np.sqrt(ratio):.3g} times better; change the sign of one axis of a or of b, or exchange two",
     )
 
 
-SCALE_BY_CHANCE = 1e-4
-"""Probability of finding two scales in frames of one scale."""
-MATTERS = 0.1
-"""Least relative decrease of the noise's σ by the wider model. Many points show less, but it matters for none."""
-THERMAL = 5e-4
-"""Largest relative scale that temperature may cause: 45 K in steel, 20 K in aluminium."""
+SCALE_BY_CHANCE, MATTERS = 1e-4, 0.1
+"""Probability of two scales in frames of one, and least relative decrease of σ by the wider model that matters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wider:
-    """A wider model that explains the points: its ``transform``, σ of a coordinate with it, and the message."""
+    """A wider model that explains the points: its ``transform``, σ of a coordinate with it, and the note."""
 
     problem: Problem
     transform: Transform
@@ -180,28 +303,25 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
         enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
         if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and enough:
             narrow = candidate, fitted
-            best = Wider(candidate, fitted, sigma, f"lengths in b are {_scale_in_words(candidate, fitted, sigma)}")
-    return best
-
-
-def _scale_in_words(problem: Problem, transform: Transform, sigma_mm: float) -> str:
-    """Returns the ratio of lengths in b to those in a, the likely cause, and the remedy."""
-    if isinstance(transform, Affine):
-        scales = np.linalg.svd(transform.linear, compute_uv=False)
-        return (
+            best = Wider(candidate, fitted, sigma, "")
+    if best is None:
+        return None
+    scales = np.linalg.svd(parts(best.transform)[0], compute_uv=False)
+    if best.problem.model == AFFINE:
+        said = (
             f"{', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one instrument is "
             "scaled or not square to the others, or an arm bends; correct it, or use --model affine within these points"
         )
-    scale = float(np.cbrt(np.linalg.det(parts(transform)[0])))
-    sigma = scale * float(np.sqrt((sigma_mm**2 * problem.unit_covariance(transform))[6, 6]))
-    digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
-    cause = "a length standard, a board or an instrument of another scale"
-    if abs(scale - 1) < THERMAL:
-        cause = f"{1e6 * abs(scale - 1):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
-    return (
-        f"{scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one of the files, or use --model "
-        "similarity"
-    )
+    else:
+        relative = best.sigma_mm * float(np.sqrt(best.problem.unit_covariance(best.transform)[6, 6]))
+        scale, sigma = float(np.cbrt(scales.prod())), float(np.cbrt(scales.prod())) * relative
+        digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+        said = (
+            f"{scale:.{digits}f} ± {sigma:.{digits}f} times those in a: temperature (steel 11.5, aluminium 23 ppm/K), "
+            "a length standard, a board or an instrument of another scale; correct one of the files, or use --model "
+            "similarity"
+        )
+    return replace(best, note=f"lengths in b are {said}")
 
 
 WIDER_THAN = 10.0
@@ -224,8 +344,7 @@ def by_chance(agreeing: int, n: int, sigma_mm: float) -> DegenerateError:
 
 
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
-    """Raises DegenerateError if points do not determine the model at their σ: along a line, in a plane for the affine
-    model, or with σ as large as their extent."""
+    """Raises DegenerateError if points do not determine the model at their σ: in a line, plane (affine) or point."""
     n, spread, needed = len(xyz_a), spreads(xyz_a), WIDER_THAN * sigma_mm
     off_line, root = float(np.hypot(spread[1], spread[2])), np.sqrt(n)
     if n > model.needed and spread[0] < needed:
@@ -260,8 +379,7 @@ def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndar
 
 
 def check_supports(problem: Problem, inliers: np.ndarray, sigma_mm: float) -> None:
-    """Raises DegenerateError for a set with outliers if :func:`check_extent` refuses it without a single point, since
-    any wrong point would have fitted there."""
+    """Raises DegenerateError if :func:`check_extent` refuses inliers without one: any wrong one would fit there."""
     rows = np.flatnonzero(inliers)
     alone = single_supports(problem.model, problem.xyz_a[rows], sigma_mm)
     if len(alone):
@@ -304,40 +422,60 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
     return best
 
 
+ASSUMED = (
+    "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
+    "sample, and the variance of their distances"
+)
 LOW_REDUNDANCY = 6
 """Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
-MAJORITY = 0.5
-"""Fraction of the point pairs below which a note says that few agree."""
 SMALL_MM = 20.0
 """Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
-TIGHT = 2.5
-"""Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
-LOOKED_AT = 10_000
-"""Largest number of outliers that are examined. More would show the same mistakes."""
 
 
-def notes_of(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> tuple[str, ...]:
-    """Returns all notes on a registration.
+def notes_of(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> Iterator[str]:
+    """Yields all notes on a registration.
 
     ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together.
     """
     inside, transform, sigma = problem[result.inliers], result.b_from_a, result.sigma_mm
     if other is not None:
         inside, transform, sigma = other.problem, other.transform, other.sigma_mm
-    return (
-        *_on_agreement(result, problem),
-        *([] if other is None else [other.note]),
-        *_on_noise(result, problem, inside, transform),
-        *([] if shifted is None else [_shift_note(result, problem, shifted)]),
-        *_on_certainty(result, inside),
-        *_on_layout(result, problem, sigma),
-        *_on_outliers(result, problem),
-    )
+    yield from _on_agreement(result, problem)
+    if other is not None:
+        yield other.note
+    residuals = inside.residuals(transform)
+    if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
+        yield (
+            "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
+            "other, and a transform is valid only where its points are; see the residual field"
+        )
+    if other is None and result.method != "liu2017" and (change := moved_meanwhile(problem, transform)):
+        yield order_note(change, problem)
+    if shifted is not None:
+        by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
+        where = ", and lie together" if shifted.together else ""
+        names = problem.names(np.flatnonzero(result.inliers)[shifted.rows])
+        yield (
+            f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
+            f"{shifted.count - len(shifted.rows)}{where} ({names}): two groups, and the data do not show which is "
+            "right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
+        )
+    if result.sigma_factor is not None and result.scaled:
+        yield (
+            f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance; the covariance is "
+            f"scaled by this factor"
+        )
+    enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
+    if len(inside) <= enough and result.scaled:
+        yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
+    if result.redundancy < LOW_REDUNDANCY:
+        yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
+    yield from _on_layout(result, problem, sigma)
 
 
 def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
     other, agree, count = result.alternative, int(result.inliers.sum()), len(result)
-    if agree < MAJORITY * count:
+    if agree < count / 2:
         yield f"only {agree} of {count} point pairs agree; check the others before you trust the transform"
     if other is not None:
         start = "AMBIGUOUS: " if result.ambiguous else ""
@@ -350,7 +488,7 @@ def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
         yield ASSUMED
     if result.method == "least-squares":  # rows that the robust method would examine
         square, redundancy = (result.residuals**2).sum(1), problem.redundancy
-        bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
+        bound = square.sum() / redundancy * 3 * ratio_limit(consensus.CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
         if square.max() > bound:
             worst = int(square.argmax())
             yield (
@@ -359,57 +497,13 @@ def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
             )
 
 
-def _on_noise(result: Registration, problem: Problem, inside: Problem, transform: Transform) -> Iterator[str]:
-    residuals = inside.residuals(transform)
-    if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
-        yield (
-            "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
-            "other, and a transform is valid only where its points are; see the residual field"
-        )
-    if transform is result.b_from_a and result.method != "liu2017":  # no wider model explains the points
-        change = moved_meanwhile(problem, transform)
-        if change is not None:
-            yield order_note(change, problem)
-
-
-def _shift_note(result: Registration, problem: Problem, shifted: Shifted) -> str:
-    by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
-    where = ", and lie together" if shifted.together else ""
-    names = problem.names(np.flatnonzero(result.inliers)[shifted.rows])
-    return (
-        f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-        f"{shifted.count - len(shifted.rows)}{where} ({names}): two groups, and the data do not show which is right "
-        "(or noise far from normal); σ of the transform cover both; did an instrument move between them?"
-    )
-
-
-def _on_certainty(result: Registration, inside: Problem) -> Iterator[str]:
-    """Yields notes on σ. ``inside`` : the inliers, with a model that explains them."""
-    if result.sigma_factor is not None and result.scaled:
-        yield (
-            f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance; the covariance is "
-            f"scaled by this factor"
-        )
-    enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
-    if len(inside) <= enough and result.scaled:
-        yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
-    if result.redundancy < LOW_REDUNDANCY:
-        yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
-    threshold, sigma = result.threshold_mm, result.sigma_mm
-    if threshold is not None and threshold < TIGHT * sigma and result.method == "robust":
-        yield (
-            f"the threshold of {threshold:.4g} mm is only {threshold / sigma:.2g} σ and cuts off good points; leave "
-            "it out to have it estimated"
-        )
-
-
 def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator[str]:
     """Yields notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
     model, transform, rows = problem.model, result.b_from_a, np.flatnonzero(result.inliers)
     inside = problem.xyz_a[rows]
-    if len(rows) <= LEVERAGE_UP_TO and result.method != "liu2017":
+    if len(rows) <= consensus.LEVERAGE_UP_TO and result.method != "liu2017":
         kind = "plane" if model == AFFINE else "line"
-        for row in rows[single_supports(model, inside, sigma)[:SHOWN]]:
+        for row in rows[single_supports(model, inside, sigma)[: consensus.SHOWN]]:
             yield f"only {problem.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
     if model != AFFINE and spreads(inside)[2] < WIDER_THAN * sigma:
         yield "the points lie in a plane: a mirrored frame would not be noticed"
@@ -424,32 +518,8 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
     if found is not None:
         angle, to = found
         moved = np.flatnonzero(to != np.arange(len(to)))
-        names = some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
+        names = consensus.some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
         yield (
             f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names}); "
             "labels exchanged like that would fit as well, so check that rows are the same points"
         )
-
-
-def _on_outliers(result: Registration, problem: Problem) -> Iterator[str]:
-    """Yields notes on outliers that a slip explains: exchanged rows, or another unit."""
-    rows, reach = np.flatnonzero(~result.inliers)[:LOOKED_AT], result.threshold_mm
-    if not len(rows) or reach is None:
-        return
-    a, b, transform = problem.xyz_a[rows], problem.xyz_b[rows], result.b_from_a
-    mapped = transform @ a
-    distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(b))
-    swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
-    taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
-    unlikely = bdtrc(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1)) < BY_CHANCE
-    if len(swapped) and unlikely:
-        names = some_of(swapped, lambda i: f"{problem.name(rows[i])} is the point of {problem.name(rows[nearest[i]])}")
-        yield f"rows exchanged: b of {names}; correct the order"
-    linear, translation = parts(transform)
-    back = np.linalg.inv(linear)
-    for factor in [f for unit in UNITS for f in (unit, 1 / unit)]:
-        of_b = (b * factor - translation) @ back.T - a
-        for side, residual in (("a", b - transform @ (a * factor)), ("b", of_b)):
-            fits = rows[np.linalg.norm(residual, axis=1) <= reach]
-            if len(fits):
-                yield f"another unit: {side} of {problem.names(fits)} fits when multiplied by {factor:.6g}; correct it"

@@ -1,13 +1,127 @@
-"""Result of a registration, and its cross-validation."""
+"""What a registration takes and gives: pairs of points from files, the result, and its cross-validation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from pathlib import Path
 
 import numpy as np
 
 from stcal.cross_validation import dealt, held_out_errors
-from stcal.geometry.arrays import Array, Brief, ByValue, freeze, rms
-from stcal.register.transforms import Problem, Transform, parts
+from stcal.errors import InputError
+from stcal.geometry.arrays import OF_POINT, Array, Brief, ByValue, freeze, require_arguments, require_fields, rms
+from stcal.io.join import join_tables
+from stcal.io.table import LENGTHS, Table, read_table
+from stcal.register.consensus import Problem, Transform, parts
+
+WHAT = "point pairs"
+COVARIANCE = tuple(f"cov_{a}_{b}" for a, b in combinations_with_replacement(OF_POINT.names, 2))
+"""Names of the upper triangle, mm², of the covariance of b − b_from_a a in frame b."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Pairs(Brief):
+    """Pairs of points of two frames from a file, with weights, covariances or neither.
+
+    ``where`` : name of the file; ``lines`` : lines of the file; ``xyz_a``, ``xyz_b`` : (n, 3) points in mm, each in its
+    own frame; row i of both is the same point; ``weights`` : (n,) weights, proportional to 1/σ²; ``covariances`` : (n,
+    3, 3) or (n,) covariances, or variances per axis, of b − b_from_a a in frame b, mm²; ``notes`` : on points of only
+    one of two files. Raises InputError: shapes do not fit, or values are not finite.
+    """
+
+    where: str
+    lines: Sequence[int]
+    xyz_a: Array
+    xyz_b: Array
+    weights: np.ndarray | None = None
+    covariances: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        require_fields(self, "point pairs")
+        n = len(self.lines)
+        freeze(self, "xyz_a", (n, 3), "points of a")
+        freeze(self, "xyz_b", (n, 3), "points of b")
+        if self.weights is not None:
+            freeze(self, "weights", (n,), "weights")
+        if self.covariances is not None:
+            shape = (n,) if np.ndim(self.covariances) == 1 else (n, 3, 3)
+            freeze(self, "covariances", shape, "covariances")
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+@require_arguments
+def read_pairs(path: str | Path | Table, second: str | Path | Table | None = None, *, key: str = "name") -> Pairs:
+    """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
+
+    Parameters
+    ----------
+    path : A table of both; or of the points of a alone, as ``x_mm, y_mm, z_mm``.
+    second : table of the points of b alone, as ``x_mm, y_mm, z_mm``.
+    key : column of both tables that names the points; or ``name=Point Name``, that of a and that of b.
+
+    Raises InputError: columns are missing or a row is invalid: text, values that are not finite, a repeated pair,
+    weights or σ that are not positive. The message names the line.
+    """
+    notes = ()
+    if second is not None:
+        joined = join_tables(path, second, key, ("a", "b"))
+        table, notes = joined.table, joined.notes
+    else:
+        table = read_table(path, WHAT)
+    xyz_a, xyz_b = table.points("a"), table.points("b")
+    _no_pair_twice(table, np.hstack([xyz_a, xyz_b]))
+    given = {
+        "weight": "weight" in table,
+        "sigma": table.has("sigma", LENGTHS),
+        "cov_…": any(name in table for name in COVARIANCE),
+    }
+    kinds = [name for name, there in given.items() if there]
+    if len(kinds) > 1:
+        raise InputError(
+            "E-TABLE-COLUMNS-CONFLICT",
+            f"{table.where}: columns {' and '.join(kinds)}; only one of weight, sigma_mm, or cov_x_x … cov_z_z needed",
+        )
+    weights = covariances = None
+    if kinds == ["weight"]:
+        weights = _positive(table, "weight", table.numbers("weight"))
+    elif kinds == ["sigma"]:
+        covariances = _positive(table, "sigma", table.quantity("sigma", LENGTHS)) ** 2
+    elif kinds:
+        missing = [name for name in COVARIANCE if name not in table]
+        if missing:
+            raise InputError(
+                "E-TABLE-COLUMN-MISSING",
+                f"{table.where}: {missing[0]} is missing; all {len(COVARIANCE)} columns cov_… or none needed",
+            )
+        covariances = np.empty((len(table), 3, 3))
+        i, j = np.triu_indices(3)
+        covariances[:, i, j] = covariances[:, j, i] = np.column_stack([table.numbers(name) for name in COVARIANCE])
+        table.require_covariances(covariances, OF_POINT)
+    return Pairs(table.where, table.lines, xyz_a, xyz_b, weights, covariances, notes)
+
+
+def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
+    """Refuses a repeated pair: equal rows have equal weighted sums, so that one sort replaces a table of tuples."""
+    key = rows @ np.random.default_rng(0).uniform(1, 2, rows.shape[1])
+    order = np.argsort(key, kind="stable")
+    near = np.flatnonzero(np.diff(key[order]) == 0)
+    same = near[(rows[order[near]] == rows[order[near + 1]]).all(1)]
+    first_of = dict(zip(order[same + 1].tolist(), order[same].tolist(), strict=True))
+    remedy = "remove it, or give one of them twice the weight"
+    table.refuse(
+        np.isin(np.arange(len(rows)), list(first_of)),
+        "E-TABLE-ROW-REPEATED",
+        lambda i: f"the same pair as on line {table.lines[first_of[i]]}; {remedy}",
+    )
+
+
+def _positive(table: Table, name: str, values: np.ndarray) -> np.ndarray:
+    needed = "a positive number needed; remove a row to give it no weight"
+    table.refuse(values <= 0, "E-SIGMA-VALUE", lambda i: f"{name} is {values[i]:g}, {needed}")
+    return values
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +145,8 @@ class ErrorFigures:
 class HeldOutPoints(ByValue):
     """Errors |b − b_from_a a| of points that were left out of the fit, by cross-validation.
 
-    Parameters
-    ----------
-    folds : int
-        Number of parts, each of which is left out once.
-    rows : (m,) int array
-        Indices of the tested points, a sample of very many.
-    error_mm : (m,) array
-    of_inliers, of_all : ErrorFigures
+    ``folds`` : parts, each left out once; ``rows`` : (m,) of the tested points, a sample of very many; ``error_mm`` :
+    (m,); ``of_inliers``, ``of_all`` : their figures.
     """
 
     folds: int
@@ -54,18 +162,10 @@ class HeldOutPoints(ByValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative(ByValue):
-    """Another transform that fits other points as well as the result fits its own.
+    """Another transform ``b_from_a`` that fits other points as well as the result fits its own.
 
-    Parameters
-    ----------
-    b_from_a : Rigid, Similarity or Affine
-        Transform as in :class:`Registration`.
-    rows : (m,) int array
-        Indices of its points.
-    apart_mm : float
-        RMS distance between the two transforms over all points.
-    turn_rad : float
-        Angle between their rotations.
+    ``rows`` : (m,) of its points; ``apart_mm`` : RMS distance between the transforms over all points; ``turn_rad`` :
+    angle between their rotations.
     """
 
     b_from_a: Transform
@@ -83,37 +183,26 @@ class Registration(Brief):
 
     Parameters
     ----------
-    model, method : str
-        ``rigid``, ``similarity`` or ``affine``; ``robust``, ``least-squares`` or ``liu2017``.
+    model, method : ``rigid``, ``similarity`` or ``affine``; ``robust``, ``least-squares`` or ``liu2017``.
     b_from_a : Rigid, Similarity or Affine
-    covariance : (6, 6), (7, 7) or (12, 12) array
-        Covariance of a left perturbation in frame b: rotation vector (rad), translation (mm), and a similarity's
-        relative scale; affine: rows of the 3×4 matrix. σ is estimated with ``redundancy`` degrees of freedom, so that a
-        confidence region takes its bound from F(p, redundancy), not from χ².
-    inliers : (n,) bool array
-        Points that the transform is fitted to.
-    residuals : (n, 3) array
-        b − b_from_a a of all points, mm, frame b.
-    sigma_mm : float
-        σ per axis of a residual; the RMS for points of different σ.
-    sigma_factor : float or None
-        Ratio of the inliers' residuals to the σ given with the data; None if none was given. The covariance is scaled
-        by it only if the data contradict the given σ (``scaled``).
-    scaled : bool
-        Whether the covariance is derived from the residuals; False if it is derived from the given σ.
-    redundancy : float
-        Degrees of freedom of the σ that the covariance is derived from; infinite if this σ was given.
-    threshold_mm : float or None
-        Largest distance of inliers, for a point of the σ above at the points' middle; None without a threshold.
-    held_out : HeldOutPoints or None
-        Cross-validation; None if it was not requested, or there are too few points.
-    ambiguous : bool
-        Whether the alternative is about as good.
+    covariance : (6, 6), (7, 7) or (12, 12) covariance of a left perturbation in frame b: rotation vector (rad),
+        translation (mm), and a similarity's relative scale; affine: rows of the 3×4 matrix. σ is estimated with
+        ``redundancy`` degrees of freedom, so that a confidence region takes its bound from F(p, redundancy), not from
+        χ².
+    inliers : (n,) points that the transform is fitted to.
+    residuals : (n, 3) b − b_from_a a of all points, mm, frame b.
+    sigma_mm : σ per axis of a residual; the RMS for points of different σ.
+    sigma_factor : ratio of the inliers' residuals to the σ given with the data; None if none was given. The covariance
+        is scaled by it only if the data contradict the given σ (``scaled``).
+    scaled : whether the covariance is derived from the residuals; False if it is derived from the given σ.
+    redundancy : degrees of freedom of the σ that the covariance is derived from; infinite if this σ was given.
+    threshold_mm : largest distance of inliers, for a point of the σ above at the points' middle; None without a
+        threshold.
+    held_out : cross-validation; None if it was not requested, or there are too few points.
+    ambiguous : whether the alternative is about as good.
     alternative : Alternative or None
-    notes : tuple of str
-        Notes on what the user should check.
-    seed, samples : int
-        Seed and number of the random samples; 0 samples if all possible ones were tried.
+    notes : notes on what the user should check.
+    seed, samples : seed and number of the random samples; 0 samples if all possible ones were tried.
     """
 
     model: str

@@ -13,8 +13,8 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.io.json import Finite, Matrix, Matrix4, Named, Points, ResultFile, Vector3
 from stcal.parallel import one_thread
-from stcal.register.liu2017 import Liu2017Options, orthogonal_samples
 from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
+from stcal.register.registration import Liu2017Options, orthogonal_samples
 from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
@@ -109,10 +109,7 @@ def _sigma_lines(found: Findings) -> list[str]:
         lines = [f"σ of its rotation about x, y, z: {three(1e3 * np.degrees(sigma[:3]))} mdeg"]
     if isinstance(found.b_from_a, Similarity):
         lines.append(f"scale {found.b_from_a.scale:.8f} ± {sigma[6] * found.b_from_a.scale:.2g}")
-    for place, xyz in (
-        ("the middle of the inliers", found.xyz_a[found.inliers].mean(0)),
-        ("a's origin", np.zeros(3)),
-    ):
+    for place, xyz in (("the middle of the inliers", found.xyz_a[found.inliers].mean(0)), ("a's origin", np.zeros(3))):
         lines.append(f"σ of a transformed point at {place}, along x, y, z: {three(found.sigma_mm_at(xyz))} mm")
     redundancy = f", {found.redundancy:.0f} degrees of freedom" if np.isfinite(found.redundancy) else ""
     factor = "" if found.sigma_factor is None else f", {found.sigma_factor:.2f} of the σ given"
@@ -169,43 +166,38 @@ def _where_it_holds(found: Findings) -> list[Block]:
     blocks: list[Block] = []
     if field is not None:
         blocks.append(_field_sentence(found, field))
-        blocks.append(
-            plot(
-                lambda: _field_figure(found, field),
-                "systematic error over the workspace",
-                "Systematic error to expect of the transform at places in and around the points, enlarged, frame b",
-            )
-        )
+
+        def figure() -> Drawing:
+            places, error = field.grid["xyz_a_mm"], field.grid["error_mm"]
+            return _views(found.b_from_a @ places, error, np.ones(len(places), bool))
+
+        about = "Systematic error to expect of the transform at places in and around the points, enlarged, frame b"
+        blocks.append(plot(figure, "systematic error over the workspace", about))
     if reach is not None:
         middle = " ".join(f"{v:.1f}" for v in reach.middle)
         explained = (
             f"Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
             "and tried on those of all; the points that it is fitted to are held out in turn"
         )
-        blocks += [page_only(explained), _reach_of_inner(reach), _cube_table(reach)]
+        blocks.append(page_only(explained))
+        inner = [(side, e.max_mm) for side, e in zip(reach.sides_mm, reach.errors[0], strict=True) if e]
+        if reach.errors[0][0] is not None and len(inner) > 1:
+            (first, _), *outer = inner
+            most = np.maximum.accumulate([error for _, error in inner])
+            farther = (f", {error:.3g} mm to {side:g} mm" for (side, _), error in zip(outer, most[1:], strict=True))
+            blocks.append(
+                f"fitted in the cube of {first:g} mm it holds within {most[0]:.3g} mm there{''.join(farther)}"
+            )
+        rows = []
+        for side, row in zip(reach.sides_mm, reach.errors, strict=True):
+            errors = [
+                [str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row
+            ]
+            rows.append([f"{side:g} mm", *chain.from_iterable(errors)])
+        sides = [f"{side:g}" for side in reach.sides_mm]
+        over = [("", 1), (f"inner {sides[0]} mm:", 3), *((f"{a} … {b} mm:", 3) for a, b in pairwise(sides))]
+        blocks.append(Table(["<fitted in the cube of", *["points", "mean", "max"] * len(rows)], rows, over))
     return blocks or [page_only("Too few points to tell")]
-
-
-def _reach_of_inner(reach: Cubes) -> str:
-    """Returns how large the errors of a fit to the inner cube are there, and farther out."""
-    found = [(side, e.max_mm) for side, e in zip(reach.sides_mm, reach.errors[0], strict=True) if e]
-    if reach.errors[0][0] is None or len(found) < 2:
-        return ""
-    most = np.maximum.accumulate([error for _, error in found])
-    (inner, _), *outer = found
-    farther = (f", {error:.3g} mm to {side:g} mm" for (side, _), error in zip(outer, most[1:], strict=True))
-    return f"fitted in the cube of {inner:g} mm it holds within {most[0]:.3g} mm there{''.join(farther)}"
-
-
-def _cube_table(reach: Cubes) -> Table:
-    """Returns errors in cubes, one row for each cube that the transform is fitted to."""
-    rows = []
-    for side, row in zip(reach.sides_mm, reach.errors, strict=True):
-        errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
-        rows.append([f"{side:g} mm", *chain.from_iterable(errors)])
-    sides = [f"{side:g}" for side in reach.sides_mm]
-    over = [("", 1), (f"inner {sides[0]} mm:", 3), *((f"{a} … {b} mm:", 3) for a, b in pairwise(sides))]
-    return Table(["<fitted in the cube of", *["points", "mean", "max"] * len(rows)], rows, over)
 
 
 VIEWS = ((0, 1), (0, 2), (1, 2))
@@ -224,11 +216,6 @@ def space_figure(found: Findings) -> Drawing:
         bad, good = found.outliers[: MOST_ARROWS // 3], np.flatnonzero(found.inliers)
         rows = np.concatenate([good[np.linspace(0, len(good) - 1, MOST_ARROWS - len(bad)).astype(int)], bad])
     return _views(found.b_from_a @ found.xyz_a[rows], found.residuals[rows], found.inliers[rows])
-
-
-def _field_figure(found: Findings, field: Field) -> Drawing:
-    places, error = field.grid["xyz_a_mm"], field.grid["error_mm"]
-    return _views(found.b_from_a @ places, error, np.ones(len(places), bool))
 
 
 def _views(place: np.ndarray, error: np.ndarray, inlier: np.ndarray) -> Drawing:
@@ -258,7 +245,7 @@ def sample_size_section(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
     rows, tries = [], min(options.tries, 200)
     for points in range(4, min(41, len(xyz_a)), 2):
         samples = orthogonal_samples(xyz_a, xyz_b, replace(options, sample=points, tries=tries), seed)
-        shares = np.array([(np.delete(error, own) < options.limit_mm).mean() for _, own, _, error in samples])
+        shares = np.array([(np.delete(error, own) < options.limit_mm).mean() for own, _, error in samples])
         best, median = (100 * shares.max(), 100 * np.median(shares)) if len(shares) else (np.nan, np.nan)
         acceptable = f"{(shares > options.share).sum()} of {tries}"
         rows.append([points, number(best, 1), number(median, 1), len(shares), acceptable])
@@ -303,9 +290,7 @@ class RegistrationFile(ResultFile):
     covariance_of: list[str] = Key(description="names of its rows: `rx_rad … z_mm`, `scale`, `m11 … m34_mm`")
     scales: Vector3 = Key(description="ratios of lengths in b to those in a, along three axes")
     sigma_mm: float = Key(description="σ per axis of a residual, estimated")
-    redundancy: Finite = Key(
-        description="degrees of freedom of the σ that the covariance rests on (null: given)",
-    )
+    redundancy: Finite = Key(description="degrees of freedom of the σ that the covariance rests on (null: given)")
     sigma_factor: float | None = Key(description="by how much residuals exceed the σ given with the data")
     scaled: bool = Key(description="whether the covariance rests on the residuals")
     threshold_mm: float | None = Key(description="inliers are nearer than this; null by least squares")

@@ -14,19 +14,15 @@ from scipy.special import chdtrc, chdtri
 from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
-from stcal.register.point_pairs import Pairs
-from stcal.register.registered import ErrorFigures, Registration, held_out
-from stcal.register.transforms import AFFINE, MODELS, Problem, Transform, jacobian, problem_of
+from stcal.register.consensus import AFFINE, MODELS, Problem, Transform, jacobian, problem_of
+from stcal.register.registered import ErrorFigures, Pairs, Registration, held_out
 
 MOST_POINTS = 500
 """Largest number of points of the model, evenly chosen from more, as its cost grows with the third power."""
-SEEN_AT = 0.01
-"""Probability of declaring a systematic part if residuals are noise."""
+SEEN_AT, WILD = 0.01, 0.01
+"""Probability of a systematic part in noise, and that a clean set has any point taken for an outlier of the field."""
 LENGTHS, RATIOS = 12, np.geomspace(1e-3, 1e7, 41)
 """Number of lengths tried before refinement, and tried ratios of the variance of f to that of the noise."""
-WILD = 0.01
-"""Probability that a clean set has any point that is taken for an outlier of the field."""
-ROUNDS = 5
 GRID, MARGIN = 7, 0.25
 """Number of places along each side of the grid of the field, and its margin beyond the box of the points."""
 sytrd, ormqr, pttrf, pttrs = get_lapack_funcs(("sytrd", "ormqr", "pttrf", "pttrs"), dtype=np.float64)
@@ -36,11 +32,10 @@ sytrd, ormqr, pttrf, pttrs = get_lapack_funcs(("sytrd", "ormqr", "pttrf", "pttrs
 class Field:
     """Systematic residuals b − b_from_a a over the workspace, frame b's axes, at places in frame a.
 
-    ``length_mm`` : distance over which they change; ``size_mm`` : their RMS length at the points; ``noise_mm`` : σ per
-    axis of the remaining noise; ``p_value`` : probability of such a part by chance; ``rows`` : (m,) rows of the points
-    used; ``taken_back`` : outliers of the registration that follow the field of the others; ``plain_mm``,
-    ``corrected_mm`` : (m,) errors of points by the transform, and by transform and field, each fitted to the other
-    points; ``sigma_ratio`` : RMS ratio of the latter to their σ, about 1 if the field's σ are true.
+    ``length_mm`` : over which they change; ``size_mm`` : RMS length at the points; ``noise_mm`` : σ per axis beside
+    them; ``p_value`` : of such a part by chance; ``rows`` : (m,) of the points used; ``taken_back`` : outliers that
+    follow the field of the others; ``plain_mm``, ``corrected_mm`` : (m,) errors of points by the transform, and by
+    transform and field, each fitted to the others; ``sigma_ratio`` : RMS of the latter over their σ.
     """
 
     length_mm: float
@@ -108,7 +103,7 @@ def residual_field(registration: Registration, problem: Problem) -> Field | None
     model, precision, residuals = problem.model, problem.precision, problem.residuals(registration.b_from_a)
     variance = 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
     used, followers = registration.inliers.copy(), np.zeros(0, int)
-    for _ in range(ROUNDS):
+    for _ in range(5):
         rows = _few(np.flatnonzero(used))
         if model.redundancy(len(rows)) < 2 * model.parameters:
             return None
@@ -235,11 +230,9 @@ class _Kriged:
 
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Sides of the cubes relative to the cube that holds all points."""
+"""Sides of the cubes relative to the cube that holds all points, which is rounded up to two digits."""
 LEAST_POINTS = 10
 """Least number of points in the inner cube: 30 coordinates for the six parameters of a rigid transform."""
-DIGITS = 2
-"""Significant digits of the outer side, which is rounded up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,7 +260,7 @@ def cubes(
     a = problem.xyz_a
     middle = (a.min(0) + a.max(0)) / 2
     reach = 2 * np.abs(a - middle).max(1)
-    step = 10.0 ** (np.floor(np.log10(reach.max())) - DIGITS + 1)
+    step = 10.0 ** (np.floor(np.log10(reach.max())) - 1)
     outer = np.ceil(reach.max() / step * (1 - 1e-9)) * step
     sides = [share * outer for share in SHARES if (reach <= share * outer).sum() >= LEAST_POINTS]
     table = []

@@ -8,7 +8,9 @@ from .kinematics.forward import jacobian as jacobian
 from .kinematics.inverse import branches as branches
 from .kinematics.inverse import inverse as inverse
 from .kinematics.measurements import Measurements as Measurements
+from .kinematics.measurements import Targets as Targets
 from .kinematics.measurements import read_measurements as read_measurements
+from .kinematics.measurements import read_targets as read_targets
 from .kinematics.robot_file import load_robot as load_robot
 from .kinematics.robot_file import robot_toml as robot_toml
 from .kinematics.robot_file import save_robot as save_robot
@@ -24,10 +26,8 @@ from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.compensation import compensated_csv as compensated_csv
 from .use.evaluation import evaluate as evaluate
+from .use.evaluation import read_measured as read_measured
+from .use.evaluation import verify as verify
 from .use.pose_design import DesignOptions as DesignOptions
 from .use.pose_design import design as design
 from .use.pose_design import design_csv as design_csv
-from .use.targets import Targets as Targets
-from .use.targets import read_targets as read_targets
-from .use.verification import read_measured as read_measured
-from .use.verification import verify as verify

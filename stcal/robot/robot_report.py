@@ -37,9 +37,8 @@ from stcal.robot.identified_report import left_lines, placed_table, residual_plo
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
-from stcal.robot.use.evaluation import Evaluated, Evaluation
+from stcal.robot.use.evaluation import Evaluated, Evaluation, Verification
 from stcal.robot.use.pose_design import PoseDesign
-from stcal.robot.use.verification import Verification
 
 
 def _axis_cells(fit: AxisFit) -> list[str]:

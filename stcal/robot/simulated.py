@@ -8,11 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import State, tips
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.robot_model import Robot
+from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot
 
 
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:

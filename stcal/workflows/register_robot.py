@@ -15,17 +15,15 @@ from stcal.geometry.robust import length_limit
 from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register
-from stcal.register.liu2017 import Liu2017Options
-from stcal.register.point_pairs import WHAT, Pairs
-from stcal.register.registered import ErrorFigures, Registration
+from stcal.register.registered import WHAT, ErrorFigures, Pairs, Registration
+from stcal.register.registration import Liu2017Options
 from stcal.register.registration_report import error_table, matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
-from stcal.robot.kinematics.conditions import read_conditions
-from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
+from stcal.robot.kinematics.measurements import Measurements, joint_values, read_conditions, targets_of
 from stcal.robot.kinematics.robot_model import Robot
 
 FIRST_NAMES = 6

@@ -8,9 +8,8 @@ from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import known_dictionary
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import load_layout, load_plan
-from stcal.locate.scenes import run
+from stcal.locate.scenes import find_scenes, run
 from tests.boards.drawn import kalibr_tag
 from tests.outcome import fails_with
 

@@ -16,11 +16,10 @@ from stcal.io.cameras.read import read_camera, written
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml
-from stcal.robot.kinematics.conditions import Conditions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.robot_file import robot_toml
-from stcal.robot.kinematics.robot_model import Robot, mh80
+from stcal.robot.kinematics.robot_model import Conditions, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.data.group_model import detections_csv
 from stcal.sfm.interop.export_colmap import export_model

@@ -11,7 +11,7 @@ from stcal import register
 from stcal.cli.main import app
 from stcal.geometry.rigid import Rigid
 from stcal.io.join import join_tables, stack_tables
-from stcal.register.point_pairs import read_pairs
+from stcal.register.registered import read_pairs
 from tests.outcome import fails_with
 
 

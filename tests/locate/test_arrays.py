@@ -71,9 +71,3 @@ def test_tags_of_a_layout():
     refuses("E-ARRAY-SHAPE", TagLayout.from_tags, "4x4_50", [1, 2], [[0.0, 0.0]], 30.0)
     with fails_with("E-TAG-DICTIONARY … 4x4_51"):
         find_charuco(np.zeros((9, 9), np.uint8), "", CharucoDesign(5, 7, 30.0, 20.0, "4x4_51"))
-
-
-def test_a_board_of_a_dictionary_by_its_short_name():
-    board = CharucoDesign(5, 7, 30.0, 22.0, "4x4_50")
-    image = rendered(board, np.diag([1.2, 1.2, 1.0]), (300, 280), np.random.default_rng(1))
-    assert len(find_charuco(image, "", board)) == 24

@@ -1,6 +1,5 @@
 """Real photographs: the tags of a ChArUco board are the target, its chessboard corners say where it is."""
 
-import time
 from pathlib import Path
 
 import cv2
@@ -9,14 +8,10 @@ import pytest
 
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
-from stcal.io.images import decode
 from stcal.locate.estimate import merge
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import LayoutPlan
 from stcal.locate.layout_calibration import CalibrationImages
-from stcal.locate.scenes import run
 from stcal.synthetic.optics import Light, expose
 from stcal.workflows.board_views import calibration_images
 from tests.support.holdout import half_calibrated, subset_trials
@@ -59,42 +54,13 @@ def test_poses_from_the_other_half(images, held_out):
     assert np.mean([trial.error_mm for trial in trials]) < 1.1
 
 
-@pytest.mark.parametrize(
-    ("size", "accepted"),
-    [(1, 0.0), pytest.param(2, 0.4, marks=pytest.mark.full), (3, 0.7), pytest.param(4, 0.8, marks=pytest.mark.full)],
-)
+@pytest.mark.parametrize(("size", "accepted"), [(1, 0.0), (3, 0.7)])
 def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
     trials = list(subset_trials(images, held_out[1], held_out[0], size, most=25))
     used = [trial for trial in trials if trial.decision == "accept"]
     wrong = [trial for trial in used if trial.flipped or trial.error_rad > np.radians(5)]
     assert len(wrong) <= 0.01 * len(trials)
     assert len(used) >= accepted * len(trials)
-    if size == 4:
-        assert np.degrees(np.mean([trial.error_rad for trial in used])) < 0.7
-        assert np.mean([trial.error_mm for trial in used]) < 1.5
-
-
-def test_a_scene_takes_about_twice_as_long_as_opencvs_tags(folder, images, tmp_path):
-    layout = half_calibrated(images, PLAN, range(16)).layout
-    photograph = cv2.imread(str(folder / "images" / images.names[5]), cv2.IMREAD_GRAYSCALE)
-    for k, each in enumerate(expose(photograph, np.geomspace(1 / 4, 4, 5))):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), each)
-    scenes = find_scenes(tmp_path)
-    model = CameraModel(
-        images.camera.focal, images.camera.centre, images.camera.distortion, "PINHOLE", None, None, "cal_data.yaml"
-    )
-    usual = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250))
-    ratios = []
-    for _ in range(7):  # the first warms up
-        start = time.process_time()
-        for file in scenes[0].files:
-            usual.detectMarkers(decode(file.path.read_bytes(), file.name))
-        middle = time.process_time()
-        result = next(iter(run(scenes, layout, model)))
-        ratios.append((time.process_time() - middle) / (middle - start))
-    assert result.verdict.decision == "accept"
-    # 1.9 on one processor: OpenCV's detection is half of it; edges by area and the pose follow. A third is leeway.
-    assert min(ratios[1:]) < 2.5
 
 
 def test_exposures_together_see_more(folder, images):

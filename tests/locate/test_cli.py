@@ -79,11 +79,8 @@ def test_limits_are_options(run):
     image = "good/1.png"
     assert run(image)[0] == 0
     for option, value, reason in [
-        ("--min-tags", 7, "tags 6, at least 7 needed"),
         ("--min-foreshortening", 0.9, "foreshortening 0.87"),
-        ("--max-sigma-deg", 0.001, "sigma of rotation"),
         ("--max-sigma-mm", 0.001, "sigma of position"),
-        ("--min-spread-px", 1000, "spread"),
     ]:
         code, shown, _ = run(image, option, value)
         assert code == 3
@@ -118,32 +115,24 @@ def test_schedule(locate):
     assert locate("schedule", "3", "1", "3")[0] == 2
 
 
-BOARDS = {
-    "dots": 'rows = 4\ncolumns = 9\npitch_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n',
-    "chessboard": 'type = "chessboard"\nrows = 4\ncolumns = 9\nsquare_mm = 20.0\n',
-}
+BOARD = 'rows = 4\ncolumns = 9\npitch_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
 
 
-def with_board(kind: str) -> np.ndarray:
-    """The target above a board, on one sheet 220 × 320 mm; the board's origin at (30, 230) mm."""
+def with_board() -> np.ndarray:
+    """The target above a board of dots, on one sheet 220 × 320 mm; the board's origin at (30, 230) mm."""
     printed = np.full((320 * PER_MM, int(SHEET_MM[0]) * PER_MM), 255, np.uint8)
     printed[: sheet().shape[0]] = sheet()
-    for row in range(-1, 4):
-        for column in range(-1, 9):
-            x, y = (30 + 20 * column) * PER_MM, (230 + 20 * row) * PER_MM
-            if kind == "chessboard" and (row + column) % 2 == 0:
-                printed[y : y + 20 * PER_MM, x : x + 20 * PER_MM] = 0
-            elif kind == "dots" and row >= 0 and column >= 0:
-                # the middle of a pixel stands for a place half a pixel on
-                middle = (int(16 * (x - 0.5)), int(16 * (y - 0.5)))
-                cv2.circle(printed, middle, 16 * 6 * PER_MM, 0, -1, cv2.LINE_AA, shift=4)
+    for row in range(4):
+        for column in range(9):
+            # the middle of a pixel stands for a place half a pixel on
+            middle = [int(16 * (mm * PER_MM - 0.5)) for mm in (30 + 20 * column, 230 + 20 * row)]
+            cv2.circle(printed, middle, 16 * 6 * PER_MM, 0, -1, cv2.LINE_AA, shift=4)
     return printed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", BOARDS)
-def test_calibrate_with_boards_of_other_kinds(locate, tmp_path, kind):
-    printed, rng = with_board(kind), np.random.default_rng(1)
+def test_calibrate_with_a_board_of_dots(locate, tmp_path):
+    printed, rng = with_board(), np.random.default_rng(1)
     (tmp_path / "images").mkdir()
     matrix = np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
     for k in range(5):
@@ -155,7 +144,7 @@ def test_calibrate_with_boards_of_other_kinds(locate, tmp_path, kind):
         shift = np.array([0, 0, 620.0]) - turn @ np.array([SHEET_MM[0] / 2, 160.0, 0])
         image = photograph(printed, PER_MM, matrix @ np.column_stack([turn[:, :2], shift]), (1200, 900))
         cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), image)
-    (tmp_path / "board.toml").write_text(BOARDS[kind])
+    (tmp_path / "board.toml").write_text(BOARD)
     entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
     (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
     write_cameras_txt(tmp_path / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))

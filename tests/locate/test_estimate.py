@@ -132,14 +132,6 @@ def test_no_tag_is_refused():
         locate(empty, LAYOUT, CAMERA)
 
 
-def test_the_order_of_tags_does_not_matter():
-    truth = Rigid.exp([0.3, 0.1, 0.5, 10, 20, 700.0])
-    seen = merge(simulated_exposures(LAYOUT, truth, np.random.default_rng(0)), LAYOUT).seen
-    one, other = locate(seen, LAYOUT, CAMERA), locate(seen.select([3, 1, 5, 0, 2, 4]), LAYOUT, CAMERA)
-    assert np.abs(one.camera_from_obj.matrix() - other.camera_from_obj.matrix()).max() < 1e-6
-    assert np.allclose(one.covariance, other.covariance, rtol=1e-5, atol=1e-12)
-
-
 def test_shared_errors_do_not_average_out():
     """Nine exposures: with independent noise σ falls to a third, with common noise not at all."""
     truth = Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.board_file import load_flat_board
-from stcal.locate.layout import layout_toml, load_layout, load_plan, obj_from_plane, square
+from stcal.locate.layout import layout_toml, load_layout, load_plan, square
 from tests.outcome import fails_with
 from tests.support.tags import example_layout
 
@@ -43,11 +43,6 @@ def test_a_calibrated_layout_comes_back(tmp_path):
     assert load_flat_board(path).tags == layout.tags  # and it is a board of tags
 
 
-def test_sigma_of_a_nominal_layout(tmp_path):
-    layout = load_layout(written(tmp_path, HEAD + "sigma_mm = 0.2\n" + PLACED.format(1, 0, 0, 0)))
-    assert np.allclose(layout.sigma_mm(), 0.2)
-
-
 def test_a_plan_may_leave_places_open(tmp_path):
     path = written(tmp_path, HEAD + TAG.format(4) + "size_mm = 20.0\n" + PLACED.format(5, 1, 2, 0))
     plan = load_plan(path)
@@ -71,11 +66,3 @@ def test_a_plan_may_leave_places_open(tmp_path):
 def test_what_is_wrong_is_named(tmp_path, text, reason):
     with fails_with(reason):
         load_layout(written(tmp_path, HEAD + text))
-
-
-def test_the_frame_of_a_turned_tag():
-    angle = 0.3
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    found, shift = obj_from_plane(square(20.0) @ turn.T + [5, 7])
-    assert np.allclose(found, turn.T, atol=1e-12)
-    assert np.allclose(found @ [5, 7] + shift, 0, atol=1e-12)

@@ -6,8 +6,8 @@ import pytest
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.locate.exposures import exposure_times
-from stcal.locate.patent import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
+from stcal.locate.scenes import exposure_times
+from stcal.locate.verdict import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
 from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
 
@@ -23,13 +23,6 @@ def test_exposure_times_are_a_geometric_series():
     assert np.allclose(exposure_times(1.0, 16.0, 5), [1, 2, 4, 8, 16])
     refuses("E-EXPOSURES-VALUE", exposure_times, 0.0, 1.0, 3)
     refuses("E-EXPOSURES-VALUE", exposure_times, 1.0, 2.0, 1)
-
-
-def test_area_is_that_of_the_convex_hull():
-    assert triangulated_area(tag_at(0, 0)) == pytest.approx(100)
-    both = np.vstack([tag_at(0, 0), tag_at(90, 0)])
-    assert triangulated_area(both) == pytest.approx(1000)
-    assert triangulated_area(np.array([[0.0, 0], [1, 1], [2, 2], [3, 3]])) == 0
 
 
 def test_selection_by_number_and_area():

@@ -9,9 +9,8 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import TargetLayout
-from stcal.locate.scenes import LocateOptions, locate_scene, run
+from stcal.locate.scenes import find_scenes, locate_scene, run
 from stcal.synthetic.optics import Light, expose
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 
@@ -72,23 +71,6 @@ def test_tags_of_another_target_are_named(located, plain):
     assert "no tag of the layout, but others of its dictionaries" in result.verdict.reasons[0]
 
 
-@pytest.mark.slow
-def test_one_tag_edge_on(located):
-    """From 82° on a tag is not read, or its pose not believed."""
-    decisions = []
-    for degrees in (60, 80, 83, 86):
-        printed, middle = sheet(), (PER_MM * SHEET_MM / 2).astype(int)
-        printed[:, : middle[0] - 21 * PER_MM] = 255
-        printed[:, middle[0] + 21 * PER_MM :] = 255
-        printed[middle[1] + 21 * PER_MM :] = 255
-        result = located([photo(tilted(degrees, 250.0), printed)])
-        decisions.append(result.verdict.decision)
-        if degrees > 80:
-            assert result.verdict.reasons
-    assert decisions[2:] == ["reject", "reject"]
-    assert decisions[0] == "accept"
-
-
 def test_an_id_twice_in_view(located):
     printed = sheet()
     side = slice(int((SHEET_MM[1] / 2 - 50) * PER_MM) - 30, int((SHEET_MM[1] / 2 - 30) * PER_MM) + 30)
@@ -129,12 +111,6 @@ def test_a_scene_that_moved(located, plain, shift):
     assert result.pose is None
 
 
-def test_a_scene_that_did_not_move(located, plain):
-    result = located(expose(plain, [0.3, 0.6, 1.0, 2.0]))
-    assert result.verdict.decision == "accept"
-    assert max(shift.shift_px for shift in result.merged.shifts) < 0.25
-
-
 def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):
     good = cv2.imencode(".png", plain)[1].tobytes()
     (tmp_path / "a.png").write_bytes(good)
@@ -142,14 +118,6 @@ def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):
     result = next(iter(run(find_scenes(tmp_path), LAYOUT, MODEL)))
     assert result.verdict.decision == "accept"
     assert result.notes[0].startswith("left out: b.png: truncated")
-
-
-def test_the_published_method_by_its_name(located, plain):
-    result = located([plain, plain], options=LocateOptions("patent"))
-    assert result.verdict.decision == "accept"
-    assert [check.name for check in result.verdict.checks] == ["det J", "error", "error ratio"]
-    off = result.patent.camera_from_obj @ TRUTH.inverse()
-    assert off.angle_rad() < np.radians(1)
 
 
 def test_a_camera_file_of_another_camera(located, plain):

@@ -4,19 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_designs import BoardView, ChessboardDesign, view_of
+from stcal.boards.board_designs import ChessboardDesign, view_of
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import LayoutPlan, obj_from_plane
-from stcal.locate.layout_calibration import (
-    CalibratedLayout,
-    ImageCorners,
-    _by_board_corners,
-    _turned_alike,
-    calibrate,
-    plane_points,
-)
+from stcal.locate.layout import LayoutPlan
+from stcal.locate.layout_calibration import CalibratedLayout, ImageCorners, _turned_alike, calibrate
 from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
 
@@ -131,27 +124,6 @@ def test_obj_lies_where_it_is_on_the_board_and_a_misread_tag_moves_little():
     assert np.abs(bad.layout.corners_mm - good.layout.corners_mm)[2].max() < 2 * sigma
 
 
-def test_rays_meet_the_plane():
-    pose = random_pose(np.random.default_rng(0))
-    xy = LAYOUT.corners_mm.reshape(-1, 2)
-    at = pose @ np.pad(xy, ((0, 0), (0, 1)))
-    assert np.allclose(plane_points(pose, at[:, :2] / at[:, 2:]), xy, atol=1e-9)
-
-
-def test_the_derivative_of_the_frame():
-    corners = LAYOUT.corners_mm @ [[0.8, 0.6], [-0.6, 0.8]] + np.array([20.0, 30.0])
-    corners[0] += np.array([[0.3, -0.2], [0, 0.1], [-0.2, 0.4], [0.1, 0]])
-
-    def in_obj(flat):
-        turn, shift = obj_from_plane(flat.reshape(-1, 4, 2)[0])
-        return (flat.reshape(-1, 2) @ turn.T + shift).ravel()
-
-    step = 1e-5
-    numeric = np.array([in_obj(corners.ravel() + e) - in_obj(corners.ravel() - e) for e in step * np.eye(48)]).T
-    exact = _by_board_corners(corners, 0, obj_from_plane(corners[0])[0])
-    assert np.abs(numeric / (2 * step) - exact).max() < 1e-7
-
-
 def test_what_cannot_be_calibrated_is_named():
     boards, tags, names = views(3, 0)
     refuses("E-LAYOUT-FEW-IMAGES … 1 … 3 … 2", calibrate, PLAN, [boards[0], None, None], tags, names, CAMERA)
@@ -168,13 +140,6 @@ def test_deviation_from_nominal_places():
     result = calibrate(plan, *views(8, 1), CAMERA)
     assert int(np.argmax(result.deviation_mm)) == 3
     assert 1.5 < result.deviation_mm[3] < 3.5  # the fit of all takes part of it
-
-
-def test_an_image_without_the_tag_of_a_small_view():
-    boards, tags, names = views(4, 0)
-    few = BoardView("0", boards[0].ids[:3], boards[0].xyz_board[:3], boards[0].xy_px[:3])
-    result = calibrate(PLAN, [few, *boards[1:]], tags, names, CAMERA)
-    assert result.images == ("1", "2", "3")
 
 
 def test_images_are_numbered_in_an_order_that_links_them():

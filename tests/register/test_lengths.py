@@ -5,7 +5,6 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from tests.outcome import fails_with
 
 B_FROM_A = Rigid.exp([0.3, -0.2, 0.5, 100, 50, -30])
 SIGMA_MM = 0.05
@@ -27,18 +26,7 @@ def test_another_scale_is_named_with_its_sigma(scale):
     assert sigma == pytest.approx(SIGMA_MM / np.sqrt(((a - a.mean(0)) ** 2).sum()), rel=0.3)
     assert abs(found - scale) < 4 * sigma
     assert "use --model similarity" in note
-    assert ("ppm, of temperature" in note) == (scale == 1.0002)
     assert register(a, scale * b + noise, model="similarity").notes == ()
-
-
-@pytest.mark.full
-def test_one_scale_is_rarely_called_two():
-    """One in 10 000 by each of two tests: of 300 sets, two have a chance of 1 in 600."""
-    said = 0
-    for seed in range(300):
-        a, b, noise = points(12, seed)
-        said += any("lengths in b" in note for note in register(a, b + noise).notes)
-    assert said <= 1
 
 
 def test_an_axis_that_is_scaled_is_told_from_a_scale():
@@ -56,23 +44,7 @@ def test_a_bend_is_still_said_beside_a_scale():
     assert any("the frames are bent" in note for note in notes)
 
 
-@pytest.mark.parametrize("wrong", [0, 20])
-def test_how_much_better_a_mirrored_frame_fits_is_true(wrong):
-    a, b, noise = points()
-    b = b * [1, -1, 1] + noise
-    b[:wrong] += 500
-    with fails_with("E-REGISTER-MIRRORED") as caught:
-        register(a, b)
-    # noise of 0.05 mm against half a metre of thickness
-    assert float(str(caught.value).split(" fit ")[1].split()[0]) > 100
-
-
 def test_equal_frames_are_not_bent():
     a, b, _ = points()
     assert register(a, a).notes == ()
     assert register(a, b).notes == ()
-
-
-def test_six_points_tell():
-    a, b, noise = points(6)
-    assert not any("cannot be identified" in note for note in register(a, b + noise).notes)

@@ -1,4 +1,4 @@
-"""Mistakes that the data show: units, mirrored axes, exchanged rows."""
+"""Mistakes that the data show: units, mirrored axes."""
 
 import numpy as np
 import pytest
@@ -37,18 +37,13 @@ def test_a_mirrored_frame_is_refused(share, method):
 
 
 @pytest.mark.parametrize(
-    ("mend", "text"),
-    [
-        (np.diag([1.0, -1, 1]), "E-REGISTER-MIRRORED"),
-        (np.diag([1.0, 1, -1]), "E-REGISTER-MIRRORED … change the sign of az"),
-        (np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), "E-REGISTER-MIRRORED"),
-    ],
+    "mend", [np.diag([1.0, -1, 1]), np.diag([1.0, 1, -1]), np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])]
 )
-def test_the_axis_is_named_where_the_frames_are_nearly_parallel(mend, text):
+def test_any_mirrored_axis_is_refused(mend):
     s = scene(4, 30)
     a = s.xyz_a
     b = Rigid.exp([0.02, -0.01, 0.03, 5, 6, 7]) @ a + (s.xyz_b - s.b_from_a @ a)
-    with fails_with(text):
+    with fails_with("E-REGISTER-MIRRORED"):
         register(a @ mend.T, b)
 
 
@@ -66,7 +61,7 @@ def test_a_thin_bent_sheet_is_not_called_mirrored():
     rng = np.random.default_rng(5)
     a = np.column_stack([rng.uniform(-100, 100, (200, 2)), rng.normal(0, 0.5, 200)])
     b = a * [1, 1, -0.3] + rng.normal(0, 0.1, a.shape)
-    assert mirrored_ratio(a, b)[0] > 1.5
+    assert mirrored_ratio(a, b) > 1.5
     register(a, b, folds=0)
 
 
@@ -74,29 +69,6 @@ def test_an_affine_fit_tells_that_it_mirrors():
     s = scene(6, 30)
     found = register(s.xyz_a * [1, 1, -1], s.xyz_b, model="affine", folds=0)
     assert any("is a reflection" in note for note in found.notes)
-
-
-def test_exchanged_rows_are_named():
-    s = scene(7, 30)
-    b = s.xyz_b[np.r_[0, 1, 9, 3:9, 2, 10:30]]  # rows 3 and 10
-    found = register(s.xyz_a, b, folds=0)
-    assert sorted(found.outliers) == [2, 9]
-    [note] = [n for n in found.notes if n.startswith("rows exchanged")]
-    assert "row 3 is the point of row 10, row 10 is the point of row 3" in note
-    random = scene(8, 100, 0.4)
-    assert not any("exchanged" in n for n in register(random.xyz_a, random.xyz_b, folds=0).notes)
-    many = scene(14, 8000, 0.5)  # of 4000 wrong points some lie by chance where another one should
-    assert not any("exchanged" in n for n in register(many.xyz_a, many.xyz_b, folds=0).notes)
-
-
-@pytest.mark.parametrize(("side", "factor"), [("a", 1000), ("b", 25.4)])
-def test_a_row_in_another_unit_is_named(side, factor):
-    s = scene(9, 30)
-    a, b = s.xyz_a.copy(), s.xyz_b.copy()
-    (a if side == "a" else b)[4] /= factor
-    found = register(a, b, folds=0, lines=range(2, 32))
-    assert found.outliers.tolist() == [4]
-    assert any(f"another unit: {side} of line 6 fits when multiplied by {factor:g}" in note for note in found.notes)
 
 
 def test_least_squares_tells_that_rows_are_far_off():

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.register.transforms import MODELS, Problem, hypotheses, jacobian, parts
+from stcal.register.consensus import MODELS, Problem
 from tests.outcome import fails_with
 from tests.support.point_pairs import make_scene
 
@@ -72,41 +72,6 @@ def test_the_covariance_is_that_of_numeric_derivatives(model, kind):
     np.testing.assert_allclose(product * scale[:, None] / scale, np.eye(model.parameters), atol=2e-4)
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
-@pytest.mark.parametrize("kind", NOISE)
-def test_leverages_sum_to_the_parameters(model, kind):
-    rng = np.random.default_rng(3)
-    s = make_scene(rng, 15)
-    problem, used = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 15)), np.arange(15) < 12
-    found = problem.leverages(problem[used].fit(), used)
-    assert np.trace(found, axis1=1, axis2=2)[used].sum() == pytest.approx(model.parameters, rel=1e-9)
-    # inside, a point's own share is less than all of it; outside, extrapolation has no bound
-    assert np.linalg.eigvalsh(found[used]).max() < 1
-
-
-def test_leverage_foretells_the_residual_without_the_point():
-    """Of a linear model exactly: r without i = (1 − H)⁻¹ r."""
-    rng = np.random.default_rng(4)
-    s, model = make_scene(rng, 9, sigma_mm=2), MODELS["affine"]
-    problem = Problem(model, s.xyz_a, s.xyz_b, precision_of("matrices", rng, 9))
-    transform = problem.fit()
-    spread = problem.leverages(transform, np.ones(9, bool))
-    own = problem.whitened(problem.residuals(transform))
-    without = problem.whitened(problem.residuals(problem[np.arange(9) != 4].fit()))
-    np.testing.assert_allclose(np.linalg.solve(np.eye(3) - spread[4], own[4]), without[4], rtol=1e-6)
-
-
-@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
-def test_many_samples_at_once_are_single_fits(model):
-    s = make_scene(np.random.default_rng(5), 30)
-    samples = np.random.default_rng(6).permutation(30)[: 6 * model.sample].reshape(6, model.sample)
-    linear, translation = hypotheses(model, s.xyz_a[samples], s.xyz_b[samples])
-    for sample, matrix, shift in zip(samples, linear, translation, strict=True):
-        one, at = parts(Problem(model, s.xyz_a[sample], s.xyz_b[sample], np.ones(len(sample))).fit())
-        np.testing.assert_allclose(matrix, one, atol=1e-9)
-        np.testing.assert_allclose(shift, at, atol=1e-6)
-
-
 @given(st.integers(0, 9999), st.sampled_from(sorted(MODELS)))
 def test_frames_may_be_moved(seed, name):
     """Moving b moves the transform; moving a takes the motion off again; residuals keep their length."""
@@ -121,13 +86,6 @@ def test_frames_may_be_moved(seed, name):
     np.testing.assert_allclose(
         Problem(model, moved @ s.xyz_a, s.xyz_b, weights).fit() @ (moved @ s.xyz_a), found @ s.xyz_a, atol=1e-7
     )
-
-
-def test_jacobian_of_one_point_by_hand():
-    quarter = Rigid(Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix())
-    slope = jacobian(MODELS["rigid"], quarter, np.array([[1.0, 0, 0]]))[0]  # goes to (0, 1, 0)
-    expected = np.array([[0, 0, -1, 1, 0, 0], [0, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 1.0]])
-    np.testing.assert_allclose(slope, expected, atol=1e-15)
 
 
 def test_affine_transforms_compose_and_invert():

@@ -5,8 +5,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.row_groups import moved_meanwhile
-from stcal.register.transforms import MODELS, problem_of
+from stcal.register.consensus import MODELS, problem_of
+from stcal.register.doubts import moved_meanwhile
 from tests.outcome import fails_with
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

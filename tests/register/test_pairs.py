@@ -65,7 +65,3 @@ def test_noise_of_three_kinds(written):
 def test_bad_files(written, rows, head, message):
     with fails_with(message):
         read_pairs(written(rows, head))
-
-
-def test_places_visited_twice_are_no_duplicates(written):
-    assert len(read_pairs(written([*ROWS, "0,0,0,10,20,30.001"]))) == 5

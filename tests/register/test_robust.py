@@ -7,9 +7,8 @@ from scipy.stats import beta
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
-from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
-from stcal.register.row_groups import lies_together, sphericity, two_groups, wilks_bound
-from stcal.register.transforms import MODELS, Problem, problem_of
+from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, MODELS, Problem, chernoff, deletion_squares
+from stcal.register.registration import wilks_bound
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, scene
 
@@ -38,10 +37,10 @@ def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share, sets):
 
 @pytest.mark.slow
 def test_clean_points_are_kept():
-    """One set in a thousand may lose a point: of 80 more than 2 would with a chance of 1e-4."""
-    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(80)))
+    """One set in a thousand may lose a point: of 40 more than 1 would with a chance of 1e-3."""
+    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(40)))
     assert CLEAN_SETS_WITH_OUTLIER == 0.001
-    assert lost <= 2
+    assert lost <= 1
 
 
 def test_outliers_just_beyond_noise_are_found():
@@ -89,14 +88,6 @@ def test_two_transforms_are_refused_or_told(kind, share, sets):
         assert min(rms) < 4 * SIGMA_MM
 
 
-def test_half_of_the_points_shifted_by_little():
-    """One transform between two groups 2 mm apart looks like noise of 0.6 mm; it is none."""
-    for trial in range(4):
-        s = scene([trial, 2], 30, 0.5, "one shift", (2, 2))
-        with fails_with("E-REGISTER-TWO-TRANSFORMS"):
-            register(s.xyz_a, s.xyz_b, folds=0)
-
-
 def test_groups_that_no_consensus_tells_apart():
     """At 1 mm, 7 σ, between them: trimming sees one set of larger σ, two transforms are seen."""
     for trial in range(2):
@@ -116,16 +107,6 @@ def test_noise_along_one_axis_is_not_two_groups():
         assert register(s.xyz_a, b, folds=0).inliers.mean() > 0.9
 
 
-@pytest.mark.slow
-def test_noise_along_one_axis_that_the_fit_carries_into_the_others():
-    """30 : 1 of 100 points: what the fit errs along the one exceeds the noise along the others."""
-    for trial in range(20):
-        rng = np.random.default_rng([trial, 12])
-        s = scene([trial, 12], 100, sigma_mm=0.01)
-        b = s.xyz_b + rng.normal(0, 0.3, (100, 1)) * [0, 0.8, 0.6]
-        assert two_groups(problem_of(RIGID, s.xyz_a, b), rng) is None
-
-
 def test_wilks_bound_is_above_the_distribution():
     """Λ as drawn from the scatter of Gaussian residuals of two linear fits, one within the other."""
     rng = np.random.default_rng(3)
@@ -138,14 +119,6 @@ def test_wilks_bound_is_above_the_distribution():
     for level in (0.5, 0.1, 0.01):
         at = np.quantile(ratios, level)
         assert np.log(level) - 0.3 < wilks_bound(at, 14, 2) < np.log(level) + 3
-
-
-def test_sphericity_is_a_p_value():
-    rng = np.random.default_rng(4)
-    p = [sphericity(y.T @ y, 15) for y in rng.normal(size=(1000, 15, 3))]
-    assert np.mean(np.array(p) < 0.1) == pytest.approx(0.1, abs=0.035)  # 3.5 of its standard deviations
-    y = rng.normal(size=(15, 3)) * [1, 1, 6]
-    assert sphericity(y.T @ y, 15) < 1e-4
 
 
 def test_deletion_residuals_are_those_of_the_fit_without_the_point():
@@ -260,14 +233,11 @@ class TestThreshold:
         # 0.4 mm is 2.7 σ and cuts off 7 %: without a correction σ would come out 5 % too small
         assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.15)
 
-    def test_a_tight_one_is_told(self):
+    def test_sigma_by_a_tight_one_is_bounded_by_it(self):
+        """Of 1 σ: a fifth of the points is left, which say little about σ, and nothing beyond the threshold."""
         s = scene(16, 200)
-        found = register(s.xyz_a, s.xyz_b, threshold_mm=1.7 * SIGMA_MM, folds=0)
-        assert any("cuts off good points" in note for note in found.notes)
-        # of 1 σ: a fifth of the points is left, which say little about σ, and nothing beyond the threshold
-        tighter = register(s.xyz_a, s.xyz_b, threshold_mm=SIGMA_MM, folds=0)
-        assert SIGMA_MM / 3 < tighter.sigma_mm <= SIGMA_MM
-        assert any("cuts off good points" in note for note in tighter.notes)
+        tight = register(s.xyz_a, s.xyz_b, threshold_mm=SIGMA_MM, folds=0)
+        assert SIGMA_MM / 3 < tight.sigma_mm <= SIGMA_MM
 
     def test_nobody_within(self):
         rng = np.random.default_rng(0)
@@ -303,11 +273,7 @@ def test_points_without_correspondence_are_refused():
     for n in (8, 40, 200):
         with fails_with("E-REGISTER-CHANCE"):
             register(rng.uniform(-100, 100, (n, 3)), rng.uniform(-100, 100, (n, 3)))
-
-
-def test_few_points_without_correspondence_are_not_called_a_line():
-    """Least squares of 30 random pairs: σ is as large as the cloud, along all of its axes."""
-    a, b = np.random.default_rng(21).uniform(-100, 100, (2, 30, 3))
+    a, b = rng.uniform(-100, 100, (2, 30, 3))  # least squares: σ is as large as the cloud, along all of its axes
     for model in ("rigid", "affine"):
         with fails_with("E-REGISTER-CHANCE … 30"):
             register(a, b, model=model, method="least-squares")
@@ -319,33 +285,3 @@ def test_the_bound_is_above_the_distribution():
         assert (chernoff(x, np.float64(a), np.float64(b)) >= beta.logcdf(x, a, b) - 1e-12).all()
         # and not far above: within the usual factor of a few √n
         assert (chernoff(x, np.float64(a), np.float64(b)) - beta.logcdf(x, a, b)).max() < 6
-
-
-def test_the_score_has_its_minimum_where_outliers_begin():
-    square = np.sort(np.random.default_rng(0).chisquare(3, 100))
-    square[70:] = 4000
-    value, cut = by_scale(RIGID, 100, square.sum())(square[None])
-    assert cut[0] == square[69]
-    assert value[0] < -100
-
-
-@pytest.mark.slow
-def test_false_alarms_of_the_search_are_rare():
-    """The bound on all sets together is generous: none of the sets without outliers may come near."""
-    for trial in range(30):
-        s = scene([trial, 5], 15)
-        total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
-        problem = problem_of(RIGID, s.xyz_a, s.xyz_b)
-        found = search(problem, by_scale(RIGID, 15, total), np.random.default_rng(0))
-        assert found.value > np.log(1e-3)
-
-
-def test_groups():
-    s = scene(22, 60, 0.4, "one shift", (1.5, 1.5))
-    groups = two_groups(problem_of(RIGID, s.xyz_a, s.xyz_b), np.random.default_rng(0))
-    near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups]
-    assert ((near[0] < near[1]) == s.clean).mean() > 0.97
-    none = scene(23, 60)
-    assert two_groups(problem_of(RIGID, none.xyz_a, none.xyz_b), np.random.default_rng(0)) is None
-    assert lies_together(s.xyz_a, s.xyz_a[:, 0] > 800)
-    assert not lies_together(s.xyz_a, s.clean)

@@ -5,7 +5,6 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.robot_file import load_robot
 from tests.scripts import load_script
 
 pytestmark = pytest.mark.slow  # a set that lies beside the repository
@@ -57,15 +56,3 @@ def test_kinematics_of_one_station_serve_another(script, data):
     for name in ("outdoor", "pallet", "diagonal_wood"):
         nominal, better = (script.errors_by_part(stations[name], each).mean() for each in (robot, real))
         assert better < 0.7 * nominal
-
-
-def test_files_for_the_command(script, data, tmp_path):
-    _, stations, robot = data
-    script.write(tmp_path, {"flat": stations["flat"]}, robot)
-    read = load_robot(tmp_path / "robot.toml")
-    head, *rows = (tmp_path / "flat.csv").read_text().splitlines()
-    assert head == script.HEADER
-    values = np.array([[float(v) for v in row.split(",")] for row in rows])
-    assert len(values) == len(script.everything(stations["flat"]).q)
-    q = np.column_stack([values[:, 6], np.radians(values[:, 7:])])
-    np.testing.assert_allclose(forward(read, q).translation, values[:, :3], atol=1e-3)

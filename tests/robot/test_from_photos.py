@@ -14,9 +14,9 @@ from stcal.io.images import Skipped
 from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import made
-from stcal.robot.use.targets import Targets
 from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -13,8 +13,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.locate.estimate import SeenTags, locate, merge
 from stcal.locate.layout import LayoutPlan, TargetLayout
 from stcal.locate.layout_calibration import CalibratedLayout, CalibrationImages, calibrate
-from stcal.locate.patent import PatentOptions, locate_as_patent
-from stcal.locate.verdict import Decision, VerdictOptions, judge
+from stcal.locate.verdict import Decision, PatentOptions, VerdictOptions, judge, locate_as_patent
 
 
 @dataclass(frozen=True, slots=True)

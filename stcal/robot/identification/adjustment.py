@@ -9,7 +9,6 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import TWIST
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
     carried_poses,
     chain_jacobian,
@@ -21,7 +20,7 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.robot_model import Chain
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions
 
 Kind = Literal["pose", "position", "distance"]
 WIDTH = {"pose": 6, "position": 3, "distance": 1}

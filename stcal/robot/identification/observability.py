@@ -10,10 +10,9 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import TOOL_WIDTH, WIDTH, Kind, Observed, State, tip_jacobian
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import chain_parameters
 from stcal.robot.kinematics.inverse import reach_mm
-from stcal.robot.kinematics.robot_model import Robot
+from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot
 
 SEEN = 1e-9
 """Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""

@@ -10,10 +10,9 @@ from scipy.linalg import block_diag
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.adjustment import Kind, State, moved, parameter_names
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, chain_parameters, elasticity_values, moved_chain
-from stcal.robot.kinematics.robot_model import Chain, Elasticity, Robot
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot
 
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""

@@ -24,23 +24,17 @@ from stcal.robot.kinematics.robot_model import (
     along,
 )
 
-PARALLEL_RAD = np.radians(1.0)
-"""Angle between axes below which Hayati's β is used: the foot of the common normal is metres away."""
-SAME_AXIS_MM = 1e-10
-"""Distance below which parallel axes count as one line: θ is free, and the nominal one is kept."""
-
-ROUNDING, ROUNDING_MM = 1e-12, 1e-9
-"""Tolerances for the rounding error of a product of a dozen transforms."""
-NOTHING_MM, NOTHING_RAD = 1e-12, 1e-14
-"""Length and angle rounded to zero; they move a tool by less than 1e-10 mm."""
+PARALLEL_RAD, SAME_AXIS_MM = np.radians(1.0), 1e-10
+"""Angle between axes below which Hayati's β is used; distance below which parallel ones are one line, and θ is free."""
+ROUNDING, ROUNDING_MM, NOTHING_MM, NOTHING_RAD = 1e-12, 1e-9, 1e-12, 1e-14
+"""Rounding of a product of a dozen transforms; length and angle that are rounded to zero."""
 
 
 def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
     """Returns the robot whose rows, base and tools give the same poses as ``chain`` with ``tools`` (flange_from_tool).
 
-    Values that a chain does not determine are kept from ``nominal``: θ and d of the first row (the base may turn about
-    and slide along the first axis), the part of the last row after its joint (the tools may turn about and slide along
-    the last axis), a and d of a prismatic joint, and d of a row with β.
+    What a chain does not determine is kept from ``nominal``: θ and d of the first row, the part of the last row after
+    its joint, a and d of a prismatic joint, and d of a row with β.
     """
     n = len(chain)
     rows = list(nominal.rows)
@@ -48,9 +42,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     mounts = {} if nominal.tree is None else nominal.tree.mounts
     begins = {0, *mounts}
     first = dict.fromkeys(begins, Rigid())
-    passed = [
-        Rigid()
-    ] * n  # free motion of a joint: a turn about its axis and a slide along it (any slide, if prismatic)
+    passed = [Rigid()] * n  # free motion of a joint: about its axis and along it (if prismatic, any slide)
     for i in sorted(set(range(n)) - begins):
         gap = passed[i - 1] @ chain.gap(i)
         before = rows[i - 1]
@@ -156,9 +148,7 @@ def robot_between(
     bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling, unusual_size=True)
     hints = list(bare.rows)
     robot = _with_ends(chain, tools, bare)
-    for i in range(
-        len(hints) - 1
-    ):  # choose the x axis along each common normal that is within 90° of the previous x axis
+    for i in range(len(hints) - 1):  # the x axis along each common normal is within 90° of the previous one
         if abs(robot.rows[i].theta) > np.pi / 2 + ROUNDING:
             k = i if convention == "standard" else i + 1
             hints[k] = DHRow(-robot.rows[k].a, -robot.rows[k].alpha, 0.0, 0.0)
@@ -210,12 +200,8 @@ def _angle(value: float) -> float:
     return right if abs(value - right) < NOTHING_RAD else value
 
 
-FITS = 0.05
-"""A nominal robot fits its data when its RMS error is below this share of their spread; factories err by under 1 %."""
-TURNED_RAD = 0.2
-"""Largest RMS difference of orientations from nominal ones; errors of zeros and base are less than half of it."""
-
-
+FITS, TURNED_RAD = 0.05, 0.2
+"""Largest RMS error of a nominal robot over the spread of its data, and of orientations: twice what robots err by."""
 MOST_TOOLS = 200
 """Number of rows of a target whose tools are tried for the one that most rows agree with."""
 
@@ -223,14 +209,11 @@ MOST_TOOLS = 200
 def require_orientations(
     where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray, many: bool = True
 ) -> None:
-    """Refuse orientations of which most are not those of the robot, whatever its tools.
+    """Refuses orientations of which most are not those of the robot, whatever its tools, by InputError.
 
     ``where`` : name of the file; ``targets`` : (m,) of the rows; ``flange``, ``seen`` : (m, 3, 3) rotations by the
     model, and of the targets as read; ``many`` : False for few rows, which are refused only if quaternions of another
-    convention fit. The typical angle is tested, as few rows may be wrong. One orientation in all rows is no misreading:
-    the adjustment finds that it tells nothing.
-
-    Raises InputError: the message names the misreading that explains it.
+    convention fit. One orientation in all rows is no misreading.
     """
     names, rows = np.array(targets, object), np.arange(len(seen))
     own = _typical_rad(targets, flange, seen)
@@ -270,12 +253,14 @@ def _misread(seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     rows, fixed = np.arange(len(seen)), Rotation.from_matrix(seen).as_euler("xyz")
     moving = Rotation.from_matrix(seen).as_euler("XYZ")
     swapped = "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)"
-    angles = [(swapped, "xyz", fixed[:, ::-1])]
-    angles += [
-        (f"the angle about {'XYZ'[k]} had the other sign", "xyz", fixed * (1 - 2 * np.eye(3)[k])) for k in range(3)
+    signs = zip("XYZ", 1 - 2 * np.eye(3), strict=True)
+    angles = [(f"the angle about {axis} had the other sign", "xyz", fixed * sign) for axis, sign in signs]
+    angles = [
+        (swapped, "xyz", fixed[:, ::-1]),
+        *angles,
+        ("the angles were about moving axes, X first", "XYZ", fixed),
+        ("the angles were about fixed axes, X first", "xyz", moving),
     ]
-    angles += [("the angles were about moving axes, X first", "XYZ", fixed)]
-    angles += [("the angles were about fixed axes, X first", "xyz", moving)]
     for words, axes, values in angles:
         yield f"{words}: correct them", rows, Rotation.from_euler(axes, values).as_matrix()
     yield "each orientation were in the line before: correct them", rows[:-1], seen[1:]

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.robot.kinematics.conditions import USUAL, Conditions, loaded
-from stcal.robot.kinematics.robot_model import Chain, Elasticity, Robot, warn_of_degrees
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot, loaded, warn_of_degrees
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
@@ -32,31 +31,18 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
     -------
     Poses : m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
 
-    Raises
-    ------
-    InputError : joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
+    Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
     values = _joint_vectors(q, robot)
     return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
-    """Returns the geometric Jacobian: the derivative of base_from_tool by the controller's values.
+    """Returns the geometric Jacobian (m, 6, n): the derivative of base_from_tool by the controller's values.
 
-    Parameters
-    ----------
-    robot, q, tool
-        As of :func:`forward`.
-
-    Returns
-    -------
-    (m, 6, n) array
-        Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left
-        perturbation), by rad or mm of each joint. The deflection of links is taken as constant.
-
-    Raises
-    ------
-    InputError : joint values of another shape or not finite; an unknown tool.
+    ``robot``, ``q``, ``tool`` : as of :func:`forward`. Rotation vector (rad) over translation (mm) of the tool's
+    origin, in the axes of the base (left perturbation), by rad or mm of each joint; the deflection of links is taken as
+    constant. Raises InputError: joint values of another shape or not finite; an unknown tool.
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)
@@ -135,23 +121,18 @@ def torques(
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        last = _loaded(chain)
+        if chain.tree is not None and "" not in chain.tree.carriers:
+            raise InputError(
+                "E-ROBOT-TREE",
+                "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
+            )
+        last = chain.carrier("")
         place = origin[last] + rotation[last] @ elasticity.payload_centre
         if chain.prismatic[last]:
             place = place + rotation[last, :, :, 2] * (q @ chain.coupling[last])[:, None]
         held = chain.carries([""])[:, :, None]
         carried = carried + held * (1e-3 * GRAVITY_M_S2 * mass[:, None] * (place - origin))
     return np.cross(carried, chain.rotation[0] @ elasticity.gravity)
-
-
-def _loaded(chain: Chain) -> int:
-    """Returns the joint that carries the payload."""
-    if chain.tree is not None and "" not in chain.tree.carriers:
-        raise InputError(
-            "E-ROBOT-TREE",
-            "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
-        )
-    return chain.carrier("")
 
 
 def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -219,13 +200,11 @@ def _walk(
 
 
 def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
-    """Returns (joint, component) of the minimal parameters of the chain's axes; component 0–5 is rx, ry, rz, tx, ty,
-    tz.
+    """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz.
 
-    An axis is a line. Of the six small motions of a joint's frame, rotation about the axis and shift along it belong to
-    the frames that follow, and of a prismatic joint only the direction counts. With the six of one tool this makes the
-    complete, minimal and continuous set of 4 R + 2 P + 6 parameters (Zhuang, Roth & Hamano 1992 for the count;
-    Okamura & Park 1996 for parameters local to each joint).
+    An axis is a line: rotation about it and shift along it belong to the frames that follow, and of a prismatic joint
+    only the direction counts. With the six of one tool this is the complete, minimal and
+    continuous set of 4 R + 2 P + 6 (Zhuang, Roth & Hamano 1992; Okamura & Park 1996).
     """
     return [(i, c) for i in range(len(chain)) for c in ((0, 1) if chain.prismatic[i] else (0, 1, 3, 4))]
 

@@ -14,28 +14,22 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.robot_model import Robot
 
-ROUNDS = 60
-"""Largest number of iterations. At a fold every step halves the distance, so that 1 to 1e-12 takes 40."""
 DONE_MM, DONE_RAD = 1e-10, 1e-13
 """Errors at which iteration ends, one digit below the tolerance of a reached pose."""
-LONGEST = 1.0
-"""Longest step of a joint, rad or fraction of the reach; the linear model does not hold beyond it."""
-LEAST_DAMPING = 1e-14
-"""Smallest damping; it keeps the normal equations regular where the Jacobian is singular."""
-ORIENTATION_WEIGHT = 0.03
-"""Weight of the orientation for arms of fewer than six joints, whose position has priority."""
 WITHIN_MM, WITHIN_RAD = 1e-9, 1e-12
 """Errors below which a pose counts as reached: far below any measurement, above the rounding of a chain of metres."""
+LONGEST, LEAST_DAMPING = 1.0, 1e-14
+"""Longest step of a joint, rad or fraction of the reach, and smallest damping, for singular Jacobians."""
+ORIENTATION_WEIGHT = 0.03
+"""Weight of the orientation for arms of fewer than six joints, whose position has priority."""
 LIMIT_SLACK = 1e-9
 """Largest excess over joint limits that counts as rounding, rad (or shares of the reach)."""
 SINGULAR = 1e-5
 """Smallest singular value (no unit) below which joint values are not determined, as an error of 1e-12 leaves 1e-6."""
 POOL, STARTS = 4096, 96
 """Joint vectors over the range, and nearest that are starts: 96 miss none of 2738 branches."""
-SAME_BRANCH = 1e-4
-"""Distance of joint vectors, rad, below which they are one solution."""
-SHORT = 0.1
-"""Distance from the reference, rad, up to which other branches are sought around the solution only, else everywhere."""
+SAME_BRANCH, SHORT = 1e-4, 0.1
+"""Distances of joint vectors, rad, below which they are one solution, and up to which others are sought nearby only."""
 AS_GOOD = 2.0
 """Largest ratio of an orientation error to the least one that counts as equally good, for arms with few joints."""
 GROUP = 2048
@@ -62,11 +56,10 @@ def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
 class Inverse(Brief):
     """Joint vectors found for m poses.
 
-    ``q`` : (m, n) values of the controller, rad or mm, always within the limits; if the pose is not reached, the
-    nearest of all that were tried. ``status`` : (m,) ``reached``; ``singular``: reached, but the values are not unique,
-    as joints can move without moving the tool, or a branch ends; ``orientation``: position reached, and orientation as
-    near as fewer than six joints allow; ``limit``: reached only by joint vectors beyond the limits; ``unreachable``: no
-    joint vector was found. ``error_mm``, ``error_rad`` : (m,) remaining errors of position and orientation.
+    ``q`` : (m, n) values of the controller, rad or mm, within the limits; of a pose not reached the nearest tried.
+    ``status`` : (m,) ``reached``; ``singular``: reached, but not by these values alone; ``orientation``: position
+    reached, orientation as near as fewer than six joints allow; ``limit``: reached only beyond the limits;
+    ``unreachable``: no joint vector found. ``error_mm``, ``error_rad`` : (m,) remaining errors.
     """
 
     q: np.ndarray
@@ -96,18 +89,17 @@ def inverse(
     """Returns joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
 
     Of all branches and turns within the joint limits, the one nearest to ``near`` is returned (Euclidean distance, rad,
-    prismatic joints in shares of the reach). If the step from ``near`` is so short that no other branch can be as near
-    (a bound from the Jacobian's smallest singular value), no other is tried. For steps up to 0.1 rad, other branches
-    are sought nearby; for longer ones, all branches are compared. The solutions of an arm with more than six joints are
+    prismatic joints in shares of the reach). No other branch is tried if the step from ``near`` is surely the shortest;
+    up to 0.1 rad others are sought nearby, else all are compared. The solutions of an arm with more than six joints are
     not isolated; one near to ``near`` is returned.
 
     Parameters
     ----------
     robot : an arm of n joints; where its base stands does not matter.
     poses : m transforms base_from_tool, mm.
-    near : (m, n) or (n,) array, optional
-        Reference values of the controller, rad or mm. Without it the first pose gets the branch nearest to the middle
-        of the limits (0 where unlimited), and every other the one nearest to that of the pose before.
+    near : (m, n) or (n,) reference values of the controller, rad or mm. Without it the first pose gets the branch
+        nearest to the middle of the limits (0 where unlimited), and every other the one nearest to that of the pose
+        before.
     tool : name of the tool.
     payload_kg : mass at the flange; that of the robot if not given.
 
@@ -115,10 +107,8 @@ def inverse(
     -------
     Inverse : joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
 
-    Raises
-    ------
-    InputError : ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an unknown
-        tool; a mass that no arm carries.
+    Raises InputError: ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an
+    unknown tool; a mass that no arm carries.
 
     References
     ----------
@@ -142,24 +132,13 @@ def inverse(
 
 @require_arguments
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
-    """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
+    """Returns all joint vectors (k, n) within the limits that bring the tool to a pose, one for each branch.
 
-    Joint values that differ by 2π are one branch, with the value nearest to the middle of the limits. At a singular
-    pose, which has a continuum of solutions, only some are returned. The search has many starts, the same every time.
-
-    Parameters
-    ----------
-    robot : an arm of n joints, at most six; where its base stands does not matter.
-    pose : base_from_tool, mm.
-    tool : name of the tool.
-
-    Returns
-    -------
-    Inverse : joint vectors (k, n), the nearest to the middle of the limits first; k is 0 where the pose is not reached.
-
-    Raises
-    ------
-    InputError : the arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
+    ``robot`` : an arm of at most six joints; where its base stands does not matter; ``pose`` : base_from_tool, mm;
+    ``tool`` : its name. Values that differ by 2π are one branch, with the value nearest to the middle of the limits;
+    the branch nearest to it is the first. At a singular pose only some of the continuum of solutions are returned. The
+    search has many starts, the same every time. Raises InputError: more than six joints, and so infinitely many
+    solutions; or an unknown tool.
     """
     problem = InverseProblem.of(robot, tool)
     problem.refuse_redundant()
@@ -184,9 +163,8 @@ def _as_good(error_rad: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverseProblem:
-    """An arm with a tool, in unitless joint values. ``unit`` : (n,) rad or mm of a unitless 1; ``reach`` : mm;
-    ``bounds`` : (n, 2); ``middle`` : (n,) of the bounds, 0 if unlimited; ``turns`` : (n,) whether 2π more is the same
-    position; ``few`` : whether fewer than six joints carry the tool."""
+    """An arm with a tool, in unitless joint values: ``unit`` (n,) rad or mm; ``reach`` mm; ``bounds`` (n, 2);
+    ``middle`` (n,), 0 if unlimited; ``turns`` (n,) whether 2π more is the same; ``few`` : fewer than six joints."""
 
     robot: Robot
     tool: str
@@ -239,7 +217,7 @@ class InverseProblem:
         rows, goal = np.arange(len(q)), poses
         error = self.errors(goal, q)
         damping, going = np.full(len(q), 1e-2), np.ones(len(q), bool)
-        for _ in range(ROUNDS):
+        for _ in range(60):  # at a fold every step halves the distance: 1 to 1e-12 takes 40
             going &= ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
             rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
             if not len(rows):
@@ -353,9 +331,8 @@ class InverseProblem:
     def _is_nearest(self, q: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``.
 
-        A solution is the only one within 2σ/K, σ being the smallest singular value of the Jacobian there and K a
-        Lipschitz constant of the Jacobian (Newton–Kantorovich). In the embedding of :meth:`_embedded` the second
-        derivatives by two joints are at most √2 long, so that K ≤ √2 n ‖coupling‖²: a distance up to σ/K is the least.
+        A solution is the only one within 2σ/K, σ the smallest singular value of the Jacobian there and K its Lipschitz
+        constant (Newton–Kantorovich), which in the embedding of :meth:`_embedded` is at most √2 n ‖coupling‖².
         """
         bound = np.sqrt(2) * q.shape[1] * np.linalg.norm(self.robot.coupling, 2) ** 2
         return np.linalg.norm(q - near, axis=1) <= self._weakest(q) / bound

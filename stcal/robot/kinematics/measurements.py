@@ -1,7 +1,8 @@
-"""Robot data: joint values with the positions, poses or distances that an instrument measured."""
+"""Tables of joint values: with what an instrument measured there, and with the poses that they command."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +12,26 @@ from numpy.typing import ArrayLike
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses
-from stcal.io.table import ANGLES, LENGTHS, Table, read_table
-from stcal.robot.kinematics.conditions import (
+from stcal.io.table import ANGLES, COMMON, COVARIANCE, LENGTHS, POSE, Table, read_table
+from stcal.robot.kinematics.inverse import reach_mm
+from stcal.robot.kinematics.robot_model import (
+    APPROACH,
+    DIRECTIONS,
+    MOST_KG,
+    MOST_TURNS,
     PAYLOAD,
     USUAL,
     Conditions,
-    approach_columns,
-    oriented,
-    read_conditions,
-    unread,
+    Robot,
+    loaded,
 )
-from stcal.robot.kinematics.inverse import reach_mm
-from stcal.robot.kinematics.robot_model import Robot
 
 WHAT = "robot data"
 STATUS, AMBIGUOUS = "status", "ambiguous"
 """Column ``status`` of ``stcal-sfm measure``, and its word for an undecided pose."""
-MAX_TURNS = 4
-"""Largest joint value in turns. Larger ones are degrees in a column of radians."""
-FROM_ITSELF_MM = 1e-3
-"""Largest distance of a position from itself in a file, of rounding."""
 LONGEST_TOOL_MM = 10_000.0
 """Longest possible tool, by which a target may be farther than the arm reaches."""
-ORIENTATION = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
-FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
-"""Largest possible length and joint value: 10 km and a hundred turns."""
+ORIENTED_BY = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -48,22 +44,18 @@ class Measurements(Brief):
     lines : (m,) its lines.
     q : (m, n) array: values of the controller, rad or mm.
     targets : (m,) names of the reflector or target seen.
-    positions : (m, 3) array, optional
-        Of the targets in the instrument's frame, mm; None where only distances were measured.
+    positions : (m, 3) of the targets in the instrument's frame, mm; None where only distances were measured.
     rotations : (m, 3, 3) array, optional: instrument_from_target, where poses were measured.
     covariance : (m, 6, 6) array, optional: of the poses, rad and mm, left perturbation.
-    common : (m, 6, r) array, optional
-        Common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r normal numbers z of
-        σ 1 for all, and by itself.
+    common : (m, 6, r) common errors, contained in ``covariance``: pose i errs by ``common[i] @ z`` with the same r
+        normal numbers z of σ 1 for all, and by itself.
     distances : (m,) array, optional: where only these were measured, mm.
     from_row : (m,) array of int, optional: row, from 0, at whose position each distance starts.
     stations : (m,) names of where the instrument stood: positions are in a frame of each; one where not given.
     notes : on rows of the file that are not here, columns that were not read, and angles by their convention.
     conditions : what the flange carried, and from where joints came.
 
-    Raises
-    ------
-    InputError : arrays of other shapes, or with values that are not finite.
+    Raises InputError: arrays of other shapes, or with values that are not finite.
     """
 
     where: str
@@ -116,9 +108,7 @@ class Measurements(Brief):
         targets : (m,) names of the targets seen; the robot's only one if not given
         where : source of the data, for messages
 
-        Raises
-        ------
-        InputError : neither positions nor poses, or arrays of other shapes.
+        Raises InputError: neither positions nor poses, or arrays of other shapes.
         """
         if poses is not None:
             positions, rotations = poses.translation, poses.rotation
@@ -179,7 +169,7 @@ class Measurements(Brief):
         """Returns the measured poses world_from_tool."""
         if self.rotations is None:
             raise InputError(
-                "E-MEASURED-NO-ORIENTATION", f"{self.where}: positions without orientation; {ORIENTATION} needed"
+                "E-MEASURED-NO-ORIENTATION", f"{self.where}: positions without orientation; {ORIENTED_BY} needed"
             )
         return Poses(self.rotations, self.points())
 
@@ -206,8 +196,8 @@ def read_measurements(
     ----------
     path : table (CSV; form: ``data_layout.md``).
     robot : the robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
-    quaternions : {"wxyz", "xyzw"}
-        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
+    quaternions : {"wxyz", "xyzw"}; ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the
+        order of the columns.
     rotation : convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
         (``data_layout.md``).
     payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
@@ -216,14 +206,12 @@ def read_measurements(
     -------
     Measurements : in the instrument's frame; mm, rad.
 
-    Raises
-    ------
-    InputError : missing columns, bad rows, joint values of another unit or number than the robot's, angles whose
-        convention is open, masses that no arm carries; the message names the line.
+    Raises InputError: missing columns, bad rows, joint values of another unit or number than the robot's, angles whose
+    convention is open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
     joints = len(robot.rows)
-    own = (PAYLOAD, *approach_columns(joints))
+    own = (PAYLOAD, *(f"{APPROACH}{i}" for i in range(1, joints + 1)))
     q, targets = joint_values(table, robot), targets_of(table)
     base: dict[str, Any] = {"conditions": read_conditions(table, payload_kg, joints)}
     if table.has("x", LENGTHS):
@@ -236,7 +224,6 @@ def read_measurements(
             base["stations"] = tuple(table.text("station"))
         notes = said + unread(table, (*columns, *own))
         data = Measurements(table.where, table.lines, q, targets, table.points(), notes=notes, **base)
-        within(table, "position", data.points(), "mm")
         for rows in data.by_station().values():
             _in_reach(data[rows], robot)
         return _usable(data, table)
@@ -247,18 +234,19 @@ def read_measurements(
             f"the header is {table.header()}{table.open_unit('x', LENGTHS)}",
         )
     distances = table.quantity("distance", LENGTHS)
-    within(table, "distance", distances, "mm")
     if rotation is not None:
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
         )
     from_row = _from_rows(table)
-    for i in np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM)).tolist():
-        raise InputError(
-            "E-MEASURED-DISTANCES",
-            f"{table.where}: line {table.lines[i]}: the distance of a position from itself is {distances[i]:.4g} mm, "
-            "0 needed: distances start at the first row, which is missing, or at the row that column from_row names",
-        )
+    table.refuse(
+        (from_row == np.arange(len(table))) & (distances > 1e-3),
+        "E-MEASURED-DISTANCES",
+        lambda i: (
+            f"the distance of a position from itself is {distances[i]:.4g} mm, 0 needed: distances start at the first "
+            "row, which is missing, or at the row that column from_row names"
+        ),
+    )
     base |= {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
     return Measurements(table.where, table.lines, q, targets, **base)
 
@@ -268,32 +256,16 @@ def targets_of(table: Table) -> tuple[str, ...]:
     return tuple(table.text("target")) if "target" in table else ("",) * len(table)
 
 
-def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
-    """Refuses values (m,) or (m, k) beyond possible ones."""
-    for row in np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1)).tolist():
-        raise InputError(
-            "E-VALUE-TOO-FAR",
-            f"{table.where}: line {table.lines[row]}: {name} is beyond {FARTHEST[unit]:.4g} {unit}; correct it, or "
-            "remove the line",
-        )
-
-
 def _in_reach(data: Measurements, robot: Robot) -> None:
     """Refuses positions farther from the middle one than arm and tool allow."""
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
-    reach, usual, worst = reach_mm(robot, robot.tools), float(np.median(away)), int(away.argmax())
-    if away[worst] <= 2 * reach + LONGEST_TOOL_MM:
-        return
-    said = (
-        f"line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of the others, robot {robot.name} "
-        f"reaches {reach:.4g} mm; correct it, or the unit of x, y, z"
-    )
-    if usual > 2 * reach + LONGEST_TOOL_MM:
-        said = (
-            f"positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches {reach:.4g} mm; "
-            "correct the unit of x, y, z: are these mm, in columns of another unit?"
+    reach, worst = reach_mm(robot, robot.tools), int(away.argmax())
+    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
+        raise InputError(
+            "E-MEASURED-REACH",
+            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of all (median "
+            f"{np.median(away):.4g} mm), robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z",
         )
-    raise InputError("E-MEASURED-REACH", f"{data.where}: {said}")
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
@@ -332,16 +304,17 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
         )
     columns = []
     for i, sliding in enumerate(robot.prismatic, 1):
-        units, unit = (LENGTHS, "mm") if sliding else (ANGLES, "rad")
+        units = LENGTHS if sliding else ANGLES
         values = table.quantity(f"q{i}", units)
-        far = np.flatnonzero(np.abs(values) > 2 * np.pi * MAX_TURNS)
-        if not sliding and len(far) and table.unit(f"q{i}", units) == "rad":
-            raise InputError(
+        if not sliding and table.unit(f"q{i}", units) == "rad":
+            table.refuse(
+                np.abs(values) > 2 * np.pi * MOST_TURNS,
                 "E-JOINT-VALUE",
-                f"{table.where}: line {table.lines[far[0]]}: q{i}_rad is {values[far[0]]:g}, over {MAX_TURNS} turns; "
-                f"if these are degrees call the column q{i}_deg",
+                lambda row, i=i, values=values: (
+                    f"q{i}_rad is {values[row]:g}, over {MOST_TURNS:g} turns; if these are degrees call the column "
+                    f"q{i}_deg"
+                ),
             )
-        within(table, f"q{i}", values, unit)
         columns.append(values)
     return np.column_stack(columns)
 
@@ -351,10 +324,197 @@ def _from_rows(table: Table) -> np.ndarray:
     if "from_row" not in table:
         return np.zeros(len(table), int)
     rows = table.numbers("from_row")
-    for i, row in enumerate(rows):
-        if row != int(row) or not 1 <= row <= len(rows):
-            raise InputError(
-                "E-MEASURED-FROM-ROW",
-                f"{table.where}: line {table.lines[i]}: from_row is {row:g}, 1 … {len(rows)} needed",
-            )
+    table.refuse(
+        (rows != rows.astype(int)) | (rows < 1) | (rows > len(rows)),
+        "E-MEASURED-FROM-ROW",
+        lambda i: f"from_row is {rows[i]:g}, 1 … {len(rows)} needed",
+    )
     return rows.astype(int) - 1
+
+
+def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
+    """Reads payload, by column ``payload_kg`` or the argument, and columns ``approach1`` …; raises InputError."""
+    mass = None if payload_kg is None else loaded(payload_kg, len(table)).payload_kg
+    if PAYLOAD in table:
+        if payload_kg is not None:
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out",
+            )
+        mass = table.numbers(PAYLOAD)
+        possible = (mass >= 0) & (mass <= MOST_KG)
+        table.refuse(~possible, "E-PAYLOAD-VALUE", lambda i: f"{PAYLOAD} is {mass[i]:g}; 0 … {MOST_KG:g} needed")
+    columns, approach = [f"{APPROACH}{i}" for i in range(1, joints + 1)], None
+    if any(name in table for name in columns):
+        approach = np.zeros((len(table), joints))
+        for i, name in enumerate(columns):
+            if name in table:
+                approach[:, i] = values = table.numbers(name)
+                came = f"1 (joint {i + 1} came from below), -1 (from above) or 0 (not known)"
+                table.refuse(
+                    ~np.isin(values, DIRECTIONS),
+                    "E-APPROACH-VALUE",
+                    lambda k, name=name, values=values, came=came: f"{name} is {values[k]:g}; {came} needed",
+                )
+    return Conditions(mass, approach)
+
+
+_UNITS = "|".join((*ANGLES, *LENGTHS))
+_KNOWN = re.compile(
+    rf"q\d+_({_UNITS})|([xyz]|distance)_({'|'.join(LENGTHS)})|{'|'.join((*POSE[3:], *COVARIANCE))}|{COMMON.pattern}|"
+    "target|status|from_row|pose|image|name|scene|set|line|station|faces|circles|rms_px|chi2_per_dof|error_mm|"
+    "error_deg|(commanded|nominal)_.*"
+)
+"""Columns that robot commands and ``stcal-sfm measure`` write. No command reports them as unread."""
+
+
+def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, tuple[str, ...], tuple[str, ...]]:
+    """Returns m poses (None without orientations), the columns of their angles, and a note that names the convention.
+
+    ``rotation`` : convention of angles whose columns do not state it, as for ``--rotation``. Raises InputError: columns
+    of a rotation are incomplete, or the convention is missing, or given without such columns or beside their own.
+    """
+    from stcal.io.rotations import read_rotations
+
+    turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
+    if rotation is not None and (turned is None or turned.stated):
+        raise InputError(
+            "E-OPTION-NEEDS", f"{table.where}: no columns of angles that --rotation {rotation} is of; leave it out"
+        )
+    if turned is None:
+        return table.poses() if table.has_rotation() else None, (), ()
+    columns = ", ".join(turned.columns)
+    words = turned.words if turned.words.startswith(columns) else f"{columns} as {turned.words}"
+    return Poses(turned.rotation, table.points()), turned.columns, (f"orientation: {words}",)
+
+
+def unread(table: Table, read: Iterable[str] = ()) -> tuple[str, ...]:
+    """Returns one note that lists the columns that are neither known nor in ``read``; no note if there are none."""
+    ignored = [name for name in table.columns if name not in {*read} and not _KNOWN.fullmatch(name)]
+    return (f"column{'s' * (len(ignored) > 1)} not read: {', '.join(ignored)}",) if ignored else ()
+
+
+NAMES = ("pose", "image", "name", "scene", PAYLOAD)
+"""Columns that name a pose. They are copied to the result if they exist."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Targets(Brief):
+    """Target poses, one for each row of a file; given by joint values if the file has no poses.
+
+    ``where`` : the file, for messages; ``lines`` : (m,) its lines; ``tools`` : (m,) names; ``poses`` : base_from_tool,
+    mm; None where joint values command; ``q`` : (m, n) array or None: commanded joint values, or those whose branch is
+    wanted, rad or mm; ``names`` : of the columns :data:`NAMES` that are there, (m,) each; ``notes`` : on columns that
+    were not read, and angles by their convention; ``conditions`` : what the flange carries.
+    """
+
+    where: str
+    lines: Sequence[int]
+    tools: tuple[str, ...]
+    poses: Poses | None
+    q: np.ndarray | None
+    names: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    conditions: Conditions = USUAL
+
+    def __post_init__(self):
+        require_fields(self, "targets")
+        if self.q is not None:
+            freeze(self, "q", (len(self), None), "joint values")
+
+    @classmethod
+    def from_poses(
+        cls, poses: Poses, q: ArrayLike | None = None, tools: Sequence[str] = (), where: str = "targets"
+    ) -> "Targets":
+        """Returns targets in memory.
+
+        ``poses`` : m poses base_from_tool, mm; ``q`` : (m, n) joint values near to which solutions are wanted, rad or
+        mm; ``tools`` : (m,) names, the only one if not given; ``where`` : their source, for messages. Raises
+        InputError: other numbers of joint values or tools.
+        """
+        m, values = len(poses), None if q is None else np.asarray(q, float)
+        names = tuple(tools) or ("",) * m
+        if len(names) != m or (values is not None and len(values) != m):
+            raise InputError("E-NAMES-COUNT", f"{where}: {m} poses, other numbers of joint values or tools; {m} needed")
+        return cls(where, range(1, m + 1), names, poses, values)
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __getitem__(self, rows: np.ndarray) -> "Targets":
+        """Returns the targets of these indices."""
+        return replace(
+            self,
+            lines=[self.lines[i] for i in rows],
+            tools=tuple(self.tools[i] for i in rows),
+            poses=None if self.poses is None else self.poses[rows],
+            q=None if self.q is None else self.q[rows],
+            names={column: tuple(own[i] for i in rows) for column, own in self.names.items()},
+            conditions=self.conditions[rows],
+        )
+
+    def joints(self) -> np.ndarray:
+        """Returns the commanded joint values (m, n), rad or mm. Raises an error if there are none."""
+        if self.q is None:
+            raise InputError(
+                "E-TARGETS-NO-JOINTS", f"{self.where}: poses without joint values; columns q1_deg … needed"
+            )
+        return self.q
+
+
+def read_targets(
+    path: str | Path | Table,
+    robot: Robot,
+    quaternions: Order = "wxyz",
+    rotation: str | None = None,
+    payload_kg: float | None = None,
+) -> Targets:
+    """Reads commanded poses, or joint values that command them.
+
+    Parameters
+    ----------
+    path : table (CSV; form: ``data_layout.md``).
+    robot : the robot with the tools of the targets, and with the joints if joint values are given.
+    quaternions, rotation, payload_kg : as of :func:`read_measurements`.
+
+    Returns
+    -------
+    Targets : base_from_tool, mm; joint values, rad or mm.
+
+    Raises InputError: neither poses nor joint values, positions without orientation, angles whose convention is open,
+    bad rows, masses that no arm carries; the message names the line.
+    """
+    table = read_table(path, "targets", quaternions)
+    has_joints = any(name.startswith("q1_") for name in table.columns)
+    has_poses = table.has("x", LENGTHS)
+    if not has_poses and not has_joints:
+        raise InputError(
+            "E-TARGETS-NO-POSES",
+            f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
+            f"the header is {table.header()}",
+        )
+    poses, columns, how_oriented = oriented(table, rotation) if has_poses else (None, (), ())
+    if rotation is not None and not has_poses:
+        raise InputError(
+            "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out"
+        )
+    if has_poses and poses is None:
+        raise InputError(
+            "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTED_BY} needed"
+        )
+    tools = targets_of(table)
+    table.refuse(
+        np.array([tool not in robot.tools for tool in tools]),
+        "E-ROBOT-NO-TOOL",
+        lambda i: f"target {tools[i]!r} is not in robot {robot.name}; there are {', '.join(map(repr, robot.tools))}",
+    )
+    return Targets(
+        table.where,
+        table.lines,
+        tools,
+        poses,
+        joint_values(table, robot) if has_joints else None,
+        {column: tuple(table.text(column)) for column in NAMES if column in table},
+        how_oriented + unread(table, (*columns, PAYLOAD)),
+        read_conditions(table, payload_kg),
+    )

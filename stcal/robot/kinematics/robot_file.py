@@ -15,9 +15,9 @@ from stcal.io.files import require_written, save
 from stcal.io.table import LEVER_MM, POSE, pose_values
 from stcal.io.toml import Finite, PoseEntry, Sized, Strict, load_toml, toml_string
 from stcal.lengths import require_millimetres, stated_unusual
-from stcal.robot.kinematics.conditions import MOST_KG
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, joint_frames
 from stcal.robot.kinematics.robot_model import (
+    MOST_KG,
     Chain,
     Convention,
     DHRow,
@@ -37,8 +37,6 @@ MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
 WRITTEN_MM = 1e-5
 """Largest difference, mm, between a written robot file and what was reported: far above that of decimals."""
-LIMIT_DIGITS = 9
-"""Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 _FORM = {
     "standard": "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)",
     "modified": "Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)",
@@ -114,20 +112,10 @@ class _RobotFile(Sized):
 
 @require_arguments
 def load_robot(path: str | Path) -> Robot:
-    """Read a robot file.
+    """Reads a robot file from ``path``: lengths in mm and angles in degrees (form: ``data_layout.md``).
 
-    Parameters
-    ----------
-    path : ``robot.toml``, lengths in mm and angles in degrees (form: ``data_layout.md``).
-
-    Returns
-    -------
-    Robot : lengths in mm, angles in rad.
-
-    Raises
-    ------
-    InputError : unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix
-        that does not fit, quaternions that are not unit; the message names the file and the place.
+    Raises InputError: unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling
+    matrix that does not fit, quaternions that are not unit; the message names the file and the place.
     """
     if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
         raise InputError(
@@ -211,16 +199,9 @@ def _joint(j: _JointFile, where: str) -> Joint:
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
-    """Returns the text of a robot file; every number reads back as the same double, but for the last bit of angles.
+    """Returns the text of the file of ``robot``, with ``comments`` at the top (form: ``data_layout.md``).
 
-    Parameters
-    ----------
-    robot : what to write.
-    comments : lines to stand at the top.
-
-    Returns
-    -------
-    str : TOML, lengths in mm and angles in degrees (form: ``data_layout.md``).
+    Every number reads back as the same double, but for the last bit of angles.
     """
     lines = [f"# {comment}" for comment in comments]
     lines += [
@@ -239,7 +220,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
                 lines.append(f"{key} = {_number(np.degrees(value) if key.endswith('deg') else value)}")
         unit, of_unit = ("deg", np.degrees) if joint.type == "revolute" else ("mm", float)
         lines += [
-            f"{end}_{unit} = {_number(round(of_unit(value), LIMIT_DIGITS))}"
+            f"{end}_{unit} = {_number(round(of_unit(value), 9))}"
             for end, value in (("min", joint.lower), ("max", joint.upper))
             if np.isfinite(value)
         ]
@@ -255,8 +236,26 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
         if name:
             lines += ["", "[[target]]", f"name = {toml_string(name)}"]
         lines += [*_pose_lines(tool), *([f"joint = {carriers[name] + 1}"] if name in carriers else [])]
-    if robot.elasticity is not None:
-        lines += ["", *_elasticity_lines(robot.elasticity)]
+    if (elasticity := robot.elasticity) is not None:
+        axis, across = elasticity.compliance.T
+        lines += [
+            "",
+            "[elasticity]  # one entry for each joint; compliance about its axis and across it",
+            f"gravity = {_number(elasticity.gravity)}  # in the base",
+            f"axis_rad_per_Nm = {_number(axis)}",
+            f"across_rad_per_Nm = {_number(across)}",
+            f"moment_Nm = {_number(elasticity.moment)}",
+            "# of sin q, cos q, sin 2q, cos 2q",
+            f"periodic_rad = {_number(elasticity.periodic)}",
+        ]
+        half, pivot = _number(elasticity.hysteresis), _number(elasticity.pivot)
+        if elasticity.hysteresis.any():
+            lines.append(f"hysteresis_rad = {half}  # half of it: farther if it came from below")
+        if elasticity.pivot.any():
+            lines.append(f"pivot_mm = {pivot}  # in the joints' frames: where the links turn when they give way")
+        if elasticity.payload_kg or elasticity.payload_centre.any():
+            lines.append(f"payload_kg = {_number(elasticity.payload_kg)}")
+            lines.append(f"payload_centre_mm = {_number(elasticity.payload_centre)}  # in the frame of the flange")
     return "\n".join(lines) + "\n"
 
 
@@ -264,52 +263,18 @@ RobotText = Annotated[str, BeforeValidator(lambda robot: robot_toml(robot) if is
 """Text of a robot file inside a result file."""
 
 
-def _elasticity_lines(elasticity: Elasticity) -> list[str]:
-    axis, across = elasticity.compliance.T
-    lines = [
-        "[elasticity]  # one entry for each joint; compliance about its axis and across it",
-        f"gravity = {_number(elasticity.gravity)}  # in the base",
-        f"axis_rad_per_Nm = {_number(axis)}",
-        f"across_rad_per_Nm = {_number(across)}",
-        f"moment_Nm = {_number(elasticity.moment)}",
-        "# of sin q, cos q, sin 2q, cos 2q",
-        f"periodic_rad = {_number(elasticity.periodic)}",
-    ]
-    if elasticity.hysteresis.any():
-        lines.append(f"hysteresis_rad = {_number(elasticity.hysteresis)}  # half of it: farther if it came from below")
-    if elasticity.pivot.any():
-        pivot = _number(elasticity.pivot)
-        lines.append(f"pivot_mm = {pivot}  # in the joints' frames: where the links turn when they give way")
-    if elasticity.payload_kg or elasticity.payload_centre.any():
-        lines.append(f"payload_kg = {_number(elasticity.payload_kg)}")
-        lines.append(f"payload_centre_mm = {_number(elasticity.payload_centre)}  # in the frame of the flange")
-    return lines
-
-
 @require_arguments
 def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:
-    """Write a robot file, complete or not at all.
+    """Writes the file of ``robot`` to ``path``, complete or not at all, with ``comments`` at the top.
 
-    Parameters
-    ----------
-    path : file to write; an existing one is replaced.
-    robot : what to write.
-    comments : lines to stand at the top.
-
-    Raises
-    ------
-    InputError : it cannot be written.
+    An existing file is replaced. Raises InputError: it cannot be written.
     """
     save(Path(path), robot_toml(robot, comments))
     require_robot_written(path, robot)
 
 
 def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = None) -> None:
-    """Read a written robot file again, and require that it has the axes of ``chain`` (of ``robot`` if None) and its
-    tools.
-
-    Raises ConvergenceError: the file cannot be read again, or an axis or a pose of a tool differs.
-    """
+    """Raises ConvergenceError if a written file has not the axes of ``chain`` (of ``robot`` if None) and its tools."""
     q, tools = fixed_values(len(robot.rows)), list(robot.tools)
 
     def values(robot: Robot, chain: Chain) -> np.ndarray:

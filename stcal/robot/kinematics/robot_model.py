@@ -14,7 +14,68 @@ from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
-from stcal.robot.kinematics.conditions import loaded
+
+PAYLOAD = "payload_kg"
+APPROACH = "approach"
+DIRECTIONS = (-1.0, 0.0, 1.0)
+MOST_KG = 1e4
+"""Largest mass at a flange. Arms carry up to 2.3 t."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Conditions:
+    """Payload and approach directions of m joint vectors. ``payload_kg`` : (m,) mass at the flange; ``approach`` : (m,
+    n) direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown."""
+
+    payload_kg: np.ndarray | None = None
+    approach: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.approach is not None:
+            freeze(self, "approach", (None, None), "approach")
+            for value in self.approach[~np.isin(self.approach, DIRECTIONS)]:
+                raise InputError("E-APPROACH-VALUE", f"approach is {value:g}; 1, -1 or 0 needed")
+        if self.payload_kg is not None:
+            freeze(self, "payload_kg", (None,), "payload")
+            for value in self.payload_kg[(self.payload_kg < 0) | (self.payload_kg > MOST_KG)]:
+                raise InputError("E-PAYLOAD-VALUE", f"payload is {value:g} kg; 0 … {MOST_KG:g} needed")
+
+    def __getitem__(self, index) -> "Conditions":
+        """Returns the conditions of the joint vectors selected by a mask, slice or list."""
+        if self.payload_kg is None and self.approach is None:
+            return self
+        return Conditions(*(None if each is None else each[index] for each in (self.payload_kg, self.approach)))
+
+    @property
+    def approached(self) -> bool:
+        """True if the approach direction of any joint is known."""
+        return self.approach is not None and bool(self.approach.any())
+
+    @property
+    def loaded(self) -> bool:
+        """True if a payload above 0 is known for any joint vector."""
+        return self.payload_kg is not None and bool(self.payload_kg.any())
+
+    def ignored(self, who: str) -> tuple[str, ...]:
+        """Returns a note that the rigid arm ``who`` does not deflect under its payload; no note without payload."""
+        if not self.loaded:
+            return ()
+        return (f"{who} is rigid, {PAYLOAD} moves nothing (`identify --model elastic` tells what links give way by)",)
+
+
+USUAL = Conditions()
+"""Default conditions: payload of the robot file, approach directions unknown."""
+
+
+def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
+    """Returns conditions with one mass for all ``count`` joint vectors, or one for each; raises InputError."""
+    if payload_kg is None:
+        return USUAL
+    values = np.asarray(payload_kg, float)
+    if values.shape not in ((), (count,)):
+        raise InputError("E-ARRAY-SHAPE", f"payload: shape {values.shape}, one number or ({count},) needed")
+    return Conditions(np.broadcast_to(values, (count,)))
+
 
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
@@ -23,7 +84,7 @@ MOST_RAD = 2 * np.pi + 1e-6
 
 
 MOST_TURNS = 4.0
-"""Number of turns, as an angle, that joints are not expected to reach: 1440°, or 25 rad where degrees were meant."""
+"""Number of turns that joints are not expected to reach: 25 rad, where degrees were meant."""
 
 
 def warn_of_degrees(values: np.ndarray, turns: np.ndarray, what: str) -> None:
@@ -49,9 +110,7 @@ class DHRow:
     theta : angle about the joint's axis where the joint's value is 0, rad.
     beta : second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
 
-    Raises
-    ------
-    InputError : a value that is no finite number.
+    Raises InputError: a value that is no finite number.
 
     References
     ----------
@@ -88,9 +147,7 @@ class Joint:
     lower, upper : limits of the controller's value, rad or mm; unlimited where not given.
     fixed : dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
 
-    Raises
-    ------
-    InputError : another type, limits that are swapped or no numbers, a dimension that no row has.
+    Raises InputError: another type, limits that are swapped or no numbers, a dimension that no row has.
     """
 
     type: JointType = "revolute"
@@ -102,8 +159,7 @@ class Joint:
         require_fields(self, "joint")
         if not self.lower < self.upper:
             raise InputError(
-                "E-ROBOT-LIMITS",
-                f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them",
+                "E-ROBOT-LIMITS", f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them"
             )
         unknown = [name for name in self.fixed if name not in DHRow.__dataclass_fields__]
         if unknown:
@@ -116,10 +172,9 @@ class Joint:
 class Elasticity:
     """Small rotations of the links of n joints in addition to the joints' own: by gravity and by gears.
 
-    Gravity acts on joint i with the torque T = M × g. M is the sum of the moments of its link and of all links that it
-    carries, each in its present orientation. The link deflects by the rotation c T, with one c about the joint's axis
-    and another across it. Gears add an angle with one and two periods per turn of the joint. A payload is a mass at a
-    point of the flange; its weight acts there, in addition to M.
+    The torque T = M × g of gravity deflects link i by the rotation c T, with one c about the joint's axis and another
+    across it; M is the sum of the moments of the link and of all that it carries, as they are oriented. Gears add an
+    angle with one and two periods per turn. A payload is a mass at a point of the flange, in addition to M.
 
     Parameters
     ----------
@@ -131,15 +186,13 @@ class Elasticity:
     gravity : (3,) its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`
     hysteresis : (n,) rad: added to the angle of revolute joints that came from below, subtracted if they came from
         above
-    pivot : (n, 3) point about which each link turns when it deflects, mm, in its joint's frame: on the joint's axis
-        for a revolute joint. The origin of that frame if not given; always the origin in a :class:`Chain`.
+    pivot : (n, 3) point about which each link turns when it deflects, mm, in its joint's frame: on the joint's axis for
+        a revolute joint. The origin of that frame if not given; always the origin in a :class:`Chain`.
     payload_kg : mass that is carried if joint vectors do not state another
     payload_centre : (3,) its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it
         has moved, of a :class:`Chain`
 
-    Raises
-    ------
-    InputError : arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
+    Raises InputError: arrays of other shapes; a direction that is 0; a mass below 0, or beyond all that arms carry.
     """
 
     compliance: np.ndarray
@@ -153,14 +206,12 @@ class Elasticity:
 
     def __post_init__(self):
         n = len(self.compliance)
-        if self.pivot is None:  # not given
-            object.__setattr__(self, "pivot", np.zeros((n, 3)))
-        if self.hysteresis is None:  # not given
-            object.__setattr__(self, "hysteresis", np.zeros(n))
         shapes = {"compliance": (n, 2), "moment": (n, 3), "periodic": (n, 4), "gravity": (3,), "payload_centre": (3,)}
         shapes |= {"hysteresis": (n,), "pivot": (n, 3)}
         loaded(self.payload_kg, 1)
         for name, shape in shapes.items():
+            if getattr(self, name) is None:  # not given
+                object.__setattr__(self, name, np.zeros(shape))
             freeze(self, name, shape, f"elasticity: {name}")
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
@@ -175,11 +226,10 @@ class Elasticity:
 class Tree:
     """Which joint carries which, of a robot with several arms on one trunk.
 
-    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the
-    branch's first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
-    before it. ``carriers`` : by tool the joint, from 0, that carries it; the last one where a tool is not named.
-
-    Raises InputError: a branch that is carried by a joint that does not come before it.
+    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where its
+    first row begins at the end of the carrier's row, mm; every other joint is carried by the one before it.
+    ``carriers`` : by tool the joint that carries it; the last one where a tool is not named. Raises InputError: a
+    branch that is carried by a joint that does not come before it.
     """
 
     mounts: Mapping[int, tuple[int, Rigid]]
@@ -220,18 +270,15 @@ class Robot(Brief):
     convention : of all rows; see :class:`DHRow`.
     rows : one for each joint, from the base; mm, rad.
     joints : one for each row: type and range.
-    coupling : (n, n) array, optional
-        Kinematic joint values from the controller's, a regular matrix; the identity if not given.
+    coupling : (n, n) kinematic joint values from the controller's, a regular matrix; the identity if not given.
     world_from_base : base in the frame of the measuring instrument, mm.
     tools : flange_from_tool by name, mm; ``""`` is the tool if none is named.
     elasticity : rigid if not given.
     tree : every joint is carried by the one before it, and tools by the last one, if not given.
     unusual_size : true if unusually long or short links are not a mistake of units.
 
-    Raises
-    ------
-    InputError : another convention; rows and joints of other types, or of different numbers, or none; lengths that are
-        not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
+    Raises InputError: another convention; rows and joints of other types, or of different numbers, or none; lengths
+    that are not mm; a coupling matrix of another shape, or a singular one; elasticity of another number of joints.
     """
 
     name: str
@@ -283,7 +330,7 @@ class Robot(Brief):
         types: Sequence[JointType] = (),
         name: str = "robot",
     ) -> "Robot":
-        """Returns the robot of a table of Denavit–Hartenberg parameters.
+        """Returns the robot of a table of Denavit–Hartenberg parameters; warns of limits that seem to be degrees.
 
         Parameters
         ----------
@@ -293,13 +340,7 @@ class Robot(Brief):
         types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
         name : for messages and reports
 
-        Raises
-        ------
-        InputError : arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
-
-        Warns
-        -----
-        InputNote : limits of many turns, which seem to be degrees.
+        Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
@@ -337,21 +378,14 @@ class Robot(Brief):
         return self.tools[name]
 
     def loaded(self, payload_kg: float) -> "Robot":
-        """Returns the robot with another mass at its flange, kg; a rigid robot does not deflect under it.
-
-        Raises InputError: a mass below 0, or beyond all that arms carry.
-        """
+        """Returns the robot with another mass at its flange, kg; raises InputError: a mass that no arm carries."""
         loaded(payload_kg, 1)
         if self.elasticity is None:
             return self
         return replace(self, elasticity=replace(self.elasticity, payload_kg=float(payload_kg)))
 
     def chain(self) -> "Chain":
-        """Returns the fixed transforms in order.
-
-        The frames of joints are at the pivots of the elasticity. A shift along the axis of a joint, or of a prismatic
-        joint in any direction, does not change the rigid arm.
-        """
+        """Returns the fixed transforms in order, with the frames of joints at the pivots of the elasticity."""
         gaps, ends = [], []
         pivots = np.zeros((len(self.rows), 3)) if self.elasticity is None else self.elasticity.pivot
         for i, row in enumerate(self.rows):
@@ -374,8 +408,7 @@ class Robot(Brief):
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, *branches)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
-        """Returns the joint, from 0, that carries another (−1: the base), and the start of the other's row after
-        its row."""
+        """Returns the joint, from 0, that carries another (−1: the base), and where the other's row begins."""
         found = None if self.tree is None else self.tree.mounts.get(joint)
         return found or (joint - 1, Rigid())
 
@@ -392,13 +425,12 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """The fixed transforms of an arm, which are all that calibration changes.
+    """The fixed transforms of an arm, which are all that calibration changes; joints turn about or move along z.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
-    first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
-    ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
-    frame; ``elasticity`` : deflection of the links; ``tree`` : if joints form one, with the ``ends`` (n,) of its rows,
-    each in its joint's frame; ``flange_joint`` : whose end is the flange.
+    first: in the world); ``last_from_flange`` : in the frame of the joint that carries the flange; ``prismatic`` :
+    (n,); ``coupling`` : (n, N), of all N values of the controller; ``elasticity`` : of the links; ``tree`` : if joints
+    form one, with the ``ends`` (n,) of its rows in their joints' frames; ``flange_joint`` : whose end is the flange.
     """
 
     rotation: np.ndarray

@@ -1,18 +1,25 @@
-"""Joint values of an identified arm that reach the programmed poses, in the programmed configuration."""
+"""Joint values of an identified arm that reach the poses that a file commands, in the programmed configuration."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AliasPath, BeforeValidator, Field
 
 from stcal.errors import InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_arguments
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid, other_axes
 from stcal.io.json import Part, ResultFile, Shape, Vector
-from stcal.io.table import csv_text
+from stcal.io.rotations import EXPLAINS
+from stcal.io.table import LENGTHS, UNIT_WORDS, csv_text
 from stcal.parallel import one_thread
+from stcal.robot.identification.adjustment import State, tips
+from stcal.robot.identification.observability import over_ranges
+from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
+from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import (
     LIMIT,
     ORIENTATION,
@@ -20,30 +27,154 @@ from stcal.robot.kinematics.inverse import (
     SINGULAR_POSE,
     UNREACHABLE,
     Inverse,
+    inverse,
     reach_mm,
 )
+from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import Joint, Robot
-from stcal.robot.use.targets import (
-    Targets,
-    joints_of,
-    on_targets,
-    out_of_reach,
-    poses_of,
-    position_misfit_mm,
-    robots_apart,
-)
+
+
+def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
+    """Returns base_from_tool of joint values (m, n), with each row's tool and load."""
+    arm = State(replace(robot, world_from_base=Rigid()).chain(), {name: robot.tool(name) for name in targets.tools})
+    return tips(arm, q, targets.tools, targets.conditions)
+
+
+def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
+    """Returns joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
+    m, mass = len(poses), targets.conditions.payload_kg
+    alike: dict[tuple[str, float | None], list[int]] = {}
+    for row, pair in enumerate(zip(targets.tools, [None] * m if mass is None else mass.tolist(), strict=True)):
+        alike.setdefault(pair, []).append(row)
+    q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
+    error_mm, error_rad = np.empty(m), np.empty(m)
+    for (name, kg), own in alike.items():
+        rows = np.array(own)
+        part = inverse(robot, poses[rows], None if near is None else near[rows], name, kg)
+        q[rows], status[rows] = part.q, part.status
+        error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
+    return Inverse(q, tuple(status), error_mm, error_rad)
+
+
+UNITS = ("m", "in")
+"""Possible units of columns of mm. In micrometres no arm would reach a pose, and cm differ by a factor of ten only."""
+USUAL_SHARE, SAMPLE = 0.01, 50
+"""Usual error as a share of the reach, ten times the manufacturing tolerance; number of joint vectors compared."""
+
+
+def robots_apart(identified: Robot, nominal: Robot) -> str:
+    """Returns a note if two files may be of different robots, by their flanges. Raises InputError: they must be."""
+    ends = [""] if identified.tree is None else list(identified.tree.carriers)
+    identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
+    q = over_ranges(identified, SAMPLE, ends[0])
+    off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
+    apart, reach = max(map(_rms, off)), max(reach_mm(each, ends) for each in (identified, nominal))
+    if apart <= USUAL_SHARE * reach:
+        return ""
+    said = (
+        f"nominal robot {nominal.name} and identified robot {identified.name} are {apart:.4g} mm apart at the same "
+        "joint values (RMS)"
+    )
+    if apart > FITS * reach:
+        raise InputError(
+            "E-ROBOT-MISMATCH",
+            f"{said}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
+            "units, D-H rows, convention and coupling of both",
+        )
+    return (
+        f"{said}, more than arms are off their drawing ({USUAL_SHARE:.0%} of the reach): are both files of this robot?"
+    )
+
+
+def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
+    """Returns whether joint values beside the poses confirm them, and doubts about the poses of ``robot``.
+
+    Raises InputError: joint values lead to the poses in another unit, convention or order of rows, which it names.
+    """
+    if targets.poses is None:
+        return True, ()
+    if targets.q is None:
+        return False, _near_base(robot, targets, targets.poses)
+    reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot, set(targets.tools))
+    own = _rms(reached.translation - targets.poses.translation)
+    if own <= FITS * reach:
+        require_orientations(targets.where, targets.tools, reached.rotation, targets.poses.rotation, many=False)
+    else:
+        _explain(robot, targets, targets.poses, targets.q, own, reach)
+    notes = _elsewhere(targets, targets.poses.difference(reached), reach)
+    return not notes, notes + (_near_base(robot, targets, targets.poses) if notes else ())
+
+
+def _rms(shift: np.ndarray) -> float:
+    """Returns the RMS length of vectors (m, 3)."""
+    return float(np.sqrt((shift**2).sum(axis=1).mean()))
+
+
+def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
+    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row."""
+
+    def misfit(case: tuple[Poses, np.ndarray]) -> float:
+        off = case[0].difference(poses_of(robot, targets, case[1]))
+        return np.inf if _rms(off[:, :3]) >= TURNED_RAD else _rms(off[:, 3:])
+
+    for best, left in explain(_mistakes(robot, poses, q), misfit, min(FITS * reach, EXPLAINS * own))[:1]:
+        raise InputError(
+            "E-ROBOT-MISMATCH",
+            f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses, "
+            f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {best.words}",
+        )
+
+
+def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
+    """Yields frequent mistakes with the poses and the joint values that were meant."""
+    turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
+    meant = [(f"lengths were {UNIT_WORDS[u]}; call the columns x_{u} …", LENGTHS[u] * poses.translation) for u in UNITS]
+    meant += [
+        (f"x, y, z were {names}; correct order and signs of the columns of positions", places)
+        for names, places in other_axes(poses.translation)
+    ]
+    for words, places in meant:
+        yield Candidate(words, partial(tuple, (Poses(poses.rotation, places), q)))
+    inverse = "poses were inverse (base seen from the tool); give the tool in the base's frame"
+    yield Candidate(inverse, lambda: (poses.inverse(), q))
+    radians = "joint values were radians in columns of degrees; call the columns q1_rad …"
+    yield Candidate(radians, lambda: (poses, turned))
+
+
+def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
+    """Returns a note on joint values that miss poses by (m, 6), unless they only choose a branch."""
+    mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
+    away = (mm > FITS * reach) | (rad > TURNED_RAD)
+    if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):
+        return ()
+    return (
+        f"joint values of {away.sum()} of {len(off)} rows, first line {targets.lines[int(away.argmax())]}, lead "
+        f"elsewhere than their poses, by {np.median(mm[away]):.4g} mm and {np.degrees(np.median(rad[away])):.3g}° "
+        "(median): they only choose the branch; if they are those of the poses, check order, units and conventions; if "
+        "the poses are of the nominal robot's tool, give that robot with --nominal",
+    )
+
+
+def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
+    """Returns a note if all poses are so near the base's origin that metres or inches would also be within reach."""
+    far = float(np.linalg.norm(poses.translation, axis=1).max())
+    first_joint = replace(robot, world_from_base=Rigid()).chain().translation[0]
+    reach = reach_mm(robot, set(targets.tools)) + float(np.linalg.norm(first_joint))
+    unit = next((unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach), None)
+    if unit is None:
+        return ()
+    return (
+        f"all targets lie within {far:.3g} mm of the base's origin, where no arm works that reaches {reach:.4g} mm: if "
+        f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …",
+    )
+
 
 LEAST_SHOWN_MM = 1e-6
 """Error below which its size says nothing."""
-ISOLATED = 6
-"""Largest number of joints with isolated solutions, of which another one is another configuration."""
-FAR_RAD = np.radians(1.0)
-"""Largest usual motion of a joint, as arms are made to milliradians."""
-AMPLIFIED = 10.0
-"""Ratio of a joint's motion to the error of the pose, in rad, from which the arm is near a singular pose."""
+FAR_RAD, AMPLIFIED = np.radians(1.0), 10.0
+"""Largest usual motion of a joint; its ratio to the error of the pose, in rad, from which the pose is near singular."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
 """Largest plausible deviation of a tool from its drawing, mm and rad."""
-FEW_ROWS = 3
 ROUND_MM = 0.01
 """Lengths as drawn are multiples of this."""
 MEANING = {
@@ -58,18 +189,12 @@ MEANING = {
 class Compensated(Brief):
     """The commanded poses with the corrected values for the controller.
 
-    Parameters
-    ----------
-    targets : Targets
-    poses : commanded base_from_tool.
-    found : by the identified robot.
-    nominal : by the nominal robot: what would be commanded without calibration.
-    before_mm, before_rad : (m,) arrays
-        Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
-        robot.
-    identified : the identified robot, with the tools that were taken.
-    beyond : joints, and their values, of rows that only joint values beyond the limits reach.
-    doubts : notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
+    ``targets`` : as given; ``poses`` : commanded base_from_tool; ``found`` : by the identified robot; ``nominal`` : by
+    the nominal robot: what would be commanded without calibration; ``before_mm``, ``before_rad`` : (m,) error of the
+    nominal joint values by the identified robot, which compensation removes; empty without a nominal robot;
+    ``identified`` : the identified robot, with the tools that were taken; ``beyond`` : joints, and their values, of
+    rows that only joint values beyond the limits reach; ``doubts`` : notes on targets that may have another meaning,
+    and on tools and arms that differ from the nominal robot.
     """
 
     targets: Targets
@@ -137,16 +262,13 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
             apart[name] = f"differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between the two files"
     with_own = replace(nominal, tools={**nominal.tools, **{name: identified.tools[name] for name in apart}})
-    taken = "identified file is taken in both"
-    if (
-        apart.keys() <= nominal.tools.keys()
-        and targets.poses is not None
-        and targets.q is not None
-        and position_misfit_mm(nominal, targets) < position_misfit_mm(with_own, targets)
-    ):
-        taken = "nominal file is taken in both (joint values beside the poses say so)"
-        own_tools = {name: nominal.tools[name] for name in apart}
-        identified, with_own = replace(identified, tools={**identified.tools, **own_tools}), nominal
+    taken, poses, q = "identified file is taken in both", targets.poses, targets.q
+    if apart.keys() <= nominal.tools.keys() and poses is not None and q is not None:
+        misses = [_rms(poses_of(each, targets, q).translation - poses.translation) for each in (nominal, with_own)]
+        if misses[0] < misses[1]:
+            taken = "nominal file is taken in both (joint values beside the poses say so)"
+            own_tools = {name: nominal.tools[name] for name in apart}
+            identified, with_own = replace(identified, tools={**identified.tools, **own_tools}), nominal
     notes = (f"tool {name or 'of the robot files'} {said}: that of the {taken}" for name, said in apart.items())
     return identified, with_own, tuple(notes)
 
@@ -156,10 +278,9 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
 def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | None = None) -> Compensated:
     """Returns joint values for the commanded poses, by the identified robot and by the nominal one.
 
-    Of several branches, the one nearest to the nominal joint values is taken; without a nominal robot, the one nearest
-    to the commanded joint values. If this one is beyond a limit, no other is taken instead. If neither joint values are
-    known, the first pose gets the branch nearest to the middle of the joint limits, and every other pose the branch
-    nearest to that of the pose before.
+    Of several branches, the one nearest to the nominal joint values is taken, else to the commanded ones; if it is
+    beyond a limit, no other instead. With neither, the first pose gets the branch nearest to the middle of the limits,
+    and every other the one nearest to that of the pose before.
 
     Parameters
     ----------
@@ -172,10 +293,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     Compensated : joint vectors (m, n) to command, rad or mm, and for each whether it reaches its pose; poses out of
         reach raise no error.
 
-    Raises
-    ------
-    InputError : joint values without poses need the nominal robot; robots of different joints, or too far apart to be
-        one; an unknown tool; poses to which their joint values lead in another unit or convention only.
+    Raises InputError: joint values without poses need the nominal robot; robots of different joints, or too far apart
+    to be one; an unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if isinstance(targets, Poses):
         targets = Targets.from_poses(targets)
@@ -197,7 +316,13 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     rigid = targets.conditions.ignored(f"robot {identified.name}") if identified.elasticity is None else ()
     if nominal is not None:
         apart = robots_apart(identified, nominal)
-        doubts = ((apart,) if apart else ()) + _roles(identified, nominal) + _in_radians(targets, identified.prismatic)
+        doubts = ((apart,) if apart else ()) + _roles(identified, nominal)
+        turning = None if targets.q is None else np.degrees(np.abs(targets.q[:, ~identified.prismatic]))
+        if targets.poses is None and len(targets) > 2 and turning is not None and turning.max(initial=0) <= 2 * np.pi:
+            doubts += (
+                f"joint values are {turning.max(initial=0):.3g}° at most, as of radians in columns of degrees: if so, "
+                "call the columns q1_rad …",
+            )
         identified, nominal, others = _with_one_tool(identified, nominal, targets)
     commander = nominal or identified
     confirmed, of_targets = on_targets(commander, targets)
@@ -207,7 +332,6 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         before = joints_of(nominal, targets, poses, targets.q)
         off, near, known = poses.difference(poses_of(identified, targets, before.q)), before.q, before.usable
     found = joints_of(identified, targets, poses, near)
-    of_targets += () if confirmed else out_of_reach(identified, targets, found)
     found, beyond = _stayed(identified, targets, poses, near, found, known)
     return Compensated(
         targets=targets,
@@ -241,23 +365,11 @@ def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     return ()
 
 
-def _in_radians(targets: Targets, sliding: np.ndarray) -> tuple[str, ...]:
-    """Returns a doubt if joint values without poses are all as small as radians are that were taken for degrees."""
-    if targets.poses is not None or targets.q is None or len(targets.q) < FEW_ROWS or sliding.all():
-        return ()
-    most = float(np.degrees(np.abs(targets.q[:, ~sliding]).max()))
-    if most > 2 * np.pi:
-        return ()
-    return (
-        f"joint values are {most:.3g}° at most, as of radians in columns of degrees: if so, call the columns q1_rad …",
-    )
-
-
 def _stayed(
     robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None, inverse: Inverse, known: np.ndarray
 ) -> tuple[Inverse, dict[int, str]]:
     """Returns solutions in the configuration of ``near`` (m, n) where ``known`` (m,), and by row limits against it."""
-    if near is None or not known.any() or len(robot.rows) > ISOLATED:
+    if near is None or not known.any() or len(robot.rows) > 6:
         return inverse, {}
     away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
     rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
@@ -319,19 +431,11 @@ def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
 
 @require_arguments
 def compensated_csv(result: Compensated, robot: Robot) -> str:
-    """Returns the table of compensated joint values; those of poses not reached are empty.
+    """Returns the CSV of the joint values of ``result`` for its ``robot``, empty where a pose is not reached.
 
-    Parameters
-    ----------
-    result : of :func:`~stcal.robot.compensate`.
-    robot : the identified robot.
-
-    Returns
-    -------
-    str : CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    Joint values in degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
-    columns = joint_columns(robot)
-    names = result.targets.names
+    columns, names = joint_columns(robot), result.targets.names
     head = [*names, "line", "target", *columns, "status", "error_mm", "error_deg"]
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]

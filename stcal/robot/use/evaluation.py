@@ -1,18 +1,25 @@
-"""Evaluation of robot files by measurements that they were not made from: errors by row, and their causes."""
+"""Robots against measurements that they were not made from: distances before and after, and errors of robot files.
 
-from collections.abc import Mapping
+Verification is the test of the stereo-target paper. Distances from the first position need no common frame of robot and
+instrument, but all carry its error; the distances of all pairs depend less on any one position.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.io.json import Matrix, Part, ResultFile
+from stcal.io.json import Matrix, Part, ResultFile, Texts, Vector
+from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
@@ -31,20 +38,263 @@ from stcal.robot.identification.prior import Placed
 from stcal.robot.identification.result import Figures, PlacedPose
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
-from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.measurements import Measurements, unread
 from stcal.robot.kinematics.robot_model import Robot
+from stcal.robot.urdf import few
+
+WHAT = "measured positions"
+SAME_MM = 1e-6
+"""Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
+MISSES, MISSES_MM = 0.05, 20.0
+"""Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
+OFF, OFF_MM = 6.0, 0.1
+"""Ratio of a pose's typical error to that of most, and its size, from which on the pose is named."""
+MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
+"""Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
+LEAST_SPREAD_MM = 20.0
+"""Largest commanded distance below which the unit is doubted."""
+SCALE_WITHIN = 0.005
+"""Largest relative difference of scale; more is another unit, or other poses."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPoses:
+    """Rows of a file. ``sets``, ``names`` : (m,) set and pose of each; ``commanded``, ``measured`` : (m, 3) mm, each in
+    a frame of its own; ``notes`` : on columns that were not read."""
+
+    where: str
+    lines: Sequence[int]
+    sets: tuple[str, ...]
+    names: tuple[str, ...]
+    commanded: np.ndarray
+    measured: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        m = len(self.lines)
+        freeze(self, "commanded", (m, 3), "commanded positions")
+        freeze(self, "measured", (m, 3), "measured positions")
+
+
+class SetResult(Part):
+    """Distance errors of one set, mm."""
+
+    name: str
+    error_mm: Vector
+    mean_mm: float
+    std_mm: float
+    max_mm: float
+    pairs_rms_mm: float
+    pairs_mm: float
+    scale: float
+    elsewhere: str = ""
+
+    def doubt(self) -> str:
+        """Returns why the measured positions may not belong to the commands; empty if they may."""
+        allowed = max(MISSES * self.pairs_mm, MISSES_MM)
+        if self.elsewhere:
+            said = self.elsewhere
+        elif abs(self.scale - 1) > SCALE_WITHIN:
+            near = abs(self.scale - 1) < MISSES
+            remedy = "check the instrument's scale" if near else "check units and the order of the poses"
+            for unit, words in UNIT_WORDS.items():
+                for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
+                    if abs(self.scale / times - 1) < SCALE_WITHIN:
+                        remedy = f"check units, as if the {side} ones were {words}"
+            said = f"measured distances are {self.scale:.4g} times the commanded ones; {remedy}"
+        elif self.pairs_rms_mm > allowed:
+            said = (
+                f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs), "
+                f"{allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
+            )
+        else:
+            return ""
+        return f"set {self.name}: {said}"
+
+    def figures(self) -> dict[str, float]:
+        """Returns the figures that are compared between sets, mm."""
+        return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
+
+
+class VerificationFile(ResultFile):
+    """Result file of ``verify``."""
+
+    format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
+    poses: list[str] = Field(description="names, the first being the one that distances start from")
+    distance_mm: Vector = Field(description="commanded distances of the others from it")
+    sets: list[SetResult] = Field(
+        description="`name`; `error_mm` measured minus commanded; `mean_mm`, `std_mm` (sample), `max_mm` of their "
+        "absolute values; `pairs_rms_mm`, `pairs_mm` RMS of errors and of commanded distances of all pairs, `scale` of "
+        "measured over commanded ones; `elsewhere`: poses that alone are not where they were commanded"
+    )
+    missing: dict[Annotated[str, "set"], list[str]] = Field(description="poses that a set lacks")
+    warnings: Texts = Field(description="what to look at")
+    notes: list[str] = Field(description="columns that were not read")
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Verification(Brief):
+    """Distance errors of several sets of measurements, over the poses that all sets have.
+
+    ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :
+    by set, the poses that it lacks; they are left out of all sets; ``notes`` : on columns that were not read.
+    """
+
+    format: ClassVar = "stcal verification 1"
+    where: str
+    poses: tuple[str, ...]
+    distance_mm: np.ndarray
+    sets: tuple[SetResult, ...]
+    missing: dict[str, tuple[str, ...]]
+    notes: tuple[str, ...] = ()
+
+    def reduction(self, index: int) -> dict[str, float]:
+        """Returns the reduction of each figure of set ``index`` relative to the first set, per cent."""
+        first, figures = self.sets[0].figures(), self.sets[index].figures()
+        return {key: 100 * (1 - figures[key] / first[key]) if first[key] > 0 else float("nan") for key in first}
+
+    def warnings(self) -> list[str]:
+        """Returns warnings of missing poses and of doubtful sets."""
+        found = [
+            f"set {name}: missing poses, left out of all sets ({len(poses)}): {few(poses)}"
+            for name, poses in self.missing.items()
+            if poses
+        ]
+        found += [doubt for each in self.sets if (doubt := each.doubt())]
+        if (most := float(self.distance_mm.max())) < LEAST_SPREAD_MM:
+            found.append(
+                f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
+                "the names of their columns say, correct these"
+            )
+        return found
+
+
+def read_measured(path: str | Path | Table) -> MeasuredPoses:
+    """Reads commanded positions in the robot's base and measured ones in the instrument's frame, mm.
+
+    ``path`` : table (CSV; form: ``data_layout.md``). Raises InputError: missing columns, bad rows, or a pose twice in
+    one set; the message names the line.
+    """
+    table = read_table(path, WHAT)
+    commanded, measured = table.points("commanded_"), table.points()
+    sets = tuple(table.text("set")) if "set" in table else ("measured",) * len(table)
+    names = _names(table, sets, commanded)
+    return MeasuredPoses(table.where, table.lines, sets, names, commanded, measured, unread(table))
+
+
+def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
+    """Returns the names of poses from column ``pose``, or else by equal commanded positions, counted within a set."""
+    if "pose" in table:
+        names = tuple(table.text("pose"))
+        keys, first = list(zip(sets, names, strict=True)), {}
+        before = [first.setdefault(key, row) for row, key in enumerate(keys)]
+        table.refuse(
+            np.array(before) != np.arange(len(table)),
+            "E-TABLE-ROW-REPEATED",
+            lambda i: (
+                f"pose {names[i]} of set {sets[i]} stands on line {table.lines[before[i]]} already; give the sets "
+                "different names"
+            ),
+        )
+        return names
+    places, numbers, times = {}, [], Counter()
+    for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
+        times[name, *xyz] += 1
+        numbers.append(places.setdefault((*xyz, times[name, *xyz]), len(places) + 1))
+    return tuple(map(str, numbers))
+
+
+def verify(data: MeasuredPoses) -> Verification:
+    """Returns the distance errors of each set of ``data``, over the poses that all sets have, mm.
+
+    Distances from the first position need no common frame of robot and instrument (Zhang & Wei 2017, section 4.3).
+    Raises InputError: fewer than three poses in common, or one pose commanded to different places.
+    """
+    rows: dict[str, dict[str, int]] = {}
+    for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
+        rows.setdefault(group, {})[name] = i
+    every = list(dict.fromkeys(data.names))
+    common = [name for name in every if all(name in rows_of_set for rows_of_set in rows.values())]
+    missing = {group: tuple(name for name in every if name not in rows_of_set) for group, rows_of_set in rows.items()}
+    if len(common) < 3:
+        raise InputError(
+            "E-VERIFY-FEW",
+            f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
+            "at least 3 needed; are the commanded positions of the sets the same?",
+        )
+    index = {group: np.array([rows_of_set[name] for name in common]) for group, rows_of_set in rows.items()}
+    first = next(iter(index.values()))
+    for group, rows_of_set in index.items():
+        apart = np.abs(data.commanded[rows_of_set] - data.commanded[first]).max(axis=1)
+        if apart.max() > SAME_MM:
+            k = int(apart.argmax())
+            raise InputError(
+                "E-VERIFY-COMMANDED",
+                f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
+                f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
+            )
+    sets = [_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items()]
+    for k, rows_of_set in enumerate(list(index.values())[1:], 1):
+        if (data.measured[rows_of_set] == data.measured[first]).all():
+            same = "measured positions are those of the first set to the last digit; give those of the instrument"
+            sets[k] = sets[k].model_copy(update={"elsewhere": same})
+    at = data.commanded[first]
+    distances = np.linalg.norm(at[1:] - at[0], axis=1)
+    return Verification(data.where, tuple(common), distances, tuple(sets), missing, data.notes)
+
+
+def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
+    """Returns which few poses (n, 3) miss most others by more than allowed, while these fit one another; else ""."""
+    if (measured == commanded).all():
+        return "measured positions are the commanded ones to the last digit; give those of the instrument"
+    wanted, found = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, measured))
+    missed = np.abs(found - wanted)
+    typical = np.median(missed, axis=1)
+    off = typical > max(MISSES * np.median(wanted), MISSES_MM)
+    far = typical > max(OFF * np.median(typical), OFF_MM)
+    if not off.any() and len(names) >= 6 and 0 < far.mean() <= MOST_ELSEWHERE:
+        listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far).tolist())
+        most = f"{np.median(typical):.2g} mm"
+        return f"pose{'s' * int(far.sum() > 1)} {listed}: far worse than the others, {most} (median); measure again"
+    if not off.any() or off.mean() > MOST_ELSEWHERE or missed[np.ix_(~off, ~off)].max() > MISSES_MM:
+        return ""
+    listed = few([name for name, wrong in zip(names, off, strict=True) if wrong])
+    return f"pose{'s' * int(off.sum() > 1)} {listed}: not where commanded, the others are; correct or remove"
+
+
+def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
+    commanded, measured = data.commanded[rows], data.measured[rows]
+    error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
+    sums = np.zeros(4)  # row by row: all pairs of thousands at once are gigabytes
+    for i in range(1, len(measured)):
+        seen, wanted = (np.linalg.norm(xyz[:i] - xyz[i], axis=1) for xyz in (measured, commanded))
+        sums += ((seen - wanted) ** 2).sum(), seen @ wanted, wanted @ wanted, i
+    squares, product, commanded_squares, pairs = sums.tolist()
+    if commanded_squares == 0:
+        raise InputError(
+            "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
+        )
+    size = np.abs(error)
+    return SetResult(
+        name=name,
+        error_mm=error,
+        mean_mm=float(size.mean()),
+        std_mm=float(size.std(ddof=1)),
+        max_mm=float(size.max()),
+        pairs_rms_mm=float(np.sqrt(squares / pairs)),
+        pairs_mm=float(np.sqrt(commanded_squares / pairs)),
+        scale=product / commanded_squares,
+        elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
+    )
+
 
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5
 """False-alarm probability per row, and factor on its limit, as a model's residuals have longer tails than noise."""
 LEAST_MM = 1e-3
 """Error below which a row is never wrong, as no instrument shows less."""
-ROUNDS = 5
-"""Largest number of rounds of fitting without gross errors; one or two are usually enough."""
-UNSEEN = 1e-12
-"""Relative visibility of a direction of parameters below which its σ is set to a huge value."""
-CHANCE = 0.05
-"""Probability of calling one of two equal robots better."""
+UNSEEN, CHANCE = 1e-12, 0.05
+"""Least relative visibility of parameters, below which σ is huge; probability of calling one of two equals better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +317,8 @@ class Evaluated:
     """Errors of one robot at the r observations, with base and tools as fitted.
 
     ``residuals`` : (r, 3) measured minus modelled position in the base's axes, or (r, 1) distance; mm; ``good`` : (r,)
-    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, empty if none were measured;
-    ``left`` : effects found in the residuals, None if there are too few rows for a test; ``beyond`` : the same after a
-    fit of all kinematic parameters to these rows.
+    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, if measured; ``left`` : effects found
+    in the residuals, None of too few rows; ``beyond`` : the same after a fit of all kinematic parameters.
     """
 
     robot: Robot
@@ -111,9 +360,8 @@ class Evaluated:
 class Evaluation:
     """Robots, in the order given, on one set of r observations: positions or distances.
 
-    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains: they are wrong, or all
-    models lack an effect; nothing was fitted to them; ``differences`` : the robot of least mean error against each
-    other one, in order of their means.
+    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains, which were not fitted;
+    ``differences`` : the robot of least mean error against each other one, in order of their means.
     """
 
     format: ClassVar = "stcal evaluation 1"
@@ -189,13 +437,11 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Returns
     -------
-    Evaluation
-        Errors by row, the better robot, and the effects found in residuals; mm, in the axes of each robot's base.
+    Evaluation : errors by row, the better robot, and the effects found in residuals; mm, in the axes of each robot's
+        base.
 
-    Raises
-    ------
-    InputError : a robot of other joints, or that does not fit the data; a tool that it does not have.
-    DegenerateError : too few rows for what is fitted, or positions that do not show it.
+    Raises InputError: a robot of other joints, or that does not fit the data; a tool that it does not have. Raises
+    DegenerateError: too few rows for what is fitted, or positions that do not show it.
     """
     fit: Fit = frozenset(part for part in ("base", "tool") if part in refit.split("-"))
     named = {name: replace(robot, name=name) for name, robot in robots.items()}
@@ -224,7 +470,7 @@ def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[Sta
     """Returns the states of all robots, and a mask (r,) of rows (never of distances) that none explains: not fitted."""
     wrong, width, targets = np.zeros(len(measured), bool), WIDTH[measured.kind], np.array(measured.data.targets)
     freedom = width * len(measured) - _parameters(measured, fit)
-    for _ in range(ROUNDS):
+    for _ in range(5):
         kept = measured[~wrong].data
         states = [start(robot, kept, fit) for robot in robots]
         errors = np.array([position_errors(residuals(state, measured)) for state in states])

@@ -27,16 +27,12 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 
-RANDOM_SETS = 20
-"""Number of random sets for comparison; their median is known to a quarter of their standard deviation."""
+RANDOM_SETS, TEST_POSES = 20, 200
+"""Number of random sets for comparison, and of random poses at which the identified robot's position is predicted."""
 DRAWS = 200
 """Number of joint vectors drawn for each candidate in the box, before the box counts as out of reach."""
-SWEEPS = 20
-"""Largest number of passes over the whole set. No exchange helps any more after 2 to 6."""
 GAIN = 1e-9
 """Least growth of log det that counts as an improvement."""
-TEST_POSES = 200
-"""Number of random poses at which the identified robot's position is predicted."""
 
 
 class DesignFile(ResultFile):
@@ -54,12 +50,12 @@ class DesignFile(ResultFile):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class PoseDesign(Brief):
-    """The chosen poses, compared with random sets of poses.
+    """The chosen poses, compared with random sets of as many.
 
-    ``q`` : (count, n) joint vectors, in order of choice: the first ones alone are a good set too; ``poses`` :
-    base_from_tool there; ``parameters``, ``seen`` : parameters, and how many of them (in combination) the candidates
-    show, of which the indices are; ``random`` : of random sets of the same size; ``sigma_mm`` : σ of the position that
-    the identified robot will predict, RMS per axis over random poses; ``random_sigma_mm`` : median of the random sets.
+    ``q`` : (count, n) joint vectors, of which the first alone are a good set too; ``poses`` : base_from_tool there;
+    ``parameters``, ``seen`` : how many there are, and how many (in combination) the candidates show, of which the
+    indices ``chosen`` and ``random`` are; ``sigma_mm`` : σ of the position that the identified robot will predict, RMS
+    per axis over random poses; ``random_sigma_mm`` : median of the random sets; ``exchanges`` : after the first choice.
     """
 
     format: ClassVar = "stcal pose design 1"
@@ -96,10 +92,8 @@ class DesignOptions:
     box : lowest x, y, z and highest x, y, z of the tool in the base, mm.
     tool : name of the tool that is measured.
 
-    Raises
-    ------
-    InputError
-        A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box that is empty.
+    Raises InputError: a choice that does not exist, no more candidates than poses, a σ that is not positive, or a box
+    that is empty.
     """
 
     count: int = 40
@@ -127,7 +121,7 @@ class DesignOptions:
         if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
             raise InputError(
                 "E-DESIGN-OPTIONS",
-                f"design: box {_shown(self.box)}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
+                f"design: box {self.box}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
             )
 
 
@@ -147,10 +141,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     -------
     PoseDesign : joint vectors with their poses base_from_tool, and their observability beside random ones.
 
-    Raises
-    ------
-    InputError : a prismatic joint without limits, or no poses in the box.
-    DegenerateError : so few poses that the parameters cannot be determined.
+    Raises InputError: a prismatic joint without limits, or no poses in the box. Raises DegenerateError: so few poses
+    that the parameters cannot be determined.
 
     References
     ----------
@@ -162,7 +154,9 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     q = _candidates(robot, options, rng)
     scale = parameter_scale(robot, options.observe, [options.tool])
     rows = identification_jacobian(robot, q, options.observe, options.sigma_mm, options.sigma_rad, options.tool) * scale
-    determined, basis = _seen_part(rows)
+    _, sigma, vt = np.linalg.svd(np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+    determined = int((sigma > SEEN * sigma[0]).sum())
+    basis = vt[:determined].T  # the combinations of parameters that the candidates show
     rows = rows @ basis
     needed = -(-determined // rows.shape[1])
     if options.count < needed:
@@ -208,7 +202,7 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
         if box is not None and drawn >= DRAWS * options.candidates:
             raise InputError(
                 "E-DESIGN-BOX",
-                f"design: of {drawn} random joint vectors {count} bring the tool into the box {_shown(box)} mm, "
+                f"design: of {drawn} random joint vectors {count} bring the tool into the box {box} mm, "
                 f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates",
             )
         q = rng.uniform(low, high, (options.candidates, len(low)))
@@ -219,17 +213,6 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
         batches.append(q)
         count += len(q)
     return np.concatenate(batches)[: options.candidates]
-
-
-def _shown(box: tuple[float, ...]) -> str:
-    return ",".join(f"{v:g}" for v in box)
-
-
-def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
-    """Returns the number of combinations of parameters that the candidates show, and these as columns (k, seen)."""
-    _, sigma, vt = np.linalg.svd(np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
-    seen = int((sigma > SEEN * sigma[0]).sum())
-    return seen, vt[:seen].T
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
@@ -245,7 +228,7 @@ def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
         chosen.append(int(gain.argmax()))
         inverse = _updated(inverse, rows[chosen[-1]], 1.0)
     exchanges = 0
-    for _ in range(SWEEPS):
+    for _ in range(20):  # no exchange helps any more after 2 to 6 sweeps
         before = exchanges
         inverse = np.linalg.inv(start + np.einsum("mri,mrj->ij", rows[chosen], rows[chosen]))  # no rounding gathers
         for place in range(count):
@@ -287,16 +270,9 @@ def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
 
 @require_arguments
 def design_csv(result: PoseDesign, robot: Robot) -> str:
-    """Returns the table of the poses to measure.
+    """Returns the CSV of the poses of ``result`` to measure with ``robot``, for which they were designed.
 
-    Parameters
-    ----------
-    result : of :func:`~stcal.robot.design`.
-    robot : the robot for which they were designed.
-
-    Returns
-    -------
-    str : CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
+    Joint values in degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
     """
     rows: list[Sequence] = [["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)]]
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):

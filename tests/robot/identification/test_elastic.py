@@ -11,10 +11,9 @@ from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import DOWN, HEAVIER, MOMENT, usual
 from stcal.robot.identification.result import Identified, IdentifiedFile, IdentifyOptions, require_identified_written
 from stcal.robot.identified_report import identified_report
-from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.robot_file import robot_toml
-from stcal.robot.kinematics.robot_model import Chain, Elasticity, Robot, mh80
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot, mh80
 from stcal.robot.robot_report import evaluation_report
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate

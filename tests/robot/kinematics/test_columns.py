@@ -8,14 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
+from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import read_measurements
+from stcal.robot.kinematics.measurements import read_measurements, read_targets
 from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from stcal.robot.use.targets import read_targets
 from tests.outcome import fails_with
 
 WPR, ABC, OPEN = ("w_deg", "p_deg", "r_deg"), ("a_deg", "b_deg", "c_deg"), ("rx_deg", "ry_deg", "rz_deg")
@@ -92,18 +91,6 @@ def test_columns_that_nothing_reads_are_named_and_the_known_ones_are_not(data):
     assert read_targets(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
 
 
-def test_covariances_and_common_errors_are_known(data):
-    path = data.write("data.csv", POSE[3:])
-    head, *rows = path.read_text().splitlines()
-    covariance = np.diag([1e-8] * 3 + [1e-4] * 3)[np.triu_indices(6)]
-    more = ",".join([*map(repr, covariance.tolist()), *["0"] * 6])
-    lines = [",".join([head, *COVARIANCE, *common_columns(1)]), *(f"{row},{more}" for row in rows)]
-    path.write_text("\n".join(lines) + "\n")
-    read = read_measurements(path, mh80())
-    assert read.covariance is not None
-    assert read.notes == ()
-
-
 @pytest.mark.slow
 def test_notes_reach_terminal_and_json(data, stcal_robot):
     robot, out = ("--robot", data.folder / "robot.toml"), data.folder / "out.json"
@@ -142,17 +129,3 @@ def test_notes_of_sweeps(data, stcal_robot):
     assert code == 0
     assert "column not read: load" in printed
     assert json.loads(out.read_text())["notes"][1] == "column not read: load"
-
-
-def test_a_trackers_file_beside_joint_values(data, stcal_robot):
-    names = [f"p{i}" for i in range(40)]
-    rows = [[name, *map(repr, place.tolist())] for name, place in zip(names, data.seen.positions / 1000, strict=True)]
-    text = "\n".join(["Name;X [m];Y [m];Z [m]", *map(";".join, rows)])
-    (data.folder / "tracker.txt").write_text(text)
-    joints = [[name, *joint_cells(data.true, q)] for name, q in zip(names, data.seen.q, strict=True)]
-    lines = [["image", *joint_columns(data.true)], *joints]
-    (data.folder / "joints.csv").write_text("\n".join(map(",".join, lines)))
-    files = ("--a", data.folder / "joints.csv", "--b", data.folder / "tracker.txt", "--key", "image=Name")
-    code, printed, _ = stcal_robot("identify", *files, "--robot", data.folder / "robot.toml", "--folds", 0)
-    assert code == 0
-    assert "40 positions from joints.csv with tracker.txt, 27 parameters determined" in printed

@@ -8,7 +8,6 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward, inverse
-from stcal.robot.kinematics.conditions import Conditions, loaded
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import (
     chain_parameters,
@@ -20,7 +19,7 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
-from stcal.robot.kinematics.robot_model import Elasticity, Robot, mh80
+from stcal.robot.kinematics.robot_model import Conditions, Elasticity, Robot, loaded, mh80
 from stcal.robot.simulated import joint_vectors
 from tests.outcome import fails_with
 
@@ -71,15 +70,6 @@ def test_rows_of_an_adjusted_chain_keep_its_deflections():
     assert np.abs(rigid[:, 3:]).max() > 0.2
     assert np.abs(reached[:, 3:]).max() < 1e-3
     assert np.abs(reached[:, :3]).max() < 1e-12
-
-
-def test_gravity_alone_is_a_rigid_arm(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text(robot_toml(mh80()) + "\n[elasticity]\ngravity = [0, 1, 0]\n")
-    robot = load_robot(path)
-    assert robot.elasticity.gravity == pytest.approx([0, 1, 0])
-    q = vectors(robot)
-    assert np.abs(forward(robot, q).difference(forward(mh80(), q))).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -143,16 +133,6 @@ def test_a_payload_is_what_moments_of_all_links_with_it_are():
     off = forward(robot, q, payload_kg=mass).difference(forward(heavier, q))
     assert np.abs(off).max() < 1e-9
     assert np.abs(forward(robot, q, payload_kg=mass).difference(forward(robot, q))[:, 3:]).max() > 0.01
-
-
-def test_each_row_has_its_own_payload_and_the_way_back_knows_it():
-    robot = replace(bent(), elasticity=replace(bent().elasticity, payload_centre=np.array([0.0, 20.0, 90.0])))
-    q, mass = vectors(robot), np.repeat([0.0, 60.0], 10)
-    both = forward(robot, q, payload_kg=mass)
-    for value, rows in ((0.0, slice(0, 10)), (60.0, slice(10, 20))):
-        assert np.abs(both[rows].difference(forward(robot, q[rows], payload_kg=value))).max() < 1e-12
-        found = inverse(robot, both[rows], q[rows], payload_kg=value)
-        assert np.abs(found.q - q[rows]).max() < 1e-9
 
 
 def test_a_file_reads_back_the_same_and_rows_made_of_a_chain_know_the_payload(tmp_path):

@@ -77,7 +77,6 @@ def test_distances_from_rows(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "E-TABLE-EMPTY … data.csv"),
         ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n", "E-TABLE-EMPTY … data.csv"),
         ("q1_mm,x_mm,y_mm,z_mm\n1,2,3,4\n", "E-TABLE-COLUMN-MISSING … data.csv … q2_rad or q2_deg"),
         ("q1_deg,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n", "E-TABLE-COLUMN-MISSING … data.csv … q1_mm or"),
@@ -85,9 +84,6 @@ def test_distances_from_rows(tmp_path):
         ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,nan\n", "E-TABLE-NUMBER … data.csv … 2 … z_mm … 'nan'"),
         ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n1,2,inf,4,5\n", "E-TABLE-NUMBER … data.csv … 3 … x_mm … 'inf'"),
         ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,1e200,4,5\n", "E-VALUE-TOO-FAR … 2 … x_mm … 1e+200 … 1e+12"),
-        # However long the rest is: the csv module gives up at 131 072 characters.
-        (f'q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,"5\n{"1,2,3,4,5" * 20_000}', "E-TABLE-CELLS … 2"),
-        ("q1_deg," + 200_000 * "x" + "\n1,2\n", "E-TABLE-HEADER … 1 … 131072"),
         ("q1_mm,q2_rad,x_mm,y_mm,z_mm\n1,90,3,4,5\n", "E-JOINT-VALUE … data.csv … 2 … q2_rad … 90 … 4"),
         ("q1_mm,q2_rad\n1,0\n", "E-MEASURED-KIND … data.csv … x_mm … y_mm … z_mm … distance_mm"),
         ("q1_mm,q2_rad,distance_mm\n1,0,3\n2,0,5\n", "E-MEASURED-DISTANCES … line 2 … itself is 3 mm … first row"),

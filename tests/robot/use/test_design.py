@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
+from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.robot_model import Joint, mh80
@@ -68,16 +68,6 @@ def test_jacobian_against_differences(observe):
         numeric = at(step).difference(at(-step)) / (2 * h) * weight
         # Rounding of 3 m over 2e-6, divided by σ = 0.02: 1e-16 · 3e3 / 2e-6 / 0.02 ≈ 1e-5 of columns that reach 1e5
         np.testing.assert_allclose(rows[:, :, i], numeric[:, -rows.shape[1] :], atol=1e-3, rtol=1e-7)
-
-
-def test_parameters_are_counted_by_the_arc_at_full_reach():
-    scale = parameter_scale(ARM, "pose")
-    tool = np.linalg.norm(np.array([0, 0, 175]) + TOOL.translation)
-    links = np.hypot(145, 540) + 870 + 210 + 1025
-    assert len(scale) == 30
-    assert scale.max() == 1
-    # The last link and the tool may point along one line or not: the sum of both is the bound.
-    assert links + tool - 1 < 1 / scale.min() < np.hypot(145, 540) + links + 175 + np.linalg.norm(TOOL.translation)
 
 
 @pytest.mark.parametrize(("observe", "parameters"), [("position", 27), ("pose", 30)])

@@ -13,8 +13,7 @@ from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.robot_report import evaluated_csv, evaluation_report, names_of
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.robot.use.evaluation import evaluate
-from stcal.robot.use.verification import read_measured, verify
+from stcal.robot.use.evaluation import evaluate, read_measured, verify
 from tests.levels import sampled
 from tests.outcome import fails_with, refuses
 from tests.robot.identification.test_solve import rokae

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
-from stcal.robot.use.compensation import compensate
-from stcal.robot.use.targets import Targets, on_targets, robots_apart
+from stcal.robot.use.compensation import compensate, on_targets, robots_apart
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])
@@ -93,20 +93,6 @@ def test_targets_in_the_arms_foot_are_said(factor, words, count):
         assert len(notes) == 1
         assert "of the base's origin, where no arm works that reaches" in notes[0]
         assert words in notes[0]
-
-
-@pytest.mark.slow
-def test_a_convention_that_brings_poses_within_reach_is_said():
-    """Of an arm that reaches down alone: its orientations in another order are out of reach."""
-    nominal = arm(3)
-    stiff = [Joint("revolute", -0.6, 0.6) if i in (3, 4, 5) else joint for i, joint in enumerate(nominal.joints)]
-    nominal = replace(nominal, joints=tuple(stiff))
-    _, poses = commanded(nominal, 5, 3, 0.5)
-    assert not any("out of reach" in note for note in compensate(nominal, targets(poses)).notes())
-    notes = compensate(nominal, targets(rolled(poses))).notes()
-    assert (
-        "5 of 5 poses are out of reach; 5 of 5 of these that were tried would be within if quaternions were" in notes[0]
-    )
 
 
 @pytest.mark.parametrize("make", [arm, scara])
