@@ -157,7 +157,7 @@ def axes(
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot import load_robot, read_measurements, robot_from_sweeps
     from stcal.robot.axes.axes_model import AxesFile
-    from stcal.robot.axes.sweeps import ring
+    from stcal.robot.axes.fit import ring
     from stcal.robot.robot_report import axes_report
 
     nominal = load_robot(robot_file)
@@ -179,7 +179,7 @@ def axes(
 
 def _length(text: str, data: "Measurements") -> float | None:
     """Returns the distance of virtual reflectors, mm; None for positions alone."""
-    from stcal.robot.axes.sweeps import length_of
+    from stcal.robot.axes.fit import length_of
 
     if text in ("auto", "off"):
         return length_of(data) if text == "auto" else None

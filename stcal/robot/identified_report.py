@@ -23,10 +23,10 @@ from stcal.report.document import (
 )
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
-from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
-from stcal.robot.identification.observability import MEANING
+from stcal.robot.identification.adjustment import MEANING, Observed, State, as_seen, tips_of
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
-from stcal.robot.identification.result import ERRORS, OUTLIER_WEIGHT, Identified
+from stcal.robot.identification.problem import GROSS
+from stcal.robot.identification.result import ERRORS, Identified
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_motions, links, torques
 from stcal.robot.kinematics.robot_model import Robot
@@ -83,7 +83,7 @@ def identified_report(result: Identified) -> Document:
         listed("kept nominal, as the data do not determine it", result.undetermined),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
-    drawn = result.state, seen, result.residuals, result.weights >= OUTLIER_WEIGHT
+    drawn = result.state, seen, result.residuals, result.weights >= GROSS
     return Document(
         f"{result.nominal.name}: identified",
         f"robot {result.nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
@@ -187,7 +187,7 @@ def placed_table(placed: Iterable[Placed]) -> Table:
 
 def _dh_tables(result: Identified) -> list[Table]:
     """Returns a table for each unit, with a row for each joint."""
-    values, before, sigma = (each * SHOWN for each in (result.rows, result.nominal_rows, result.dh_sigma))
+    values, before, sigma = (each * SHOWN for each in (result.rows, dh_values(result.nominal), result.dh_sigma))
     tables = []
     for unit in dict.fromkeys(UNITS):
         kinds = [k for k in range(5) if UNITS[k] == unit]

@@ -25,12 +25,9 @@ from stcal.report.document import (
 )
 from stcal.report.svg import AXIS_COLOURS, COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
-from stcal.robot.axes.axes_model import AxesResult
-from stcal.robot.axes.checks import Pair
-from stcal.robot.axes.fit import AxisFit
-from stcal.robot.axes.sweeps import called
-from stcal.robot.identification.adjustment import tips_of
-from stcal.robot.identification.observability import MEANING
+from stcal.robot.axes.axes_model import AxesResult, Pair
+from stcal.robot.axes.fit import AxisFit, called
+from stcal.robot.identification.adjustment import MEANING, tips_of
 from stcal.robot.identification.prior import SHOWN
 from stcal.robot.identification.result import Figures
 from stcal.robot.identified_report import left_lines, placed_table, residual_plot

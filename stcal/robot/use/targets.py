@@ -14,8 +14,7 @@ from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
-from stcal.robot.identification.adjustment import State, tips
-from stcal.robot.identification.observability import over_ranges
+from stcal.robot.identification.adjustment import State, over_ranges, tips
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward

@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.axes.axes_model import robot_from_sweeps
-from stcal.robot.axes.checks import pairs_of
-from stcal.robot.axes.fit import fit_axes
-from stcal.robot.axes.sweeps import find_arcs, length_of, ring
+from stcal.robot.axes.axes_model import pairs_of, robot_from_sweeps
+from stcal.robot.axes.fit import find_arcs, fit_axes, length_of, ring
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
@@ -209,9 +207,9 @@ def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 40), SIGMA, 2)
-    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 1000)
+    monkeypatch.setattr("stcal.robot.axes.axes_model.REFITTED", 1000)
     exact = robot_from_sweeps(data, nominal).without_one
-    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 0)
+    monkeypatch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)
     linear = robot_from_sweeps(data, nominal).without_one
     assert linear.lines == exact.lines
     change = exact.distance - np.median(exact.distance, axis=0)
