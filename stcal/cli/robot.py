@@ -42,9 +42,8 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
+    from stcal.robot.descriptions import coupled, load_urdf, read_universal, require_urdf_written, robot_urdf
     from stcal.robot.kinematics.robot_file import load_robot
-    from stcal.robot.universal import read_universal
-    from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")

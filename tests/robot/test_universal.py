@@ -6,10 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.descriptions import LINKS, is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, save_robot
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
-from stcal.robot.universal import LINKS, is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from tests.outcome import fails_with
 
 UR5E = {

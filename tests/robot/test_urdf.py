@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.descriptions import load_urdf, require_urdf_written, robot_urdf
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
-from stcal.robot.urdf import load_urdf, require_urdf_written, robot_urdf
 from tests.outcome import fails_with
 from tests.support.arms import two_arms
 

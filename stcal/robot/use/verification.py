@@ -17,9 +17,9 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.io.json import Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.descriptions import few
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
-from stcal.robot.urdf import few
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
