@@ -22,7 +22,6 @@ from stcal.robot.axes.fit import (
     called,
     find_arcs,
     fit_axes,
-    unwound_by,
     virtual_reflectors,
 )
 from stcal.robot.identification.adjustment import State, observed
@@ -269,7 +268,7 @@ def robot_from_sweeps(
         tool_spread_mm=spread,
         pairs=pairs,
         without_one=_leave_one_out(data, fits, nominal, passed),
-        off=tuple({int(data.lines[row]): size for row, size in _off_mm(fit).items()} for fit in fits),
+        off=tuple({int(data.lines[row]): size for row, size in fit.off_mm.items()} for fit in fits),
         notes=tuple(notes),
     )
 
@@ -422,48 +421,34 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
         reversed_[flipped] = np.linalg.norm(_shape(directions * sign, places, sliding)[0] - shape)
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
-    robot = f"robot {nominal.name}'s"
-    if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
-        code, said = (
+    named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
+    checks = [
+        (
+            mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best],
             "E-AXES-MIRRORED",
-            (
-                f"the axes are the mirror image of {robot}: positions of a left-handed frame (or joints that count the "
-                "other way); swap two columns of x, y, z or change the sign of one"
-            ),
-        )
-    elif reversed_[best] < as_it_is / 2:
-        named = ", ".join(str(i + 1) for i in best)
-        code = "E-AXES-SIGN"
-        said = f"joint {named} counts against {robot}; correct alpha in the robot file or the sign of its values"
-    elif right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
-        code, said = (
+            f"the axes are the mirror image of {robot}'s: positions of a left-handed frame (or joints that count the "
+            "other way); swap two columns of x, y, z or change the sign of one",
+        ),
+        (
+            reversed_[best] < as_it_is / 2,
+            "E-AXES-SIGN",
+            f"joint {named} counts against {robot}'s; correct alpha in the robot file or the sign of its values",
+        ),
+        (
+            right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE,
             "E-AXES-UNITS",
-            (
-                f"the axes lie {apart / right:.3g} times as far apart as {robot}; check the unit of x, y, z, and the "
-                "lengths in the robot file"
-            ),
-        )
-    else:
-        angles = [np.degrees(np.arccos(np.clip((z[:-1] * z[1:]).sum(1), -1, 1))) for z in (directions, wanted)]
-        far = np.flatnonzero(np.abs(angles[0] - angles[1]) > np.degrees(AGREES_RAD))
-        if not len(far):
-            return
-        i = int(far[0])
-        code, said = (
-            "E-AXES-ANGLE",
-            (
-                f"axes of joints {i + 1} and {i + 2} are {angles[0][i]:.1f}° apart, {angles[1][i]:.1f}° in robot "
-                f"{nominal.name}; correct its alpha or theta, or the sign with which a joint counts"
-            ),
-        )
-    raise InputError(code, f"{where}: {said}")
-
-
-def _off_mm(fit: AxisFit) -> dict[int, float]:
-    """Returns how far each outlier (by its row) is off its arc, mm, the farthest first."""
-    length = np.where(fit.weights == 0, np.linalg.norm(fit.residuals, axis=1), 0.0)
-    distances = {int(row): float(length[fit.rows == row].max()) for row in fit.outliers}
-    return dict(sorted(distances.items(), key=lambda item: -item[1]))
+            f"the axes lie {apart / (right or 1.0):.3g} times as far apart as {robot}'s; check the unit of x, y, z, "
+            "and the lengths in the robot file",
+        ),
+    ]
+    angles = [np.degrees(np.arccos(np.clip((z[:-1] * z[1:]).sum(1), -1, 1))) for z in (directions, wanted)]
+    for i, (angle, nominal_angle) in enumerate(zip(*angles, strict=True), 1):
+        said = f"axes of joints {i} and {i + 1} are {angle:.1f}° apart, {nominal_angle:.1f}° in {robot}; correct its "
+        said += "alpha or theta, or the sign with which a joint counts"
+        checks.append((abs(angle - nominal_angle) > np.degrees(AGREES_RAD), "E-AXES-ANGLE", said))
+    for wrong, code, said in checks:
+        if wrong:
+            raise InputError(code, f"{where}: {said}")
 
 
 def _remarks(
@@ -476,7 +461,7 @@ def _remarks(
         if not fit.settled
     ]
     for fit in fits:
-        off_arc, limit = _off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
+        off_arc, limit = fit.off_mm, f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
         if len(off_arc) > FEW:
             first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
             notes.append(
@@ -517,24 +502,7 @@ def _remarks(
 def _leave_one_out(
     data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
 ) -> LeaveOneOut:
-    """Returns the values without each row; what comes after a changed axis is unwound and fitted again."""
-    kinematic, sliding = data.q @ nominal.coupling.T, nominal.prismatic.tolist()
-    start = [np.array(data.points())]
-    for j, fit in enumerate(fits):
-        start.append(unwound_by(fit.world_from_axis, start[-1], kinematic[:, j], sliding[j])[1])
-
-    def refitted(rows: list[int]) -> np.ndarray:
-        """Returns the values (n − 1, 6) without these rows; nan if the remaining rows determine no axis."""
-        first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
-        frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
-        try:
-            for j in range(first, len(fits)):
-                frames.append(fits[j].without(points, rows))
-                points = unwound_by(frames[j], points, kinematic[:, j], sliding[j])[1]
-            return _pair_values(frames, nominal).reshape(-1, 6)
-        except (DegenerateError, ConvergenceError):
-            return np.full((len(fits) - 1, 6), np.nan)
-
+    """Returns the values of the pairs without each row."""
     groups, counts = {}, {}  # rows that were measured together: the same joint values, each reflector once
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
         key = q.tobytes(), target
@@ -543,26 +511,43 @@ def _leave_one_out(
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
     if len(instants) > REFITTED:
-        values = _by_influence(instants, fits, passed, nominal)
+        values = _by_influence(instants, fits, nominal, passed)
     else:
-        values = np.array([refitted(rows) for rows in instants])
-    lines = tuple(int(data.lines[rows[0]]) for rows in instants)
-    return LeaveOneOut(lines, values[:, :, 3], values[:, :, 4])
+        values = _refitted(data, instants, fits, nominal)
+    values = values.reshape(len(instants), -1, 6)
+    return LeaveOneOut(tuple(int(data.lines[rows[0]]) for rows in instants), values[:, :, 3], values[:, :, 4])
+
+
+def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit], nominal: Robot) -> np.ndarray:
+    """Returns the values (r, 6 (n − 1)) without each instant's rows, nan if the remaining ones determine no axis; what
+    comes after a changed axis is unwound and fitted again."""
+    kinematic, points = (data.q @ nominal.coupling.T).T, [np.array(data.points())]
+    for fit, value in zip(fits, kinematic, strict=True):
+        points.append(fit.unwound(points[-1], value)[1])
+    values = np.full((len(instants), 6 * (len(fits) - 1)), np.nan)
+    for found, rows in zip(values, instants, strict=True):
+        first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
+        again, at = fits[:first], points[first]
+        try:
+            for fit, value in zip(fits[first:], kinematic[first:], strict=True):
+                again = [*again, fit.without(at, rows)]
+                at = again[-1].unwound(at, value)[1]
+            found[:] = _pair_values([fit.world_from_axis for fit in again], nominal)
+        except (DegenerateError, ConvergenceError):
+            continue
+    return values
 
 
 def _by_influence(
-    instants: list[list[int]], fits: list[AxisFit], passed: list[list[np.ndarray]], nominal: Robot
+    instants: list[list[int]], fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
 ) -> np.ndarray:
-    """Returns the pairs' values (r, n − 1, 6) without each instant's rows, to first order (Cook & Weisberg 1982)."""
+    """Returns the values (r, 6 (n − 1)) without each instant's rows, to first order."""
     number = {row: i for i, rows in enumerate(instants) for row in rows}
     changes = []
     for fit, derivatives in zip(fits, passed, strict=True):
         change = np.zeros((len(instants), len(fit.gain)))
         np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
-        for before, derivative in zip(changes, derivatives, strict=True):
-            change += before @ derivative.T
-        changes.append(change)
+        changes.append(change + sum(old @ by.T for old, by in zip(changes, derivatives, strict=True)))
     frames = [fit.world_from_axis for fit in fits]
-    values = _pair_values(frames, nominal)
     slope = _by_axes(lambda f: _pair_values(f, nominal), frames, nominal)
-    return (values + np.concatenate(changes, axis=1) @ slope.T).reshape(len(instants), -1, 6)
+    return _pair_values(frames, nominal) + np.concatenate(changes, axis=1) @ slope.T

@@ -308,9 +308,11 @@ class AxisFit:
         return self.sigma_mm**2 * np.einsum("pkc,qkc->pq", self.gain, self.gain)
 
     @property
-    def outliers(self) -> np.ndarray:
-        """Rows that are left out as gross errors."""
-        return np.unique(self.rows[self.weights == 0])
+    def off_mm(self) -> dict[int, float]:
+        """How far each row that is left out as a gross error is off its arc, mm, the farthest first."""
+        length = np.where(self.weights == 0, np.linalg.norm(self.residuals, axis=1), 0.0)
+        off = {int(row): float(length[self.rows == row].max()) for row in np.unique(self.rows[self.weights == 0])}
+        return dict(sorted(off.items(), key=lambda item: -item[1]))
 
     @property
     def rms_mm(self) -> float:
@@ -322,19 +324,27 @@ class AxisFit:
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
 
     def influence(self) -> np.ndarray:
-        """Returns the change (k, p) of the axis, linear, without each of its points."""
+        """Returns the change (k, p) of the axis, linear, without each of its points (Cook & Weisberg 1982)."""
         step = np.einsum("pkc,kvc->kpv", self.gain, self._by_points())  # derivative of the axis by the residuals
         weight = np.maximum(self.weights, TINY)
         normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
         lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
-        sums = self.member @ (self.weights @ self.member)
-        lever += (self.weights / np.maximum(sums, TINY))[:, None, None] * np.eye(2)
+        sums = np.maximum(self.member @ (self.weights @ self.member), TINY)
+        lever += (self.weights / sums)[:, None, None] * np.eye(2)
         return -(step @ np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None]))[:, :, 0]
 
-    def without(self, points: np.ndarray, left_out: Sequence[int]) -> Rigid:
-        """Returns world_from_axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
+    def without(self, points: np.ndarray, left_out: Sequence[int]) -> "AxisFit":
+        """Returns the axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
         weights = np.where(np.isin(self.rows, left_out), 0.0, self.weights)
-        return replace(self, points=points[self.rows], weights=weights)._descended().world_from_axis
+        return replace(self, points=points[self.rows], weights=weights)._descended()
+
+    def unwound(self, points: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the rotations (m, 3, 3) that undo the joint's values (m,), and points (m, 3) after that."""
+        z, origin = self.world_from_axis.rotation[:, 2], self.world_from_axis.translation
+        if self.prismatic:
+            return np.broadcast_to(np.eye(3), (len(points), 3, 3)), points - value[:, None] * z
+        turn = Rotation.from_rotvec(-value[:, None] * z).as_matrix()
+        return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
 
     def solved(self, moved: np.ndarray, starts: bool = True) -> "AxisFit":
         """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint;
@@ -570,8 +580,7 @@ def fit_axes(
         passed.append([np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]) for jacobian in inherited])
         for before, by in zip(response, passed[-1], strict=True):
             to_noise += np.einsum("pq,qmc->pmc", by, before)
-        axis = fit.world_from_axis
-        turn, after = unwound_by(axis, points, kinematic[:, j], bool(sliding))
+        axis, (turn, after) = fit.world_from_axis, fit.unwound(points, kinematic[:, j])
         # The unwound points change with rx, ry, tx, ty of the axis: δ = D(U x) − U(D x).
         shifts = [np.broadcast_to(axis.rotation[:, c], (2, m, 3)) for c in (0, 1)]
         places = np.stack([after, points]) - axis.translation
@@ -584,12 +593,3 @@ def fit_axes(
     rows = np.concatenate(response)
     stacked = rows.reshape(-1, 3 * m) if virtual is None else virtual.by_pose(rows)
     return fits, stacked @ stacked.T, points, passed
-
-
-def unwound_by(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations (m, 3, 3) that undo the joint's values, and the points after that."""
-    z, origin = axis.rotation[:, 2], axis.translation
-    if sliding:
-        return np.broadcast_to(np.eye(3), (len(points), 3, 3)), points - value[:, None] * z
-    turn = Rotation.from_rotvec(-value[:, None] * z).as_matrix()
-    return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin

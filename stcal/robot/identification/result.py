@@ -413,9 +413,10 @@ class IdentifiedFile(ResultFile):
     )
 
 
-def directions_named(directions: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
+def directions_named(directions: np.ndarray, names: tuple[str, ...] | list[str]) -> tuple[str, ...]:
     """Returns names of directions (k, d), ``J2 y (with tool z)``, each led by a parameter of its own."""
-    lead, reduced = [], directions.copy()
+    reduced = directions.copy()
+    lead: list[int] = []
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
         free[lead] = 0

@@ -61,8 +61,9 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         return _with_stations(robot, data, fit)
     named = sorted(set(data.targets))
     _require_motion(data, named)
-    for name in named if robot.tree is not None else ():
-        if name not in robot.tree.carriers:
+    carriers = named if robot.tree is None else robot.tree.carriers
+    for name in named:
+        if name not in carriers:
             target, key = (
                 (f"target {name}", "it a [[target]] with joint")
                 if name
