@@ -63,13 +63,7 @@ REFITTED = 200
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Pair:
-    """Two consecutive axes, ``joint`` (from 1) and the next; mm, rad; None along prismatic joints.
-
-    ``angle_rad`` : between the axes; ``distance_mm`` : of the next axis from this one, for near-parallel pairs in the
-    plane across this axis that the robot's rows define, else along the common normal; ``parallel`` : the rows have
-    Hayati's β; ``normal_mm``, ``foot_mm`` : length of the common normal, and position of its foot on this axis, from
-    where the axis was measured; ``refused`` : why a row of Denavit and Hartenberg must not be used, or "".
-    """
+    """Two consecutive axes; :class:`AxesFile` describes the fields (``pairs``). None along prismatic joints."""
 
     joint: int
     angle_rad: float
@@ -103,15 +97,7 @@ class LeaveOneOut:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxesResult:
-    """A robot by the axis method.
-
-    ``fits`` : one for each joint, with the joints before it at zero; ``covariance`` : (p, p) of all axes together, 4 or
-    2 parameters of each in its own frame, including what each axis inherits from the unwinding of those before;
-    ``robot`` : its rows, base and tools; ``row_sigma`` : (n, 5) of a, alpha, d, theta, beta (mm, rad), 0 where the
-    nominal value is kept; ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the
-    axes; ``off`` : for each axis, lines of the rows that were left out and how far they are off their arcs, mm;
-    ``notes`` : what was passed over.
-    """
+    """A robot by the axis method; :class:`AxesFile` describes the fields. ``chain`` : the axes as measured."""
 
     format: ClassVar = "stcal axes 1"
     fits: tuple[AxisFit, ...]

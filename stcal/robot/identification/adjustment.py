@@ -301,16 +301,14 @@ class Weighting:
 
 def parameter_units(derivative: np.ndarray) -> np.ndarray:
     """Returns steps (k,) that move the tool by 1 mm RMS, or by 1 rad if they move no point; 1 if they move nothing."""
-    lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
-    moves = np.sqrt((lengths**2).sum(1).mean(0))
-    turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
+    moves, turns = (np.sqrt((part**2).sum(1).mean(0)) for part in (derivative[:, -3:], derivative[:, :-3]))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
 
 
 def position_errors(found: np.ndarray) -> np.ndarray:
     """Returns the position errors (r,), mm."""
-    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
+    return np.linalg.norm(found[:, -3:], axis=1)
 
 
 SEEN = 1e-9
@@ -329,15 +327,13 @@ MEANING = {
 class ObservabilityIndices:
     """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
 
-    The indices depend on the units of the parameters, except for the order that O1 gives to sets of poses. In this
-    module all parameters are lengths in mm, an angle being the arc that it makes at the arm's whole reach
-    (:func:`parameter_scale`), and measurements are counted in their σ. So singular values, O1, O3, O4 and O5 are in
-    1/mm; O2 has no unit; and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
+    The indices depend on the units of the parameters, except for the order that O1 gives to sets of poses. Here all
+    parameters are in mm (:func:`parameter_scale`), and measurements are counted in their σ: O1, O3, O4 and O5 are in
+    1/mm, and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
 
-    ``o1`` : (σ₁ … σ_L)^(1/L) / √count, volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991);
-    ``o2`` : σ_L / σ₁, inverse condition number (Driels & Pathre 1990); ``o3`` : σ_L, the combination of parameters that
-    is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994); ``o4`` : σ_L² / σ₁, noise amplification (Nahvi &
-    Hollerbach 1996); ``o5`` : 1 / (1/σ₁ + … + 1/σ_L), near to A-optimality (Sun & Hollerbach 2008).
+    ``o1`` : (σ₁ … σ_L)^(1/L) / √count (Borm & Menq 1989, 1991); ``o2`` : σ_L / σ₁ (Driels & Pathre 1990); ``o3`` : σ_L
+    (Nahvi, Hollerbach & Hayward 1994); ``o4`` : σ_L² / σ₁ (Nahvi & Hollerbach 1996); ``o5`` : 1 / (1/σ₁ + … + 1/σ_L)
+    (Sun & Hollerbach 2008); see :data:`MEANING`.
     """
 
     o1: float

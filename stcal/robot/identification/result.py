@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields, rms
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_written
-from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
+from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile, Vector
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Kind,
@@ -343,13 +343,6 @@ ERRORS = {
 }
 
 
-class ElasticityValues(Part):
-    compliance: Matrix
-    moment: Matrix
-    periodic: Matrix
-    hysteresis: Vector
-
-
 class PlacedPose(Part):
     name: str
     pose: Pose
@@ -371,7 +364,7 @@ class IdentifiedFile(ResultFile):
         description="where both were tried: RMS errors of held-out rows, `rigid_mm` and `elastic_mm`; mean by which "
         "elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
-    elasticity_sigma: ElasticityValues | None = Field(
+    elasticity_sigma: Annotated[Elasticity, Named("compliance moment periodic hysteresis")] | None = Field(
         description="σ of the elasticity, a row for each joint: `compliance` (rad/Nm) about its axis and across it, "
         "`moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
     )

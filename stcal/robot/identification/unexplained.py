@@ -39,14 +39,7 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An effect found in the residuals.
-
-    ``what`` : its name ("the angle of joint 3, once a turn"); ``joint``, ``turns`` : number of the joint, and of
-    periods in one turn of it, 0 where there is none; ``effect_mm``, ``effect_rad`` : amplitude in the residuals if it
-    is periodic, size of a jump, else RMS; ``share`` : of the squared residuals (weighted as in the fit) explained;
-    ``p`` : probability of such an effect by chance, times the number of tests; ``line`` : of the first row after a jump
-    along the order of the rows; ``advice`` : what to do about it, empty for effects of the robot.
-    """
+    """An effect found in the residuals; the result file of ``identify`` describes the fields (``left``)."""
 
     what: str
     joint: int
@@ -141,11 +134,17 @@ class _Found:
     root: np.ndarray
     rest: "_Rest | None" = None
 
-    def worth_saying(self) -> "_Found | None":
-        """Returns the finding if it is beyond chance, and not tiny."""
-        found = self.finding
-        tiny = found.share < LEAST_SHARE or (found.effect_mm < LEAST_MM and found.effect_rad < LEAST_RAD)
-        return None if tiny or self.log_p > np.log(LEVEL) else self
+    @classmethod
+    def of(
+        cls, effect: _Effect, size: tuple[float, float], share: float, log_p: float, *seen, **said
+    ) -> "_Found | None":
+        """Returns the finding if it is beyond chance, and not tiny; ``size`` : mm, rad; ``seen`` : motions, root, rest;
+        ``said`` : fields of the finding that are not the effect's."""
+        p = float(np.exp(min(log_p, 0.0)))
+        words = {"what": effect.what, "joint": effect.joint, "turns": effect.turns} | said
+        finding = Finding(effect_mm=size[0], effect_rad=size[1], share=share, p=p, **words)
+        tiny = share < LEAST_SHARE or (size[0] < LEAST_MM and size[1] < LEAST_RAD)
+        return None if tiny or log_p > np.log(LEVEL) else cls(finding, log_p, *seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,15 +195,10 @@ class _Rest:
 
         mm, rad = size(slice(-3, None)), size(slice(0, 3)) if width == 6 else 0.0
         log_p += float(np.log(len(tried) + others))
-        share, p = float(takes @ takes) / max(self.square, 1e-300), float(np.exp(min(log_p, 0.0)))
-        rest = replace(
-            self,
-            fitted=np.hstack([self.fitted, new]),
-            remaining=self.remaining - takes,
-            freedom=self.freedom - new.shape[1],
-        )
-        finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
-        return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
+        share, fitted = float(takes @ takes) / max(self.square, 1e-300), np.hstack([self.fitted, new])
+        freedom = self.freedom - new.shape[1]
+        rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
+        return _Found.of(candidate, (mm, rad), share, log_p, candidate.motions, self.root, rest)
 
     def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
         """Returns the F test of what ``values`` (N, c) add: log p, the part (N,) of the residuals that it explains, and
@@ -251,29 +245,23 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     """Returns what may move during the measurements; none for distances, which no frame enters."""
     if measured.used == "distance":
         return []
-    tip, data = tips_of(state, measured.data), measured.data
-    again = "or measure again"
-    found = [
-        (
-            "the instrument or the robot's base elsewhere",
-            0,
-            frame_motions(tip, tip.translation.mean(0)),
-            f"name these rows another station (column station), {again}",
-            False,
-        )
-    ]
+    tip, data, order = tips_of(state, measured.data), measured.data, []
+
+    def add(what: str, motions: np.ndarray, advice: str, joint: int = 0, slides: bool = False) -> None:
+        order.append(_Effect(what, joint, as_seen(state, measured, tip, motions), 0, advice, slides))
+
+    another = "name these rows another {0} (column {0}), or measure again"
+    frame = frame_motions(tip, tip.translation.mean(0))
+    add("the instrument or the robot's base elsewhere", frame, another.format("station"))
     for name in dict.fromkeys(data.targets):
+        on_flange = tool_motions(tip, data.targets, name, measured.kind)
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
-        advice = f"name these rows another target (column target), {again}"
-        found.append((what, 0, tool_motions(tip, data.targets, name, measured.kind), advice, False))
+        add(what, on_flange, another.format("target"))
     twists = joint_motions(state.chain, data.q, tip, data.conditions) * state.chain.carries(data.targets)[:, :, None]
     for i, (twist, slides) in enumerate(zip(twists, state.chain.prismatic.tolist(), strict=True), 1):
         advice = "look whether it slipped, and measure again"
-        found.append((f"the zero of joint {i} another one", i, twist[:, :, None], advice, slides))
-    return [
-        _Effect(what, joint, as_seen(state, measured, tip, motions), 0, advice, slides)
-        for what, joint, motions, advice, slides in found
-    ]
+        add(f"the zero of joint {i} another one", twist[:, :, None], advice, i, slides)
+    return order
 
 
 def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarray, tests: int) -> _Found | None:
@@ -284,17 +272,14 @@ def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarra
     if not found:
         return None
     moved, change = min(found, key=lambda each: each[1].log_p)
-    log_p = change.log_p + float(np.log(tests))
-    what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
+    said = {"what": f"the order of the rows, {moved.what} by and by", "advice": DRIFTS}
     if change.kind != "drift":
         lines = rows.measured.lines
-        line, advice = lines[change.row], moved.advice
         likely = f" ({lines[change.first]} to {lines[change.last]} as likely)" if change.first < change.last else ""
-        what = f"the order of the rows, {moved.what} from line {line}{likely} on"
-    p = float(np.exp(min(log_p, 0.0)))
-    finding = Finding(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
-    taken = change.moves[:, None, None] * moved.motions
-    return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
+        what = f"the order of the rows, {moved.what} from line {lines[change.row]}{likely} on"
+        said = {"what": what, "line": lines[change.row], "advice": moved.advice}
+    seen = change.moves[:, None, None] * moved.motions, change.good.astype(float)
+    return _Found.of(moved, _size(moved, change), change.share, change.log_p + float(np.log(tests)), *seen, **said)
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:

@@ -252,7 +252,7 @@ def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     assert sigma[:3].max() < 2e-5
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.3)
     assert "hysteresis" in identified_report(found).text()
-    assert IdentifiedFile.model_validate(found).elasticity_sigma.hysteresis.tolist() == sigma.tolist()
+    assert IdentifiedFile.model_validate(found).elasticity_sigma["hysteresis"] == sigma.tolist()
     rigid = identify(mh80(), data, IdentifyOptions(folds=0))
     assert "the direction from which joint" in rigid.left[0].what
 
