@@ -49,8 +49,10 @@ def world_poses(robot: Robot, q: np.ndarray, tool: str):
     return robot.world_from_base @ forward(robot, q, tool)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("convention", ["standard", "modified"])
+@pytest.mark.parametrize(
+    ("name", "convention"),
+    [*((name, "standard") for name in ROBOTS), ("example", "modified"), ("prismatic", "modified")],
+)
 def test_there_and_back(name, convention, tmp_path):
     robot = ROBOTS[name]
     (tmp_path / "a.urdf").write_text(robot_urdf(robot))

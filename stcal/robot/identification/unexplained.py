@@ -134,17 +134,11 @@ class _Found:
     root: np.ndarray
     rest: "_Rest | None" = None
 
-    @classmethod
-    def of(
-        cls, effect: _Effect, size: tuple[float, float], share: float, log_p: float, *seen, **said
-    ) -> "_Found | None":
-        """Returns the finding if it is beyond chance, and not tiny; ``size`` : mm, rad; ``seen`` : motions, root, rest;
-        ``said`` : fields of the finding that are not the effect's."""
-        p = float(np.exp(min(log_p, 0.0)))
-        words = {"what": effect.what, "joint": effect.joint, "turns": effect.turns} | said
-        finding = Finding(effect_mm=size[0], effect_rad=size[1], share=share, p=p, **words)
-        tiny = share < LEAST_SHARE or (size[0] < LEAST_MM and size[1] < LEAST_RAD)
-        return None if tiny or log_p > np.log(LEVEL) else cls(finding, log_p, *seen)
+    def worth_saying(self) -> "_Found | None":
+        """Returns the finding if it is beyond chance, and not tiny."""
+        found = self.finding
+        tiny = found.share < LEAST_SHARE or (found.effect_mm < LEAST_MM and found.effect_rad < LEAST_RAD)
+        return None if tiny or self.log_p > np.log(LEVEL) else self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +192,9 @@ class _Rest:
         share, fitted = float(takes @ takes) / max(self.square, 1e-300), np.hstack([self.fitted, new])
         freedom = self.freedom - new.shape[1]
         rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
-        return _Found.of(candidate, (mm, rad), share, log_p, candidate.motions, self.root, rest)
+        p = float(np.exp(min(log_p, 0.0)))
+        finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
+        return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
 
     def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
         """Returns the F test of what ``values`` (N, c) add: log p, the part (N,) of the residuals that it explains, and
@@ -272,14 +268,17 @@ def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarra
     if not found:
         return None
     moved, change = min(found, key=lambda each: each[1].log_p)
-    said = {"what": f"the order of the rows, {moved.what} by and by", "advice": DRIFTS}
+    what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
     if change.kind != "drift":
         lines = rows.measured.lines
+        line, advice = lines[change.row], moved.advice
         likely = f" ({lines[change.first]} to {lines[change.last]} as likely)" if change.first < change.last else ""
-        what = f"the order of the rows, {moved.what} from line {lines[change.row]}{likely} on"
-        said = {"what": what, "line": lines[change.row], "advice": moved.advice}
-    seen = change.moves[:, None, None] * moved.motions, change.good.astype(float)
-    return _Found.of(moved, _size(moved, change), change.share, change.log_p + float(np.log(tests)), *seen, **said)
+        what = f"the order of the rows, {moved.what} from line {line}{likely} on"
+    log_p = change.log_p + float(np.log(tests))
+    p = float(np.exp(min(log_p, 0.0)))
+    finding = Finding(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
+    taken = change.moves[:, None, None] * moved.motions
+    return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:

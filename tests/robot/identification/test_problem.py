@@ -130,16 +130,6 @@ def test_of_several_parts_the_covariance_is_true_on_average():
     assert np.mean(error) == pytest.approx(1, abs=0.1)
 
 
-def test_parts_without_noise_do_not_break_it():
-    design = np.random.default_rng(3).normal(size=(20, 3))
-    exact = design @ [1.0, 2.0, 3.0]
-    parts = Components([Equations.of(exact, -design)], Equations.nothing(3), 0.0, np.array([np.inf]))
-    parts = Spread(parts, np.array([-2.0]), np.array([3.0]), np.ones(3))
-    best = parts.best()
-    assert best == pytest.approx([-2.0])
-    assert np.isfinite(parts.covariance(best)).all()
-
-
 @pytest.mark.parametrize("slope", [-2.5, -0.5, 0.9])
 def test_steps_that_overshoot_are_shortened(slope):
     """Of an iteration x → slope · x the first wanted step is (slope - 1) x; at -2.5 whole steps lead away for ever."""

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.identify import identify
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import robot_toml
@@ -34,7 +35,7 @@ def in_order(data, order, conjugated=False):
     return replace(data, rotations=Poses.from_quaternions(wxyz[:, order], data.points()).rotation)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("order", "conjugated", "said"),
     [
@@ -50,10 +51,10 @@ def test_another_convention_is_named(seed, order, conjugated, said):
     assert str(caught.value).endswith(said)
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("count", [8, 40])
-def test_orientations_as_their_columns_say_are_taken(seed, count):
-    start(mh80(), seen(seed, count))
+def test_orientations_as_their_columns_say_are_taken(count):
+    for seed in range(2):
+        start(mh80(), seen(seed, count))
 
 
 def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
@@ -196,4 +197,4 @@ def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():
     positions = np.vstack([part.positions for part in parts])
     data = Measurements.from_arrays(q, positions)
     with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
-        identify(mh80(), data)
+        identify(mh80(), data, IdentifyOptions(folds=0))
