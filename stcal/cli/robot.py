@@ -42,9 +42,8 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
+    from stcal.robot.descriptions import coupled, load_urdf, read_universal, require_urdf_written, robot_urdf
     from stcal.robot.kinematics.robot_file import load_robot
-    from stcal.robot.universal import read_universal
-    from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
@@ -155,7 +154,7 @@ def axes(
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot import load_robot, read_measurements, robot_from_sweeps
     from stcal.robot.axes.axes_model import AxesFile
-    from stcal.robot.axes.sweeps import ring
+    from stcal.robot.axes.fit import ring
     from stcal.robot.robot_report import axes_report
 
     nominal = load_robot(robot_file)
@@ -176,7 +175,8 @@ def axes(
 
 
 def _length(text: str, data: "Measurements") -> float | None:
-    from stcal.robot.axes.sweeps import length_of
+    """Returns the distance of virtual reflectors, mm; None for positions alone."""
+    from stcal.robot.axes.fit import length_of
 
     if text in ("auto", "off"):
         return length_of(data) if text == "auto" else None

@@ -1,4 +1,8 @@
 from .axes.axes_model import robot_from_sweeps as robot_from_sweeps
+from .descriptions import UrdfRobot as UrdfRobot
+from .descriptions import load_universal as load_universal
+from .descriptions import load_urdf as load_urdf
+from .descriptions import robot_urdf as robot_urdf
 from .identification.identify import identify as identify
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
@@ -18,10 +22,6 @@ from .kinematics.robot_model import DHRow as DHRow
 from .kinematics.robot_model import Joint as Joint
 from .kinematics.robot_model import Robot as Robot
 from .robot_report import evaluated_csv as evaluated_csv
-from .universal import load_universal as load_universal
-from .urdf import UrdfRobot as UrdfRobot
-from .urdf import load_urdf as load_urdf
-from .urdf import robot_urdf as robot_urdf
 from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.compensation import compensated_csv as compensated_csv

@@ -23,10 +23,10 @@ from stcal.report.document import (
 )
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
-from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
-from stcal.robot.identification.observability import MEANING
+from stcal.robot.identification.adjustment import MEANING, Observed, State, as_seen, tips_of
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
-from stcal.robot.identification.result import ERRORS, OUTLIER_WEIGHT, Identified
+from stcal.robot.identification.problem import GROSS
+from stcal.robot.identification.result import ERRORS, Identified
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_motions, links, torques
 from stcal.robot.kinematics.robot_model import Robot
@@ -43,7 +43,6 @@ DEVIATIONS = (
     " by hysteresis",
 )
 """What each σ of :class:`Deviations` is of."""
-ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
 
 
 def identified_report(result: Identified) -> Document:
@@ -58,12 +57,19 @@ def identified_report(result: Identified) -> Document:
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
     indices = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
     rows = result.adjustment.rows
+    gain, model = result.gain, "model: elastic" if result.model == "elastic" else ""
+    if gain is not None:
+        less, beyond = "less" if gain.gain_mm > 0 else "more", "" if gain.beyond_chance else "not "
+        model = (
+            f"model: {result.model}; rows held out err by {gain.rigid_mm:.3g} mm RMS of a rigid arm and "
+            f"{gain.elastic_mm:.3g} of an elastic one, {abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, "
+            f"{beyond}beyond chance"
+        )
+    adjusted = f"adjusted: base, tools and {(rows.free & ~rows.fixed).sum()} of {rows.free.sum()} dimensions"
     accuracy = [
         _noise(result),
-        f"adjusted: base, tools and {(rows.free & ~rows.fixed).sum()} of {rows.free.sum()} dimensions"
-        if rows.fixed.any()
-        else "",
-        _model(result),
+        adjusted if rows.fixed.any() else "",
+        model,
         Table(["<Error, mm", "mean", "RMS", "max"], errors),
         page_only(
             "Held out: rows that took no part in the fit that they judge. σ: of the tool's position, by the "
@@ -83,7 +89,7 @@ def identified_report(result: Identified) -> Document:
         listed("kept nominal, as the data do not determine it", result.undetermined),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
-    drawn = result.state, seen, result.residuals, result.weights >= OUTLIER_WEIGHT
+    drawn = result.state, seen, result.residuals, result.weights >= GROSS
     return Document(
         f"{result.nominal.name}: identified",
         f"robot {result.nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
@@ -128,19 +134,6 @@ def left_lines(left: Sequence[Finding] | None) -> list[str]:
     return [finding.sentence() for finding in left] or [nothing]
 
 
-def _model(result: Identified) -> str:
-    """Returns which model was chosen, and its gain."""
-    gain = result.gain
-    if gain is None:
-        return "model: elastic" if result.model == "elastic" else ""
-    less, beyond = "less" if gain.gain_mm > 0 else "more", "" if gain.beyond_chance else "not "
-    return (
-        f"model: {result.model}; rows held out err by {gain.rigid_mm:.3g} mm RMS of a rigid arm and "
-        f"{gain.elastic_mm:.3g} of an elastic one, {abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, "
-        f"{beyond}beyond chance"
-    )
-
-
 def _elastic_blocks(result: Identified) -> list[Block]:
     """Returns a table of each joint's deflection at the measured torques (RMS), gear error and hysteresis, with σ."""
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
@@ -152,24 +145,20 @@ def _elastic_blocks(result: Identified) -> list[Block]:
     about = (torque * rotation[..., 2]).sum(2)
     across = (torque**2).sum(2) - about**2
     rms = np.sqrt(np.stack([(about**2).mean(1), across.clip(0).mean(1)], axis=1))
-    columns = [*(elasticity.compliance * rms).T], [*(sigma.compliance * rms).T]
-    for pair in (slice(0, 2), slice(2, 4)):
-        columns[0].append(np.linalg.norm(elasticity.periodic[:, pair], axis=1))
-        columns[1].append(np.sqrt((sigma.periodic[:, pair] ** 2).mean(1)))
+    pairs, size = (slice(0, 2), slice(2, 4)), np.linalg.norm
+    own = [*(elasticity.compliance * rms).T, *(size(elasticity.periodic[:, p], axis=1) for p in pairs)]
+    deviation = [*(sigma.compliance * rms).T, *(size(sigma.periodic[:, p], axis=1) / np.sqrt(2) for p in pairs)]
+    heads = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
     if result.state.hysteresis:
-        columns[0].append(elasticity.hysteresis)
-        columns[1].append(sigma.hysteresis)
-    cells = MDEG * np.array(columns).T  # (n, columns, 2)
+        heads, own, deviation = [*heads, "hysteresis"], [*own, elasticity.hysteresis], [*deviation, sigma.hysteresis]
+    cells = MDEG * np.array([own, deviation]).T  # (n, columns, 2)
     return [
         subheading("Elasticity"),
         page_only(
             "Deflection of the links at the torques of the measured rows (RMS), and amplitudes of the gears and their "
             "hysteresis"
         ),
-        Table(
-            [*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])],
-            [[str(i), *(f"{value:.1f} ± {s:.1f}" for value, s in row)] for i, row in enumerate(cells, 1)],
-        ),
+        Table(heads, [[str(i), *(f"{value:.1f} ± {s:.1f}" for value, s in row)] for i, row in enumerate(cells, 1)]),
     ]
 
 
@@ -187,17 +176,15 @@ def placed_table(placed: Iterable[Placed]) -> Table:
 
 def _dh_tables(result: Identified) -> list[Table]:
     """Returns a table for each unit, with a row for each joint."""
-    values, before, sigma = (each * SHOWN for each in (result.rows, result.nominal_rows, result.dh_sigma))
+    values, before, sigma = (each * SHOWN for each in (result.rows, dh_values(result.nominal), result.dh_sigma))
     tables = []
     for unit in dict.fromkeys(UNITS):
-        kinds = [k for k in range(5) if UNITS[k] == unit]
-        lines = []
-        for i in range(len(values)):
-            cells = [str(i + 1)]
+        kinds, lines = [k for k in range(5) if UNITS[k] == unit], []
+        for i, kept in enumerate(sigma == 0, 1):
+            cells = [str(i)]
             for k in kinds:
-                kept = sigma[i, k] == 0
-                change = NONE if kept else number(values[i, k] - before[i, k], 4)
-                cells += [number(values[i, k], 4), change, "" if kept else f"{sigma[i, k]:.4f}"]
+                value, change = number(values[i - 1, k], 4), number(values[i - 1, k] - before[i - 1, k], 4)
+                cells += [value, NONE, ""] if kept[k] else [value, change, f"{sigma[i - 1, k]:.4f}"]
             lines.append(cells)
         heads = ["<joint", *["value", "change", "σ"] * len(kinds)]
         tables.append(Table(heads, lines, [("", 1), *((f"{DIMENSIONS[k]} ({unit})", 3) for k in kinds)]))
@@ -230,12 +217,11 @@ def _place(result: Identified, row: int) -> str:
 HEAD = ("joint", "parameter", "nominal", "identified", "difference", "sigma", "unit", "determined")
 DIGITS = {"mm": 6, "deg": 9}
 ZERO = "zero"
-LENGTH_AT, ANGLE_AT = DIMENSIONS.index("d"), DIMENSIONS.index("theta")
 
 
 def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the controller's values at its present 0, their σ, and a mask (n,) of determined ones: q + C⁻¹ Δθ."""
-    at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
+    at = np.where(nominal.prismatic, DIMENSIONS.index("d"), DIMENSIONS.index("theta"))
     joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
     change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]
     jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[joints, at]
@@ -260,19 +246,17 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
     str : CSV in mm and degrees, with σ (form: ``data_layout.md``).
     """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
+    unit = np.where(nominal.prismatic, 1.0, np.degrees(1.0))
     change, change_sigma, known = zeros(result, nominal)
     rows: list[Sequence] = [HEAD]
-
-    def row(joint: int, name: str, old: float, new: float, deviation: float, unit: str, told: bool) -> None:
-        shown = [fixed(v, DIGITS[unit]) for v in (old, new, new - old)]
-        sigma_text = fixed(deviation, DIGITS[unit]) if told else ""
-        rows.append([joint, name, *shown, sigma_text, unit, "yes" if told else "no"])
-
     for i, slides in enumerate(nominal.prismatic):
-        for name, unit, old, new, deviation in zip(DIMENSIONS, UNITS, before[i], values[i], sigma[i], strict=True):
-            row(i + 1, name, old, new, deviation, unit, deviation > 0)
-        factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
-        row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
+        told = sigma[i] > 0
+        cells = [*zip(DIMENSIONS, UNITS, before[i], values[i], sigma[i], told, strict=True)]
+        of_zero = unit[i] * change[i], unit[i] * change_sigma[i], bool(known[i])
+        for name, of, old, new, deviation, yes in (*cells, (ZERO, "mm" if slides else "deg", 0.0, *of_zero)):
+            shown = [fixed(v, DIGITS[of]) for v in (old, new, new - old)]
+            text = fixed(deviation, DIGITS[of]) if yes else ""
+            rows.append([i + 1, name, *shown, text, of, "yes" if yes else "no"])
     return csv_text(rows)
 
 
@@ -295,10 +279,8 @@ def joints_figure(
     data, chain = seen.data, state.chain
     tip = tips_of(state, data)
     twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]
-    values, n = data.q @ chain.coupling.T, len(chain)
-    errors = residuals[:, -3:]
-    across = min(n, 3)
-    down = -(-n // across)
+    values, errors = data.q @ chain.coupling.T, residuals[:, -3:]
+    across = min(len(chain), 3)
     turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
     points = []
     for i, (twist, sliding) in enumerate(zip(twists, chain.prismatic, strict=True)):
@@ -309,35 +291,27 @@ def joints_figure(
         at = values[seen.first[moves], i] * (1 if sliding else np.degrees(1))
         points.append((at, along, "mm" if sliding else "deg"))
     y = limits(np.concatenate([along for _, along, _ in points]))
+    down = -(-len(chain) // across)
     drawing = Drawing(9, 0.35 + 1.75 * down)
-    boxes = drawing.panels(across, down, gap=34)
-    for i, (box, (at, along, unit)) in enumerate(zip(boxes, points, strict=False)):
-        axes = Axes(drawing, box, limits(at), y)
+
+    def wave(degrees: np.ndarray, turns: int) -> np.ndarray:
+        """Returns a constant, a cosine and a sine, (m, 3), with ``turns`` periods a turn."""
+        angle = turns * np.radians(degrees)
+        return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
+
+    for i, (box, (at, along, unit)) in enumerate(zip(drawing.panels(across, down, gap=34), points, strict=False)):
+        axes, turns = Axes(drawing, box, limits(at), y), turns_of.get(i + 1)
         axes.frame(f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
         axes.level(0, "#9aa0a8")
         axes.marks(at, along, "dot", 3 if len(at) <= FEW else 1.4, colour)
-        if turns_of.get(i + 1) and len(at) > 3:
-            fitted = np.linalg.lstsq(_wave(at, turns_of[i + 1]), along, rcond=None)[0]
+        if turns and len(at) > 3:
+            fitted = np.linalg.lstsq(wave(at, turns), along, rcond=None)[0]
             x = np.linspace(at.min(), at.max(), 100)
-            axes.lines([(x, _wave(x, turns_of[i + 1]) @ fitted)], INK, 1.2)
+            axes.lines([(x, wave(x, turns) @ fitted)], INK, 1.2)
     return drawing
 
 
-def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
-    """Returns a constant, a cosine and a sine, (m, 3), with ``turns`` periods a turn."""
-    angle = turns * np.radians(degrees)
-    return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
-
-
-def residual_plot(
-    state: State,
-    seen: Observed,
-    residuals: np.ndarray,
-    good: np.ndarray,
-    findings: Iterable[Finding],
-    colour: str = COLOURS[0],
-) -> Html:
-    """Returns the figure of residuals by joint; see :func:`joints_figure`."""
+def residual_plot(*drawn) -> Html:
+    """Returns the figure of residuals by joint, of the arguments of :func:`joints_figure`."""
     caption = "Residual along each joint's own motion, by the joint's value; a curve where residuals go with its angle"
-    draw = partial(joints_figure, state, seen, residuals, good, findings, colour)
-    return plot(draw, "Residuals by joint", caption)
+    return plot(partial(joints_figure, *drawn), "Residuals by joint", caption)

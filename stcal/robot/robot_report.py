@@ -26,79 +26,59 @@ from stcal.report.document import (
 from stcal.report.svg import AXIS_COLOURS, COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.axes.axes_model import AxesResult
-from stcal.robot.axes.checks import Pair
-from stcal.robot.axes.fit import AxisFit
-from stcal.robot.axes.sweeps import called
-from stcal.robot.identification.adjustment import tips_of
-from stcal.robot.identification.observability import MEANING
+from stcal.robot.axes.fit import called
+from stcal.robot.identification.adjustment import MEANING, tips_of
 from stcal.robot.identification.prior import SHOWN
 from stcal.robot.identification.result import Figures
 from stcal.robot.identified_report import left_lines, placed_table, residual_plot
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.robot_model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
-from stcal.robot.use.evaluation import Evaluated, Evaluation, Verification
+from stcal.robot.use.evaluation import Evaluation, Verification
 from stcal.robot.use.pose_design import PoseDesign
-
-
-def _axis_cells(fit: AxisFit) -> list[str]:
-    length = fit.lengths()
-    sliding = len(fit.gain) == 2
-    deviation = np.sqrt(np.diag(fit.covariance))
-    return [
-        str(fit.joint + 1),
-        str(len(fit.arcs)),
-        str(len(length)),
-        f"{fit.span:.1f} mm" if sliding else f"{np.degrees(fit.span):.1f}°",
-        f"{fit.rms_mm:.4f}",
-        f"{length.mean():.4f}",
-        f"{rms(length):.4f}",
-        f"{1e6 * np.linalg.norm(deviation[:2]):.1f}",
-        NONE if sliding else f"{np.linalg.norm(deviation[2:]):.4f}",
-    ]
-
-
-def _pair_cells(pair: Pair, spread: np.ndarray) -> list[str]:
-    metres = [None if v is None else v / 1e3 for v in (pair.foot_mm, pair.foot_sigma_mm)]
-    lengths = (pair.distance_mm, pair.distance_sigma_mm, spread[0], pair.normal_mm, pair.normal_sigma_mm, spread[1])
-    return [
-        f"{pair.joint}–{pair.joint + 1}",
-        *(f"{np.degrees(angle):.4f}" for angle in (pair.angle_rad, pair.angle_sigma_rad)),
-        *(number(value, 4) for value in (*lengths, metres[0])),
-        number(metres[1], 5),
-        ("Hayati β" if pair.parallel else "D-H") + (", D-H refused" if pair.parallel and pair.refused else ""),
-    ]
 
 
 def axes_report(result: AxesResult, where: str) -> Document:
     """Returns the report of ``axes``."""
+    axes, pairs = [], []
+    for fit in result.fits:
+        length, sliding = fit.lengths(), fit.prismatic
+        deviation = np.sqrt(np.diag(fit.covariance))
+        span = f"{fit.span:.1f} mm" if sliding else f"{np.degrees(fit.span):.1f}°"
+        lengths = (f"{value:.4f}" for value in (fit.rms_mm, length.mean(), rms(length)))
+        place = NONE if sliding else f"{np.linalg.norm(deviation[2:]):.4f}"
+        cells = [str(fit.joint + 1), str(len(fit.arcs)), str(len(length)), span, *lengths]
+        axes.append([*cells, f"{1e6 * np.linalg.norm(deviation[:2]):.1f}", place])
+    spreads = [result.without_one.spread(name) for name in ("distance", "normal")]
+    for pair, distance, normal in zip(result.pairs, *spreads, strict=True):
+        angles = (f"{np.degrees(angle):.4f}" for angle in (pair.angle_rad, pair.angle_sigma_rad))
+        foot, foot_sigma = (None if v is None else v / 1e3 for v in (pair.foot_mm, pair.foot_sigma_mm))
+        lengths = (pair.distance_mm, pair.distance_sigma_mm, distance, pair.normal_mm, pair.normal_sigma_mm, normal)
+        kind = ("Hayati β" if pair.parallel else "D-H") + (", D-H refused" if pair.parallel and pair.refused else "")
+        cells = [*angles, *(number(value, 4) for value in (*lengths, foot)), number(foot_sigma, 5), kind]
+        pairs.append([f"{pair.joint}–{pair.joint + 1}", *cells])
     tools = [
         [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
-        for name, tool in result.robot.tools.items()
+        for name, tool in result.tools.items()
     ]
     rows = [
         [str(i), *(f"{v:.4f}" + (f" ± {s:.4f}" if s > 0 else "") for v, s in zip(*row, strict=True))]
         for i, row in enumerate(zip(result.rows * SHOWN, result.row_sigma * SHOWN, strict=True), 1)
     ]
-    spread = np.stack([result.without_one.spread(name) for name in ("distance", "normal")], axis=1)
     axis_heads = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "direction µrad", "place mm")
     pair_heads = ("joints", "angle °", "σ °", *("distance mm", "σ mm", "spread mm") * 2, "foot m", "σ m", "<row")
-    axes = [
+    of_axes = [
         page_only(
             "One fit for each joint over all arcs of all reflectors. Residuals: RMS of a coordinate (radial, axial), "
             "mean and RMS length of the points' vectors"
         ),
-        Table(axis_heads, [_axis_cells(fit) for fit in result.fits], [("", 4), ("residuals", 3), ("σ", 2)]),
+        Table(axis_heads, axes, [("", 4), ("residuals", 3), ("σ", 2)]),
         legend({"radial": AXIS_COLOURS[0], "axial (both across, if prismatic)": AXIS_COLOURS[2]}),
         plot(lambda: _residuals(result), "residuals of each joint's points", "Residuals, reflector by reflector"),
     ]
-    pairs = [
+    of_pairs = [
         *(f"D-H value of joints {p.joint}–{p.joint + 1} refused: {p.refused}" for p in result.pairs if p.refused),
-        Table(
-            pair_heads,
-            [_pair_cells(pair, spread[pair.joint - 1]) for pair in result.pairs],
-            [("", 3), ("robust", 3), ("common normal", 5), ("", 1)],
-        ),
+        Table(pair_heads, pairs, [("", 3), ("robust", 3), ("common normal", 5), ("", 1)]),
         f"spread: largest less smallest value when each of {len(result.without_one.lines)} rows (with its reflectors) "
         "is left out",
         page_only(
@@ -117,8 +97,8 @@ def axes_report(result: AxesResult, where: str) -> Document:
         f"Axes of {result.robot.name}",
         where,
         [
-            Section("Axes", axes, terminal=True),
-            Section("Pairs of axes", pairs, terminal=True),
+            Section("Axes", of_axes, terminal=True),
+            Section("Pairs of axes", of_pairs, terminal=True),
             Section("Robot", robot, terminal=True),
             Section("Notes", [bullets(result.notes)]),
         ],
@@ -127,13 +107,13 @@ def axes_report(result: AxesResult, where: str) -> Document:
 
 def _residuals(result: AxesResult) -> Drawing:
     drawing = Drawing(7.5, 2.9)
-    shown = {fit.joint + 1: fit.residuals[fit.weights > 0] for fit in result.fits}
-    values = np.concatenate([used[:, :2].ravel() for used in shown.values()])
-    joints = list(range(1, len(result.fits) + 1))
-    axes = Axes(drawing, drawing.panels()[0], (0.5, len(joints) + 0.5), limits([0, *values]))
+    shown = [fit.residuals[fit.weights > 0, :2] for fit in result.fits]
+    joints = list(range(1, len(shown) + 1))
+    extent = limits([0, *np.concatenate(shown).ravel()])
+    axes = Axes(drawing, drawing.panels()[0], (0.5, len(joints) + 0.5), extent)
     axes.frame("joint", "residual, mm", "y", (joints, list(map(str, joints))))
     axes.level(0)
-    for joint, used in shown.items():
+    for joint, used in zip(joints, shown, strict=True):
         at = joint + (np.linspace(-0.3, 0.3, len(used)) if len(used) > 1 else np.zeros(1))
         for k in range(2):
             axes.marks(at, used[:, k], "dot", 2.4, AXIS_COLOURS[2 * k])
@@ -162,11 +142,16 @@ def verification_figure(result: Verification) -> Drawing:
 
 def verification_report(result: Verification) -> Document:
     """Returns the report of ``verify``."""
+
+    def reduced(k: int, name: str) -> str:
+        """Returns by how much a figure is less, per cent; none where the first one is 0."""
+        less = result.reduction(k)[name] if k else np.nan
+        return NONE if not np.isfinite(less) else f"{less:.1f} %" if less >= 0 else f"{-less:.1f} % more"
+
     rows = []
     for k, each in enumerate(result.sets):
-        reduced = result.reduction(k) if k else {}
-        cells = [(number(v, 4), _percent(reduced[key]) if k else NONE) for key, v in each.figures().items()]
-        rows.append([each.name, *(cell for pair in cells for cell in pair)])
+        pairs = ((number(value, 4), reduced(k, name)) for name, value in each.figures().items())
+        rows.append([each.name, *(cell for pair in pairs for cell in pair)])
     over = [("", 1), ("mean", 2), ("std", 2), ("max", 2), ("RMS of all pairs", 2)]
     errors = [
         [pose, number(distance, 3), *(number(each.error_mm[i], 4) for each in result.sets)]
@@ -183,67 +168,45 @@ def verification_report(result: Verification) -> Document:
             "Dashed: mean of the set of the same colour",
         ),
     ]
+    table = Table(["pose", "commanded distance mm", *(f"{e.name}: error mm" for e in result.sets)], errors)
     return Document(
         "Verification",
         f"{result.where}: distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), "
         "measured against commanded",
-        [
-            Section("Result", answer, terminal=True),
-            Section(
-                "Poses",
-                [Table(["pose", "commanded distance mm", *(f"{e.name}: error mm" for e in result.sets)], errors)],
-            ),
-        ],
+        [Section("Result", answer, terminal=True), Section("Poses", [table])],
     )
-
-
-def _percent(less: float) -> str:
-    """Returns by how much a figure is less, per cent; none where the first one is 0."""
-    if not np.isfinite(less):
-        return NONE
-    return f"{less:.1f} %" if less >= 0 else f"{-less:.1f} % more"
 
 
 def compensation_report(result: Compensated) -> Document:
     """Returns the report of ``compensate``: nominal and compensated joint values of each pose."""
-    robot = result.identified
-    counts = ", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status))
+    robot, found, named = result.identified, result.found, any(result.targets.tools)
+    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
+
+    def values(inverse: Inverse, i: int, error_mm: np.ndarray) -> list[str]:
+        shown = [number(v, 5) for v in inverse.q[i] * unit] if inverse.usable[i] else [NONE] * len(unit)
+        return [*shown, number(error_mm[i], 4) if inverse.usable[i] or inverse is found else NONE]
+
+    rows = []
+    for i, (line, tool) in enumerate(zip(result.targets.lines, result.targets.tools, strict=True)):
+        name = [str(line), *([tool or NONE] if named else []), found.status[i]]
+        rows.append([*name, "compensated", *values(found, i, found.error_mm)])
+        if result.nominal:
+            rows.append([*[""] * len(name), "nominal", *values(result.nominal, i, result.before_mm)])
+    counts = ", ".join(f"{s} {found.status.count(s)}" for s in dict.fromkeys(found.status))
     joints = [name.replace("_", " ") for name in joint_columns(robot)]
-    heads = ["line", *(["<target"] if any(result.targets.tools) else []), "<status", "<", *joints, "error mm"]
+    heads = ["line", *(["<target"] if named else []), "<status", "<", *joints, "error mm"]
     reached, *summary = compensated_summary(result)
-    usable = result.found.usable
-    answer = Answer("yes" if usable.all() else "part" if usable.any() else "no", reached)
+    answer = Answer("yes" if found.usable.all() else "part" if found.usable.any() else "no", reached)
     return Document(
         f"Compensation of {robot.name}",
         f"{len(result)} poses: {counts}",
         [
             Section("Result", summary, terminal=True),
             Section("To know", [bullets(result.remarks[:MOST_NOTES])]),
-            Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
+            Section("Joint values", [Table(heads, rows)], terminal=True),
         ],
         [answer],
     )
-
-
-def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
-    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
-    n, named = len(robot.prismatic), any(result.targets.tools)
-
-    def values(inverse: Inverse, i: int) -> list[str]:
-        return [number(v, 5) for v in inverse.q[i] * unit] if inverse.usable[i] else [NONE] * n
-
-    rows = []
-    for i in range(len(result)):
-        name = [
-            str(result.targets.lines[i]),
-            *([result.targets.tools[i] or NONE] if named else []),
-            result.found.status[i],
-        ]
-        rows.append([*name, "compensated", *values(result.found, i), number(result.found.error_mm[i], 4)])
-        if result.nominal:
-            error = number(result.before_mm[i], 4) if result.nominal.usable[i] else NONE
-            rows.append([*[""] * len(name), "nominal", *values(result.nominal, i), error])
-    return rows
 
 
 def design_report(result: PoseDesign, robot: Robot) -> Document:
@@ -311,31 +274,28 @@ HEADS = ("rows", "mean", "median", "RMS", "95 %", "max")
 def names_of(files: Sequence[Path]) -> list[str]:
     """Returns names of robots by their files. An identified robot keeps the name of the nominal one."""
     stems, whole = [file.stem for file in files], [str(file) for file in files]
-    if len(set(whole)) < len(whole):
-        again = next(name for name in whole if whole.count(name) > 1)
+    again = next((name for name in whole if whole.count(name) > 1), "")
+    if again:
         raise InputError("E-OPTION-REPEATED", f"--robot {again}: given twice; give each file once")
     return stems if len(set(stems)) == len(stems) else whole
 
 
-def _table(result: Evaluation) -> Table:
+def _errors(result: Evaluation) -> Table:
     """Returns the errors of all observations, and of those without the wrong ones if there are any."""
     turned = any(each.orientation_rad for each in result.robots)
     heads, rows = ["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())], []
     for each in result.robots:
-        parts = {"": np.ones(len(each.good), bool), ", without unexplained": each.good}
+        parts = {"": np.ones_like(each.good)} | ({", without unexplained": each.good} if result.wrong.any() else {})
         for said, taken in parts.items():
-            if said and not result.wrong.any():
-                continue
             figures = Figures.of(each.errors_mm[taken])
             cells = [each.name + said, str(figures.rows), *(number(getattr(figures, f), 4) for f in FIGURES)]
-            if turned:
-                rotation = Figures.of(np.degrees(each.rotation_rad[taken]))
-                cells += [number(rotation.rms, 4), number(rotation.max, 4)]
-            rows.append(cells)
+            rotation = Figures.of(np.degrees(each.rotation_rad[taken])) if turned else None
+            rows.append(cells + ([number(rotation.rms, 4), number(rotation.max, 4)] if rotation else []))
     return Table(heads, rows)
 
 
 def _verdicts(result: Evaluation) -> list[str]:
+    """Returns which robot is better, and the rows that no robot explains."""
     found = []
     for each in result.differences:
         size = f"{each.mm:.3g} ± {each.sigma_mm:.2g} mm"
@@ -343,32 +303,20 @@ def _verdicts(result: Evaluation) -> list[str]:
             found.append(f"robot {each.better} is better than {each.worse}: mean error {size} less, on the same rows")
         else:
             found.append(f"robots {each.better} and {each.worse} differ by no more than chance: mean error {size}")
-    return [*found, *([f"best: {result.best}"] if result.best and len(result.robots) > 2 else [])]
-
-
-def _wrong(result: Evaluation) -> list[str]:
-    at = np.flatnonzero(result.wrong)
-    if not len(at):
-        return []
+    if result.best and len(result.robots) > 2:
+        found.append(f"best: {result.best}")
     least = np.min([each.errors_mm for each in result.robots], axis=0)
+    at = np.flatnonzero(result.wrong)
     at = at[np.argsort(-least[at])].tolist()
-    named = ", ".join(f"line {result.lines[i]} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG])
-    more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
-    fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
-    return [
-        f"rows that no robot explains (the least error that any of them leaves): {named}{more}{fitted}; the rows are "
-        "wrong, or all models lack something"
-    ]
-
-
-def _beyond(each: Evaluated) -> list[str]:
-    """Returns whether parameters of the kinematics explain what a robot leaves."""
-    if not each.left or each.beyond is None:
-        return []
-    if not each.beyond:
-        return ["parameters identified from these rows would explain all of it"]
-    beyond = "; ".join(finding.what for finding in each.beyond)
-    return [f"parameters of the kinematics do not explain all of it; what remains depends on {beyond}"]
+    if at:
+        named = ", ".join(f"line {result.lines[i]} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG])
+        more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
+        fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
+        found.append(
+            f"rows that no robot explains (the least error that any of them leaves): {named}{more}{fitted}; the rows "
+            "are wrong, or all models lack something"
+        )
+    return found
 
 
 @require_arguments
@@ -385,14 +333,21 @@ def evaluated_csv(result: Evaluation) -> str:
     """
     data, robots, seen = result.seen.data, result.robots, result.seen.first
     turned = data.rotations is not None
+
+    def cells(values: Iterable) -> list[str]:
+        return [f"{value:.6f}" for value in values]
+
+    def places(head: str, xyz: np.ndarray) -> list[tuple[str, Iterable]]:
+        return [(head.format(axis), cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
+
     columns: list[tuple[str, Iterable]] = [("line", data.lines), ("target", data.targets)]
     joints = (joint_cells(robots[0].robot, q) for q in data.q)
     columns += zip(joint_columns(robots[0].robot), zip(*joints, strict=True), strict=True)
     if data.positions is not None:
-        columns += _places("{}_mm", data.positions)
+        columns += places("{}_mm", data.positions)
     else:
         distances, from_row = data.lengths()
-        columns += [("distance_mm", _cells(distances)), ("from_row", from_row + 1)]
+        columns += [("distance_mm", cells(distances)), ("from_row", from_row + 1)]
     if turned:
         quaternions = [[f"{v:.12f}" for v in column] for column in data.poses().quaternions().T]
         columns += zip(QUATERNION, quaternions, strict=True)
@@ -404,39 +359,25 @@ def evaluated_csv(result: Evaluation) -> str:
         residuals[seen] = each.residuals
         if data.positions is not None:
             place = "commanded" if len(robots) == 1 else name
-            columns += _places(f"{place}_{{}}_mm", tips_of(each.state, data).translation)
-            columns += _places(f"{name}_residual_{{}}_mm", residuals)
+            columns += places(f"{place}_{{}}_mm", tips_of(each.state, data).translation)
+            columns += places(f"{name}_residual_{{}}_mm", residuals)
         else:
-            columns.append((f"{name}_residual_mm", _cells(residuals[:, 0])))
-        columns.append((f"{name}_error_mm", _cells(np.linalg.norm(residuals, axis=1))))
+            columns.append((f"{name}_residual_mm", cells(residuals[:, 0])))
+        columns.append((f"{name}_error_mm", cells(np.linalg.norm(residuals, axis=1))))
         if turned:
-            columns.append((f"{name}_error_deg", _cells(np.degrees(each.rotation_rad))))
-    heads, cells = zip(*columns, strict=True)
-    return csv_text([heads, *zip(*cells, strict=True)])
-
-
-def _places(head: str, xyz: np.ndarray) -> list[tuple[str, list[str]]]:
-    """Returns the columns of places (m, 3) with their heads."""
-    return [(head.format(axis), _cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
-
-
-def _cells(values) -> list[str]:
-    return [f"{v:.6f}" for v in values]
+            columns.append((f"{name}_error_deg", cells(np.degrees(each.rotation_rad))))
+    heads, values = zip(*columns, strict=True)
+    return csv_text([heads, *zip(*values, strict=True)])
 
 
 def evaluation_report(result: Evaluation) -> Document:
     """Returns the report of ``evaluate``: errors of each robot, the better one, and the effects found in residuals."""
-    seen, conditions = result.seen, result.seen.data.conditions
+    seen = result.seen
+    rigid = (each for each in result.robots if each.robot.elasticity is None)
     answer: list[Block] = [
-        _table(result),
+        _errors(result),
         *_verdicts(result),
-        *_wrong(result),
-        *(
-            note
-            for each in result.robots
-            if each.robot.elasticity is None
-            for note in conditions.ignored(f"robot {each.name}")
-        ),
+        *(note for each in rigid for note in seen.data.conditions.ignored(f"robot {each.name}")),
         page_only(
             "95 %: limit that 95 of 100 rows do not exceed. A few bad rows do not change the median, and the lines "
             "without rows that no robot explains"
@@ -447,9 +388,14 @@ def evaluation_report(result: Evaluation) -> Document:
     for each, colour in zip(result.robots, cycle(COLOURS)):
         base = each.robot.world_from_base
         found = each.residuals @ base.rotation.T if each.residuals.shape[1] == 3 else each.residuals
+        lines = left_lines(each.left)
+        if each.left and each.beyond is not None:
+            beyond = "; ".join(finding.what for finding in each.beyond)
+            said = f"parameters of the kinematics do not explain all of it; what remains depends on {beyond}"
+            lines.append(said if beyond else "parameters identified from these rows would explain all of it")
         robots += [
             subheading(each.name),
-            *(f"{each.name}: {line}" for line in (*left_lines(each.left), *_beyond(each))),
+            *(f"{each.name}: {line}" for line in lines),
             residual_plot(each.state, seen, found, each.good, each.left or (), colour),
             page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
             page_only(placed_table(each.placed)),

@@ -42,7 +42,7 @@ from stcal.robot import (
     robot_toml,
 )
 from stcal.robot.axes.axes_model import AxesFile, AxesResult
-from stcal.robot.axes.sweeps import find_arcs, length_of, ring
+from stcal.robot.axes.fit import find_arcs, length_of, ring
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
 from stcal.robot.identified_report import identified_report
 from stcal.robot.kinematics.measurements import joint_values, targets_of

@@ -8,9 +8,9 @@ from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
+from stcal.robot.descriptions import load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
-from stcal.robot.urdf import load_urdf
 from tests.outcome import fails_with, refuses
 
 TAGS = 'type = "tags"\n' + "".join(

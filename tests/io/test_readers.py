@@ -20,9 +20,8 @@ from stcal.handeye.data.pose_files import read_pairs, require_own
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
+from stcal.robot.descriptions import is_conf, kinematics_content, load_urdf, robot_of_conf, robot_of_kinematics
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
-from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
-from stcal.robot.urdf import load_urdf
 from stcal.sfm.budget.combine import statement_of
 from stcal.workflows.robot_at_images import read_robot_poses
 

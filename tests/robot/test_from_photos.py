@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import require_new_folder, save_folder
 from stcal.io.images import Skipped
 from stcal.io.table import Table, pose_cells, read_table
-from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import Robot, mh80
@@ -119,21 +118,6 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_to
         assert f'<th scope="row">{line}</th>' in page
 
 
-@pytest.mark.full
-def test_the_sigma_at_the_targets_is_that_of_the_errors_there():
-    """Of 20 arms. All targets of an arm share the target's depth, which errs most: the mean is about that of 20 squares
-    of normal numbers, 1 ± 0.32."""
-    missed = []
-    for seed in range(20):
-        cell = Cell(seed)
-        q = np.concatenate([SWEEPS, cell.about(30)])
-        found = work.from_measured(
-            "views", cell.measured(q), joint_table(q), mh80(), wanted(cell.about(12)), IdentifyOptions(folds=0)
-        )
-        missed.append(cell.missed(found))
-    assert 0.3 < np.mean(missed) < 2
-
-
 @pytest.mark.slow
 def test_files_are_read_by_the_next_step(tmp_path, swept):
     save_folder(tmp_path / "arm", files_of(swept))
@@ -156,19 +140,6 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     names = {f"{step}.{kind}" for step in ("poses", "identified") for kind in ("json", "html")}
     assert set(files_of(found)) == names | {"poses.csv", "identified.toml", "report.html"}
     assert found.errors["as drawn"].rms > 5 * found.errors["identified, the same rows"].rms
-
-
-@pytest.mark.full
-def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
-    def unsettled(*_, **__):
-        raise ConvergenceError("E-TEST", "joint 2: no minimum; measure a longer sweep")
-
-    monkeypatch.setattr(work, "robot_from_sweeps", unsettled)
-    q = np.concatenate([SWEEPS, cell.about(5)])
-    found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
-    assert found.axes is None
-    assert "the axis method was left out: joint 2: no minimum; measure a longer sweep" in story(found)
-    assert found.identified.rank == 30
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.descriptions import LINKS, is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, save_robot
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
-from stcal.robot.universal import LINKS, is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from tests.outcome import fails_with
 
 UR5E = {
@@ -108,23 +108,21 @@ def test_the_yaml_of_ur_calibration(convention):
 
 @pytest.mark.parametrize("with_nominal", [False, True])
 def test_calibration_conf(with_nominal):
+    """Tools and base of the nominal arm stay."""
     lists = (
         f"{key} = [{', '.join(map(repr, map(float, values)))}]"
         for key, values in (("a", A), ("d", D), ("alpha", ALPHA))
     )
     text = CONF if with_nominal else "[DH]\n" + "\n".join(lists) + "\n" + CONF
     assert is_conf(text)
-    robot = robot_of_conf(text, "calibration.conf", nominal() if with_nominal else None, "standard")
-    np.testing.assert_allclose(poses(robot), [by_rows(q) for q in Q], atol=ROUNDING_MM)
-    assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
-
-
-def test_tools_and_base_of_the_nominal_arm_stay():
-    base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
-    given = nominal(world_from_base=base, tools={"": tool})
-    robot = robot_of_conf(CONF, "calibration.conf", given, "standard")
+    base = tool = Rigid()
+    if with_nominal:
+        base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
+    given = nominal(world_from_base=base, tools={"": tool}) if with_nominal else None
+    robot = robot_of_conf(text, "calibration.conf", given, "standard")
     wanted = [base.matrix() @ by_rows(q) @ tool.matrix() for q in Q]
     np.testing.assert_allclose(poses(robot), wanted, atol=ROUNDING_MM)
+    assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
 
 
 @pytest.mark.parametrize(

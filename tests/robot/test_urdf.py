@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.descriptions import load_urdf, require_urdf_written, robot_urdf
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
-from stcal.robot.urdf import load_urdf, require_urdf_written, robot_urdf
 from tests.outcome import fails_with
 from tests.support.arms import two_arms
 
@@ -49,8 +49,10 @@ def world_poses(robot: Robot, q: np.ndarray, tool: str):
     return robot.world_from_base @ forward(robot, q, tool)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("convention", ["standard", "modified"])
+@pytest.mark.parametrize(
+    ("name", "convention"),
+    [*((name, "standard") for name in ROBOTS), ("example", "modified"), ("prismatic", "modified")],
+)
 def test_there_and_back(name, convention, tmp_path):
     robot = ROBOTS[name]
     (tmp_path / "a.urdf").write_text(robot_urdf(robot))

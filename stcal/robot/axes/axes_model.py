@@ -1,33 +1,34 @@
 """The robot from the axes of all joints: Denavit–Hartenberg rows, tools, their σ, and what to refuse."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain, combinations, pairwise
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from stcal.errors import InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile
 from stcal.parallel import one_thread
-from stcal.robot.axes.checks import (
-    LeaveOneOut,
-    Pair,
-    chain_through,
-    jacobian_by_axes,
-    leave_one_out,
-    off_mm,
-    pairs_of,
-    remarks,
-    require_like_nominal,
-    sigma_of,
+from stcal.robot.axes.fit import (
+    GROSS,
+    REWEIGHTINGS,
+    STILL_RAD,
+    TINY,
+    AxisFit,
+    called,
+    find_arcs,
+    fit_axes,
+    virtual_reflectors,
 )
-from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
-from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
+from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.prior import dh_values
+from stcal.robot.identification.unexplained import moved_meanwhile
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
+from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import RobotText
 from stcal.robot.kinematics.robot_model import Chain, Robot
@@ -37,19 +38,66 @@ Rows = Annotated[list[list[Finite]], BeforeValidator(lambda rows: np.asarray(row
 """Rows of numbers, null where there is none."""
 TOOL_GROSS = 6.0
 """Distance, in median distances, beyond which a row does not count for a reflector's place on the flange."""
+USABLE_MM = 1.0
+"""σ of a common normal's length or foot beyond which the Denavit–Hartenberg value is refused: arms repeat to 0.1 mm."""
+STEP_RAD, STEP_MM = 1e-7, 1e-4
+"""Steps of central differences: far above rounding, and small against angles to which an axis is known."""
+EXACTLY = 1e-12
+"""Sine of the angle of two axes below which rounding alone decides where their common normal is."""
+LIKELY, MANY = 2.0, 4
+"""Factor by which a mirror may fit worse than reversed joints, and number of these from which on they are not tried."""
+LIKE_SIZE = 2.0
+"""Largest ratio of the distances between axes to the nominal ones, or of these to them; wrong units differ by more."""
+AGREES_RAD = np.radians(10.0)
+"""Largest difference of axes and joint zeros from a nominal robot that is the same, and counts alike."""
+MOVED_SHARE = 0.5
+"""Share of the squared residuals beyond which a move along the order of the rows is named: gear errors vary with the
+order too."""
+FEW = 3
+"""Largest number of outliers of a joint that are named one by one."""
+ONE_LINE_MM = 10.0
+"""Largest distance between axes that are meant to be one line, such as those of a SCARA's spindle."""
+REFITTED = 200
+"""Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Pair:
+    """Two consecutive axes; :class:`AxesFile` describes the fields (``pairs``). None along prismatic joints."""
+
+    joint: int
+    angle_rad: float
+    angle_sigma_rad: float
+    parallel: bool
+    distance_mm: float | None = None
+    distance_sigma_mm: float | None = None
+    normal_mm: float | None = None
+    normal_sigma_mm: float | None = None
+    foot_mm: float | None = None
+    foot_sigma_mm: float | None = None
+    refused: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeaveOneOut:
+    """The values of each pair without one row of the sweeps. ``lines`` : first line of each row left out; ``distance``,
+    ``normal`` : (r, n − 1) mm, as in :class:`Pair`, or nan."""
+
+    lines: tuple[int, ...]
+    distance: np.ndarray
+    normal: np.ndarray
+
+    def spread(self, name: str) -> np.ndarray:
+        """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""
+        values = getattr(self, name)
+        known = np.isfinite(values)
+        high, low = np.where(known, values, -np.inf).max(axis=0), np.where(known, values, np.inf).min(axis=0)
+        return np.where(known.any(axis=0), high - low, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxesResult:
-    """A robot by the axis method.
-
-    ``fits`` : one for each joint, with the joints before it at zero; ``covariance`` : (p, p) of all axes together, 4 or
-    2 parameters of each in its own frame, including what each axis inherits from the unwinding of those before;
-    ``robot`` : its rows, base and tools; ``row_sigma`` : (n, 5) of a, alpha, d, theta, beta (mm, rad), 0 where the
-    nominal value is kept; ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the
-    axes; ``off`` : for each axis, lines of the rows that were left out and how far they are off their arcs, mm;
-    ``notes`` : what was passed over.
-    """
+    """A robot by the axis method; :class:`AxesFile` describes the fields. ``chain`` : the axes as measured."""
 
     format: ClassVar = "stcal axes 1"
     fits: tuple[AxisFit, ...]
@@ -140,7 +188,7 @@ def robot_from_sweeps(
     still_rad : change of a revolute joint's value up to which the joint stands still.
     places : (k, 3) array, optional
         Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
-        too: those of :func:`~stcal.robot.axes.sweeps.ring`, or points of a real target. If None, positions alone
+        too: those of :func:`~stcal.robot.axes.fit.ring`, or points of a real target. If None, positions alone
         are used.
 
     Returns
@@ -165,19 +213,18 @@ def robot_from_sweeps(
             "E-STATION-SINGLE",
             f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
         )
-    measured, virtual = data, None if places is None else virtual_reflectors(data, places)
-    data = data if virtual is None else virtual.data
     if nominal.tree is not None:
         raise InputError(
             "E-ROBOT-TREE",
             f"robot {nominal.name} is a tree of joints; the axis method takes one arm at a time: give its file",
         )
+    measured, virtual = data, None if places is None else virtual_reflectors(data, places)
+    data = data if virtual is None else virtual.data
     arcs, notes = find_arcs(data, nominal, still_rad)
-    notes = [*data.notes, *notes]
     fits, covariance, unwound, passed = fit_axes(data, nominal, arcs, virtual)
     frames = [fit.world_from_axis for fit in fits]
-    require_like_nominal(data.where, frames, nominal)
-    axes = chain_through(frames, nominal)
+    _require_like_nominal(data.where, frames, nominal)
+    axes = _chain_through(frames, nominal)
     tools, spread = _tools(data, frames[-1], unwound)
     if virtual is not None:
         tools, spread = virtual.tools(tools, spread)
@@ -187,11 +234,11 @@ def robot_from_sweeps(
         robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
 
     def row_values(frames: list[Rigid]) -> np.ndarray:
-        return dh_values(robot_from_chain(chain_through(frames, nominal), {}, nominal)).ravel()
+        return dh_values(robot_from_chain(_chain_through(frames, nominal), {}, nominal)).ravel()
 
-    row_sigma = sigma_of(jacobian_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
+    row_sigma = _sigma_of(_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
-    notes += remarks(measured, data, fits, robot, nominal)
+    notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot, nominal)]
     notes += [
         f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"
@@ -206,8 +253,8 @@ def robot_from_sweeps(
         row_sigma=row_sigma,
         tool_spread_mm=spread,
         pairs=pairs,
-        without_one=leave_one_out(data, fits, nominal, passed),
-        off=tuple({int(data.lines[row]): size for row, size in off_mm(fit).items()} for fit in fits),
+        without_one=_leave_one_out(data, fits, nominal, passed),
+        off=tuple({int(data.lines[row]): size for row, size in fit.off_mm.items()} for fit in fits),
         notes=tuple(notes),
     )
 
@@ -224,3 +271,269 @@ def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
         tools[name] = Rigid(np.eye(3), place)
         spread[name] = float(np.sqrt(((points[good] - place) ** 2).sum(axis=1).mean()))
     return tools, spread
+
+
+def _chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
+    """Returns the chain through the axes; the flange is the last joint's frame."""
+    gaps = [frames[0], *(a.inverse() @ b for a, b in pairwise(frames))]
+    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
+    return Chain(rotation, translation, Rigid(), nominal.prismatic, nominal.coupling)
+
+
+def _by_axes(function: Callable[[list[Rigid]], np.ndarray], frames: list[Rigid], robot: Robot) -> np.ndarray:
+    """Returns the derivative (v, p) of a function of the axes by their parameters, each in its own frame."""
+    columns = []
+    for i, sliding in enumerate(robot.prismatic):
+        for component in (0, 1) if sliding else (0, 1, 3, 4):
+            step = STEP_RAD if component < 3 else STEP_MM
+            twist = step * np.eye(6)[component]
+            high, low = (
+                function([*frames[:i], frames[i] @ Rigid.exp(sign * twist), *frames[i + 1 :]]) for sign in (1, -1)
+            )
+            columns.append((high - low) / (2 * step))
+    return np.column_stack(columns)
+
+
+def _sigma_of(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Returns σ (v,) of values from their ``jacobian`` (v, p) by parameters with this covariance (p, p)."""
+    return np.sqrt(np.maximum(np.einsum("vp,pq,vq->v", jacobian, covariance, jacobian), 0))
+
+
+def _pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
+    """Returns values (6 (n − 1),) of the pairs: the acute angle as a vector (3), the rows' distance, and the common
+    normal's length and foot from the axis's origin (nan with a prismatic joint)."""
+    robot = robot_from_chain(_chain_through(frames, nominal), {}, nominal)
+    values = np.full((len(frames) - 1, 6), np.nan)
+    for i, (axis, next_axis) in enumerate(pairwise(frames)):
+        across = np.cross(axis.rotation[:, 2], next_axis.rotation[:, 2])
+        square = across @ across
+        sine = np.sqrt(square)
+        acute = np.arctan2(sine, abs(axis.rotation[:, 2] @ next_axis.rotation[:, 2]))
+        values[i, :3] = across * (acute / sine if sine > EXACTLY else 1.0)
+        if nominal.prismatic[i] or nominal.prismatic[i + 1]:
+            continue
+        between = next_axis.translation - axis.translation
+        values[i, 3] = robot.rows[i if nominal.convention == "standard" else i + 1].a
+        if sine > EXACTLY:
+            values[i, 4:] = between @ across / sine, np.cross(between, next_axis.rotation[:, 2]) @ across / square
+    return values.ravel()
+
+
+def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple[Pair, ...]:
+    """Returns the pairs of consecutive axes with their σ from the covariance (p, p) of all axes."""
+    values = _pair_values(frames, robot).reshape(-1, 6)
+    jacobians = _by_axes(lambda f: _pair_values(f, robot), frames, robot).reshape(len(values), 6, -1)
+    size = sum(abs(row.a) + abs(row.d) for row in robot.rows)
+    pairs = []
+    for i, (value, jacobian) in enumerate(zip(values, jacobians, strict=True)):
+        acute = float(np.linalg.norm(value[:3]))
+        opposed = frames[i].rotation[:, 2] @ frames[i + 1].rotation[:, 2] < 0
+        spread = jacobian[:3] @ covariance @ jacobian[:3].T  # of the angle's vector
+        # of exactly parallel axes the largest σ of that
+        variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
+        pair = Pair(
+            joint=i + 1,
+            angle_rad=np.pi - acute if opposed else acute,
+            angle_sigma_rad=float(np.sqrt(max(variance, 0))),
+            parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
+        )
+        if np.isfinite(value[3]):
+            pair = _with_lengths(pair, acute, value[3:], _sigma_of(jacobian[3:], covariance), size)
+        pairs.append(pair)
+    return tuple(pairs)
+
+
+def _with_lengths(pair: Pair, angle: float, value: np.ndarray, sigma: np.ndarray, size: float) -> Pair:
+    """Returns the pair with its lengths, and why Denavit and Hartenberg's must not be used, if so."""
+    distance, normal, foot = (float(v) for v in value)
+    pair = replace(pair, distance_mm=abs(distance), distance_sigma_mm=float(sigma[0]))
+    if not np.isfinite(foot):
+        return replace(pair, refused="the axes are parallel: every common normal is as good as any other")
+    reasons = []
+    if abs(foot) > size:
+        reasons.append(f"foot {abs(foot) / 1e3:.4g} m away, the arm is {size / 1e3:.3g} m long")
+    if max(sigma[1:]) > USABLE_MM:
+        reasons.append(f"σ {sigma[1]:.3g} mm of a and {sigma[2] / 1e3:.3g} m of the foot, {USABLE_MM:g} mm needed")
+    if reasons:
+        per_urad = abs(distance) / np.sin(angle) ** 2 * 1e-6
+        reasons.append(f"axes {np.degrees(angle):.4f}° apart, 1 µrad moves the foot by {per_urad / 1e3:.3g} m")
+    return replace(
+        pair,
+        normal_mm=abs(normal),
+        normal_sigma_mm=float(sigma[1]),
+        foot_mm=foot,
+        foot_sigma_mm=float(sigma[2]),
+        refused="; ".join(reasons),
+    )
+
+
+def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns cosines, moments and triple products of directed axes, and their signs after a mirror."""
+    size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
+    found = []
+    for i, k in combinations(range(len(z)), 2):
+        found.append((z[i] @ z[k], 1 if sliding[i] == sliding[k] else -1))
+        if not sliding[i] and not sliding[k]:
+            found.append(((origin[k] - origin[i]) @ np.cross(z[i], z[k]) / size, -1))
+    for i, j, k in combinations(range(len(z)), 3):
+        found.append((z[i] @ np.cross(z[j], z[k]), -1 if (sliding[i] + sliding[j] + sliding[k]) % 2 else 1))
+    values, mirrored = np.array(found).T
+    return values, mirrored
+
+
+def _apart(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> float:
+    """Returns the sum of the distances of revolute axes; of two nearly parallel ones, the distance across them."""
+    total = 0.0
+    for i, k in combinations(np.flatnonzero(~sliding), 2):
+        between, normal = origin[k] - origin[i], np.cross(z[i], z[k])
+        sine = np.linalg.norm(normal)
+        parallel = sine < np.sin(AGREES_RAD)
+        total += np.linalg.norm(np.cross(between, z[i])) if parallel else abs(between @ normal) / sine
+    return float(total)
+
+
+def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> None:
+    """Refuses mirrored positions, joints with reversed sign, and an arm of another build."""
+    n, sliding = len(frames), nominal.prismatic
+    rotation, origins = joint_frames(nominal.chain(), np.zeros((1, n)))
+    wanted, origin = rotation[:, 0, :, 2], origins[:, 0]
+    directions, places = np.array([f.rotation[:, 2] for f in frames]), np.array([f.translation for f in frames])
+    shape, _ = _shape(wanted, origin, sliding)
+    values, mirror = _shape(directions, places, sliding)
+    as_it_is, mirrored = (float(np.linalg.norm(v - shape)) for v in (values, values * mirror))
+    reversed_ = {}
+    for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY)):
+        sign = np.where(np.isin(np.arange(n), flipped), -1.0, 1.0)[:, None]
+        reversed_[flipped] = np.linalg.norm(_shape(directions * sign, places, sliding)[0] - shape)
+    best = min(reversed_, key=lambda flipped: reversed_[flipped])
+    apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
+    named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
+    checks = [
+        (
+            mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best],
+            "E-AXES-MIRRORED",
+            f"the axes are the mirror image of {robot}'s: positions of a left-handed frame (or joints that count the "
+            "other way); swap two columns of x, y, z or change the sign of one",
+        ),
+        (
+            reversed_[best] < as_it_is / 2,
+            "E-AXES-SIGN",
+            f"joint {named} counts against {robot}'s; correct alpha in the robot file or the sign of its values",
+        ),
+        (
+            right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE,
+            "E-AXES-UNITS",
+            f"the axes lie {apart / (right or 1.0):.3g} times as far apart as {robot}'s; check the unit of x, y, z, "
+            "and the lengths in the robot file",
+        ),
+    ]
+    angles = [np.degrees(np.arccos(np.clip((z[:-1] * z[1:]).sum(1), -1, 1))) for z in (directions, wanted)]
+    for i, (angle, nominal_angle) in enumerate(zip(*angles, strict=True), 1):
+        said = f"axes of joints {i} and {i + 1} are {angle:.1f}° apart, {nominal_angle:.1f}° in {robot}; correct its "
+        said += "alpha or theta, or the sign with which a joint counts"
+        checks.append((abs(angle - nominal_angle) > np.degrees(AGREES_RAD), "E-AXES-ANGLE", said))
+    for wrong, code, said in checks:
+        if wrong:
+            raise InputError(code, f"{where}: {said}")
+
+
+def _remarks(
+    measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
+) -> list[str]:
+    """Returns remarks on the axes, their robot, and moves between the rows ``measured``, ``data`` with virtual ones."""
+    notes = [
+        f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
+        for fit in fits
+        if not fit.settled
+    ]
+    for fit in fits:
+        off_arc, limit = fit.off_mm, f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
+        if len(off_arc) > FEW:
+            first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
+            notes.append(
+                f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, "
+                f"{limit}; the farthest are lines {first}; all are in --json"
+            )
+            off_arc = {}
+        notes += [
+            f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
+            f"{fit.joint + 1}, {limit}"
+            for row, size in off_arc.items()
+        ]
+        notes += [
+            f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint {fit.joint + 1} to "
+            "tell of it; its arc is not used"
+            for arc in fit.near
+        ]
+    swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
+    for name in dict.fromkeys(each for each in data.targets if each not in swept):
+        rows = [i for i, target in enumerate(data.targets) if target == name]
+        what = called(name) if name else "rows without a target, beside rows with one"
+        notes.append(
+            f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on the "
+            "flange rests on these rows alone; name it like the others, or leave it out"
+        )
+    for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
+        after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
+        one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
+        if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
+            notes.append(
+                f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
+                "file: its zero position differs"
+            )
+    moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(measured, "position"), MOVED_SHARE)
+    return notes if moved is None else [*notes, moved.sentence()]
+
+
+def _leave_one_out(
+    data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
+) -> LeaveOneOut:
+    """Returns the values of the pairs without each row."""
+    groups, counts = {}, {}  # rows that were measured together: the same joint values, each reflector once
+    for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
+        key = q.tobytes(), target
+        counts[key] = counts.get(key, 0) + 1
+        groups.setdefault((key[0], counts[key]), []).append(row)
+    used = np.unique(np.concatenate([fit.rows for fit in fits]))
+    instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
+    if len(instants) > REFITTED:
+        values = _by_influence(instants, fits, nominal, passed)
+    else:
+        values = _refitted(data, instants, fits, nominal)
+    values = values.reshape(len(instants), -1, 6)
+    return LeaveOneOut(tuple(int(data.lines[rows[0]]) for rows in instants), values[:, :, 3], values[:, :, 4])
+
+
+def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit], nominal: Robot) -> np.ndarray:
+    """Returns the values (r, 6 (n − 1)) without each instant's rows, nan if the remaining ones determine no axis; what
+    comes after a changed axis is unwound and fitted again."""
+    kinematic, points = (data.q @ nominal.coupling.T).T, [np.array(data.points())]
+    for fit, value in zip(fits, kinematic, strict=True):
+        points.append(fit.unwound(points[-1], value)[1])
+    values = np.full((len(instants), 6 * (len(fits) - 1)), np.nan)
+    for found, rows in zip(values, instants, strict=True):
+        first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
+        again, at = fits[:first], points[first]
+        try:
+            for fit, value in zip(fits[first:], kinematic[first:], strict=True):
+                again = [*again, fit.without(at, rows)]
+                at = again[-1].unwound(at, value)[1]
+            found[:] = _pair_values([fit.world_from_axis for fit in again], nominal)
+        except (DegenerateError, ConvergenceError):
+            continue
+    return values
+
+
+def _by_influence(
+    instants: list[list[int]], fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
+) -> np.ndarray:
+    """Returns the values (r, 6 (n − 1)) without each instant's rows, to first order."""
+    number = {row: i for i, rows in enumerate(instants) for row in rows}
+    changes = []
+    for fit, derivatives in zip(fits, passed, strict=True):
+        change = np.zeros((len(instants), len(fit.gain)))
+        np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
+        changes.append(change + sum(old @ by.T for old, by in zip(changes, derivatives, strict=True)))
+    frames = [fit.world_from_axis for fit in fits]
+    slope = _by_axes(lambda f: _pair_values(f, nominal), frames, nominal)
+    return _pair_values(frames, nominal) + np.concatenate(changes, axis=1) @ slope.T

@@ -1,5 +1,6 @@
-"""Fits the axis of a joint to positions and orientations of a target along sweeps, with full turns unwound."""
+"""Fits the axis of each joint to positions and orientations of a target along sweeps of single joints."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,25 +11,28 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import NormalEquations, minimise
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid, skew
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
-from stcal.robot.axes.sweeps import Arc, VirtualReflectors
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot
 
+STILL_RAD = np.radians(1.5e-3)
+"""Difference up to which joint values are equal: a controller shows 0.001°, and coupling adds two of them."""
+STILL_MM = 2e-3
+DISTINCT = {"revolute": 3, "prismatic": 2}
+"""Number of positions that give an arc its radius and height, or a line its direction."""
+STANDS_STILL_MM = 1.0
+"""Motion of a reflector below which it stands still; sweeps move it by more, unless it is on the axis."""
 GROSS = 6.0
 """Residual, in σ, beyond which a point is left out and named: 1 in 10⁷ of normal ones."""
 NEAR_AXIS = 10.0
 """Radius, in σ of a point, below which an arc is of no use: noise biases radii by σ²/2r, a twentieth of σ here."""
 ROUNDING = 1e-12
 """Relative size of the rounding error of coordinates."""
-STANDS_STILL_MM = 1.0
-"""Motion of a reflector below which it stands still; sweeps move it by more, unless it is on the axis."""
 WEAK_RAD = 0.02
 """σ of a direction beyond which an axis is not known; its covariance is valid for small angles only."""
 MOTION = np.radians(2.0)
 """Largest difference of the observed motion from the joint's values, or share of a sliding joint's way."""
-LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
 """Share of the largest arc below which residuals are too small to hide a gross error that bent the first axis."""
 STARTS, REWEIGHTINGS = 60, 30
@@ -38,6 +42,166 @@ SINGULAR, TINY = 1e-10, 1e-300
 """Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
 FIRST_SIZE = 0.05
 """Size of an arc, as a share of the largest, from which on it is used for the first axis."""
+SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0
+"""Distances of virtual reflectors from the target that make sense."""
+SEPARATOR = " point "
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arc:
+    """Rows (indices into the measurements) of one reflector in one sweep of ``joint`` (from 0)."""
+
+    joint: int
+    target: str
+    rows: np.ndarray
+
+
+def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
+    """Returns the arcs of all joints, and notes on arcs that are not used. Rows of one reflector that differ in exactly
+    one *kinematic* joint value form an arc. Positions a full turn apart are one only for the joint that turns.
+
+    Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
+    """
+    if data.positions is None:
+        raise InputError(
+            "E-MEASURED-DISTANCES", f"{data.where}: distances only; columns x_mm, y_mm, z_mm needed for the axis method"
+        )
+    names = np.array(data.targets)
+    for target in dict.fromkeys(data.targets):
+        points = data.points()[names == target]
+        far = float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
+        if len(points) > 1 and far < STANDS_STILL_MM:
+            raise InputError(
+                "E-TARGET-STILL",
+                f"{data.where}: {called(target)} does not move: 90 % of its {len(points)} positions lie within "
+                f"{far:.3g} mm while the joints move; a reflector on the flange, and each row's own measurement needed",
+            )
+    kinematic = data.q @ robot.coupling.T
+    still = np.where(robot.prismatic, STILL_MM, still_rad)
+    same = np.column_stack([_clusters(v, s) for v, s in zip(kinematic.T, still, strict=True)])
+    arcs, notes, missing = [], [], []
+    for j, joint in enumerate(robot.joints):
+        groups, least, before = defaultdict(list), DISTINCT[joint.type], len(arcs)
+        for row, others in enumerate(np.delete(same, j, axis=1)):
+            groups[data.targets[row], *others.tolist()].append(row)
+        for (target, *_), rows in groups.items():
+            places = kinematic[rows, j]
+            if not robot.prismatic[j]:  # angles from the middle of their widest gap, so that no cluster lies across 0
+                around = np.sort(np.mod(places, 2 * np.pi))
+                gaps = np.diff(around, append=around[0] + 2 * np.pi)
+                places = np.mod(places - around[gaps.argmax()] - gaps.max() / 2, 2 * np.pi)
+            distinct = len(set(_clusters(places, still[j])))
+            if distinct >= least:
+                arcs.append(Arc(j, target, np.array(rows)))
+            elif distinct > 1:
+                notes.append(
+                    f"joint {j + 1}, {called(target)}, line {data.lines[rows[0]]}: an arc of {distinct} positions is "
+                    f"not used, {least} needed"
+                )
+        missing += [j] if len(arcs) == before else []
+    if missing:
+        names, least = ", ".join(str(j + 1) for j in missing), DISTINCT[robot.joints[missing[0]].type]
+        raise InputError(
+            "E-AXES-NO-SWEEP",
+            f"{data.where}: joint {names} is never swept: no rows of one reflector differ in that joint "
+            f"alone, {least} or more positions needed; measure its sweep, and if the controller couples joints, give "
+            "`coupling` in the robot file",
+        )
+    return arcs, notes
+
+
+def called(target: str) -> str:
+    """Returns the name by which messages refer to a reflector."""
+    return f"reflector {target}" if target else "the reflector"
+
+
+def _clusters(values: np.ndarray, still: float) -> np.ndarray:
+    """Returns the number of the cluster of each value; neighbours closer than ``still`` are in one cluster."""
+    order = np.argsort(values)
+    label = np.empty(len(values), int)
+    label[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > still)])
+    return label
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualReflectors:
+    """Virtual reflectors of poses. ``data`` : k rows for each of m poses; ``places`` : (k, 3) places of the reflectors
+    in the target's frame, mm; ``pose`` : (km,) number of the pose of each row; ``lever`` : (km, 3) vectors from the
+    reflectors' mean, of RMS length 1, in the instrument's frame."""
+
+    data: Measurements
+    places: np.ndarray
+    pose: np.ndarray
+    lever: np.ndarray
+
+    def by_pose(self, response: np.ndarray) -> np.ndarray:
+        """Returns the response (p, 6 m) to the noise of poses, given that (p, km, 3) to the noise of independent rows.
+        A pose errs by a translation, and by a rotation that moves the reflectors as much (RMS)."""
+        by_row = np.concatenate([np.broadcast_to(np.eye(3), (len(self.lever), 3, 3)), -skew(self.lever)], axis=2)
+        shared = np.zeros((len(response), int(self.pose.max()) + 1, 6))
+        np.add.at(shared.swapaxes(0, 1), self.pose, np.einsum("pmc,mcd->mpd", response, by_row))
+        return np.sqrt(3 / 5) * shared.reshape(len(response), -1)
+
+    def tools(self, places: dict[str, Rigid], spread_mm: dict[str, float]) -> tuple[dict[str, Rigid], dict[str, float]]:
+        """Returns the poses of the targets from their reflectors' places, and the RMS about these places."""
+        tools, spread = {}, {}
+        for name in dict.fromkeys(self.data.targets):
+            target, _, number = name.rpartition(SEPARATOR)
+            if number == "1":
+                names = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
+                xyz = np.array([places[each].translation for each in names])
+                tools[target] = align_rigid(xyz, self.places)
+                spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in names])))
+        return tools, spread
+
+
+def length_of(data: Measurements) -> float | None:
+    """Returns the distance, mm, at which σ of rotations moves a point by σ of positions; None if no σ are stated."""
+    if data.rotations is None or data.covariance is None:
+        return None
+    variance = np.einsum("mii->mi", np.asarray(data.covariance))
+    rotation, position = variance[:, :3].mean(axis=1), variance[:, 3:].mean(axis=1)
+    if not (rotation > 0).all():
+        return None
+    return float(np.clip(np.median(np.sqrt(position / rotation)), SHORTEST_MM, LONGEST_MM))
+
+
+def ring(length_mm: float) -> np.ndarray:
+    """Returns places (3, 3) at ``length_mm`` about the target's origin, in its XY plane; raises InputError: a length
+    out of range."""
+    if not SHORTEST_MM <= length_mm <= LONGEST_MM:
+        raise InputError(
+            "E-OPTION-RANGE", f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
+        )
+    angles = 2 * np.pi / 3 * np.arange(3)
+    return length_mm * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+
+
+def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
+    """Returns reflectors carried at ``places`` (k, 3) of a target, mm; raises InputError if there are no
+    orientations."""
+    if data.rotations is None or data.positions is None:
+        raise InputError(
+            "E-MEASURED-NO-ORIENTATION",
+            f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out",
+        )
+    m, k = len(data), len(places)
+    about = places - places.mean(axis=0)
+    lever = about / np.sqrt((about**2).sum(axis=1).mean())
+    carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
+    row = np.repeat(np.arange(m), k)
+    at = row.tolist()
+    virtual = replace(
+        data,
+        lines=[data.lines[i] for i in at],
+        q=data.q[row],
+        targets=tuple(f"{data.targets[i]}{SEPARATOR}{n % k + 1}" for n, i in enumerate(at)),
+        positions=np.asarray(data.positions)[row] + carried,
+        rotations=None,
+        covariance=None,
+        common=None,
+    )
+    return VirtualReflectors(virtual, places, row, lever)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,15 +233,13 @@ class AxisFit:
     def of(cls, points: np.ndarray, arcs: Sequence[Arc], prismatic: bool, where: str, start: Rigid) -> "AxisFit":
         """Returns the fit at its start: points (m, 3) of all rows, of equal weights."""
         rows = np.concatenate([arc.rows for arc in arcs])
-        member = np.zeros((len(rows), len(arcs)))
-        member[np.arange(len(rows)), np.repeat(np.arange(len(arcs)), [len(arc.rows) for arc in arcs])] = 1
         return cls(
             where=where,
             prismatic=prismatic,
             arcs=tuple(arcs),
             rows=rows,
             points=points[rows],
-            member=member,
+            member=np.repeat(np.eye(len(arcs)), [len(arc.rows) for arc in arcs], axis=0),
             size=max(_spread(points[arc.rows]) for arc in arcs),
             weights=np.ones(len(rows)),
             world_from_axis=start,
@@ -100,21 +262,24 @@ class AxisFit:
             return self.local[:, :2]
         return np.column_stack([np.hypot(self.local[:, 0], self.local[:, 1]), self.local[:, 2]])
 
-    @cached_property
-    def means(self) -> np.ndarray:
-        """Weighted means (2, a) of the values by arc."""
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Returns the weighted means (a, c) of values (k, c) by arc."""
         weighted = self.member * self.weights[:, None]
-        return (self.values.T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
+        return (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
+
+    def demean(self, values: np.ndarray) -> np.ndarray:
+        """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
+        return values - self.member @ self.means(values)
 
     @property
     def radii(self) -> np.ndarray:
         """Radii (a,) of the arcs, mm; nan for a prismatic joint."""
-        return self.means[0] * (np.nan if self.prismatic else 1.0)
+        return self.means(self.values)[:, 0] * (np.nan if self.prismatic else 1.0)
 
     @property
     def heights(self) -> np.ndarray:
         """Heights (a,) of the arcs above the origin, mm; nan for a prismatic joint."""
-        return self.means[1] * (np.nan if self.prismatic else 1.0)
+        return self.means(self.values)[:, 1] * (np.nan if self.prismatic else 1.0)
 
     @cached_property
     def residuals(self) -> np.ndarray:
@@ -124,7 +289,8 @@ class AxisFit:
     @property
     def redundancy(self) -> int:
         """Number of redundant measured numbers."""
-        return self._redundancy(self.weights)
+        kept = self.weights > 0
+        return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
 
     @cached_property
     def sigma_mm(self) -> float:
@@ -142,9 +308,11 @@ class AxisFit:
         return self.sigma_mm**2 * np.einsum("pkc,qkc->pq", self.gain, self.gain)
 
     @property
-    def outliers(self) -> np.ndarray:
-        """Rows that are left out as gross errors."""
-        return np.unique(self.rows[self.weights == 0])
+    def off_mm(self) -> dict[int, float]:
+        """How far each row that is left out as a gross error is off its arc, mm, the farthest first."""
+        length = np.where(self.weights == 0, np.linalg.norm(self.residuals, axis=1), 0.0)
+        off = {int(row): float(length[self.rows == row].max()) for row in np.unique(self.rows[self.weights == 0])}
+        return dict(sorted(off.items(), key=lambda item: -item[1]))
 
     @property
     def rms_mm(self) -> float:
@@ -156,31 +324,27 @@ class AxisFit:
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
 
     def influence(self) -> np.ndarray:
-        """Returns the change (k, p) of the axis, linear, without each of its points."""
+        """Returns the change (k, p) of the axis, linear, without each of its points (Cook & Weisberg 1982)."""
         step = np.einsum("pkc,kvc->kpv", self.gain, self._by_points())  # derivative of the axis by the residuals
         weight = np.maximum(self.weights, TINY)
         normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
         lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
-        sums = self.member @ (self.weights @ self.member)
-        lever += (self.weights / np.maximum(sums, TINY))[:, None, None] * np.eye(2)
-        without = np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None])
-        return -(step @ without)[:, :, 0]
+        sums = np.maximum(self.member @ (self.weights @ self.member), TINY)
+        lever += (self.weights / sums)[:, None, None] * np.eye(2)
+        return -(step @ np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None]))[:, :, 0]
 
-    def without(self, points: np.ndarray, left_out: Sequence[int]) -> Rigid:
-        """Returns world_from_axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
+    def without(self, points: np.ndarray, left_out: Sequence[int]) -> "AxisFit":
+        """Returns the axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
         weights = np.where(np.isin(self.rows, left_out), 0.0, self.weights)
-        return replace(self, points=points[self.rows], weights=weights)._descended().world_from_axis
+        return replace(self, points=points[self.rows], weights=weights)._descended()
 
-    def demean(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
-        weighted = self.member * self.weights[:, None]
-        means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
-        return values - self.member @ means
-
-    def radius_of(self, points: np.ndarray) -> float:
-        """Returns the mean distance of ``points`` from the axis."""
-        local = (points - self.world_from_axis.translation) @ self.world_from_axis.rotation
-        return float(np.hypot(local[:, 0], local[:, 1]).mean())
+    def unwound(self, points: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the rotations (m, 3, 3) that undo the joint's values (m,), and points (m, 3) after that."""
+        z, origin = self.world_from_axis.rotation[:, 2], self.world_from_axis.translation
+        if self.prismatic:
+            return np.broadcast_to(np.eye(3), (len(points), 3, 3)), points - value[:, None] * z
+        turn = Rotation.from_rotvec(-value[:, None] * z).as_matrix()
+        return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
 
     def solved(self, moved: np.ndarray, starts: bool = True) -> "AxisFit":
         """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint;
@@ -191,17 +355,18 @@ class AxisFit:
                 f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
                 "position or a second reflector needed",
             )
-        fit = self._started(moved[self.rows]) if starts else self
-        if starts:
-            fit = replace(fit, weights=fit._huber())  # before the first step, which a gross error would lead astray
+        fit = self
+        if starts:  # weights before the first step, which a gross error would lead astray
+            fit = self._started(moved[self.rows])
+            fit = replace(fit, weights=fit._robust()[2])
         for gross in (np.inf, GROSS):
             for _ in range(REWEIGHTINGS):
                 fit = fit._descended()
-                length = np.linalg.norm(fit.residuals, axis=1)
-                new = np.where(length > gross * fit._robust_sigma(length), 0.0, fit._huber())
-                new = new if fit._redundancy(new) > 0 else fit._huber()
-                settled = bool(np.abs(new - fit.weights).max() < WEIGHTS_SETTLED)
-                fit = replace(fit, weights=new, settled=settled)
+                length, sigma, huber = fit._robust()
+                new = replace(fit, weights=np.where(length > gross * sigma, 0.0, huber))
+                weights = new.weights if new.redundancy > 0 else huber
+                settled = bool(np.abs(weights - fit.weights).max() < WEIGHTS_SETTLED)
+                fit = replace(fit, weights=weights, settled=settled)
                 if settled:
                     break
         fit = fit._descended()
@@ -220,10 +385,10 @@ class AxisFit:
         for i, subset in enumerate(sets):
             fit = replace(self, weights=np.asarray(subset, float))
             fit = replace(fit, world_from_axis=fit._linear_start())
-            length = np.linalg.norm(fit.residuals, axis=1)
+            length, sigma, _ = fit._robust()
             if np.median(length) < least:
                 least, best = np.median(length), fit
-            if i == 0 and length.max() <= min(GROSS * fit._robust_sigma(length), QUIET * self.size):
+            if i == 0 and length.max() <= min(GROSS * sigma, QUIET * self.size):
                 break
         if best is None:
             raise DegenerateError(
@@ -237,10 +402,10 @@ class AxisFit:
         """Returns the axis by the arcs' common scatter and the circles' common centre (Kåsa 1976)."""
         centred = self.demean(self.points)
         _, axes = np.linalg.eigh((self.weights[:, None] * centred).T @ centred)
-        middle = self.points.mean(axis=0)
+        x, z = (axes[:, 0], axes[:, 2]) if self.prismatic else (axes[:, 2], axes[:, 0])
+        middle, frame = self.points.mean(axis=0), np.column_stack([x, np.cross(z, x), z])
         if self.prismatic:
-            return Rigid(_frame(axes[:, 0], axes[:, 2]), middle)
-        frame = _frame(axes[:, 2], axes[:, 0])
+            return Rigid(frame, middle)
         flat = (self.points - middle) @ frame[:, :2]
         # |x|² − 2 c·x is the same all along a circle about c
         root = np.sqrt(self.weights)
@@ -248,23 +413,16 @@ class AxisFit:
         centre = np.linalg.lstsq(2 * root[:, None] * self.demean(flat), root * square, rcond=None)[0]
         return Rigid(frame, middle + frame[:, :2] @ centre)
 
-    def _redundancy(self, weights: np.ndarray) -> int:
-        kept = weights > 0
-        return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
-
     @property
     def _floor(self) -> float:
         return ROUNDING * max(np.abs(self.points).max(), self.size)
 
-    def _huber(self) -> np.ndarray:
-        """Returns Huber weights (k,) from the lengths of the residuals."""
+    def _robust(self) -> tuple[np.ndarray, float, np.ndarray]:
+        """Returns the residuals' lengths (k,), σ of one coordinate by their median, mm, and Huber weights (k,)."""
         length = np.linalg.norm(self.residuals, axis=1)
-        return huber_weights(length, HUBER * self._robust_sigma(length))
-
-    def _robust_sigma(self, length: np.ndarray) -> float:
-        """Returns σ of one coordinate from the median length, mm."""
-        redundancy = self._redundancy(np.ones(len(length))) / (2 * len(length))
-        return max(robust_sigma(length, 2, redundancy), self._floor)
+        redundancy = replace(self, weights=np.ones(len(length))).redundancy / (2 * len(length))
+        sigma = max(robust_sigma(length, 2, redundancy), self._floor)
+        return length, sigma, huber_weights(length, HUBER * sigma)
 
     def _by_points(self) -> np.ndarray:
         """Returns the derivative (k, 2, 3) of the values by the points."""
@@ -275,7 +433,7 @@ class AxisFit:
         return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
 
     def _jacobian(self) -> np.ndarray:
-        """Returns the derivative (k, 2, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
+        """Returns the derivative (2 k, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
         u, v, w = self.local.T
         zero = np.zeros_like(u)
         if self.prismatic:
@@ -283,19 +441,20 @@ class AxisFit:
         else:
             u1, v1 = np.array([u, v]) / np.maximum(np.hypot(u, v), TINY)
             values = np.array([[v1 * w, -u1 * w, -u1, -v1], [-v, u, zero, zero]])
-        k = len(u)
-        return self.demean(np.moveaxis(values, 2, 0).reshape(k, -1)).reshape(k, 2, -1)
+        return self.demean(np.moveaxis(values, 2, 0).reshape(len(u), -1)).reshape(2 * len(u), -1)
 
     def _inverse(self) -> np.ndarray:
         """Returns the matrix (p, k, 2) by which residuals become the Gauss-Newton step."""
         jacobian = self._jacobian()
-        k, _, p = jacobian.shape
-        root = np.repeat(np.sqrt(self.weights), 2)
+        root, p = np.repeat(np.sqrt(self.weights), 2), jacobian.shape[1]
         unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
-        u, s, vt = np.linalg.svd(root[:, None] * jacobian.reshape(2 * k, p) * unit, full_matrices=False)
+        u, s, vt = np.linalg.svd(root[:, None] * jacobian * unit, full_matrices=False)
         if s[-1] <= SINGULAR * s[0]:
-            raise DegenerateError("E-AXES-UNDETERMINED", f"{self.where}: its arcs do not determine an axis; {LONGER}")
-        return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
+            self._undetermined("its arcs do not determine an axis; sweep further, or with reflectors farther apart")
+        return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, -1, 2)
+
+    def _undetermined(self, said: str, code: str = "E-AXES-UNDETERMINED") -> None:
+        raise DegenerateError(code, f"{self.where}: {said}")
 
     def _descended(self) -> "AxisFit":
         """Returns the axis of least squares with these weights."""
@@ -304,8 +463,7 @@ class AxisFit:
 
         def linearise(frame: Rigid) -> NormalEquations:
             fit = replace(self, world_from_axis=frame)
-            jacobian = fit._jacobian().reshape(len(root), -1)
-            return NormalEquations.of(root * fit.residuals.ravel(), root[:, None] * jacobian)
+            return NormalEquations.of(root * fit.residuals.ravel(), root[:, None] * fit._jacobian())
 
         def moved(frame: Rigid, step: np.ndarray) -> Rigid:
             """Returns the moved frame with its origin at the foot of the points' centroid."""
@@ -319,22 +477,21 @@ class AxisFit:
 
     def _require_known(self) -> None:
         """Refuses an axis whose σ is too large for its linear covariance."""
-        if not self.prismatic and (self.means[0] <= NEAR_AXIS * self.sigma_mm).all():
-            raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(self.where, self.size))
-        sigma = self.sigma_mm * np.linalg.norm(self.gain, axis=2)
+        if not self.prismatic and (self.means(self.values)[:, 0] <= NEAR_AXIS * self.sigma_mm).all():
+            self._undetermined(ON_AXIS.format(self.size))
+        sigma, most_mm = self.sigma_mm * np.linalg.norm(self.gain, axis=2), WEAK_RAD * self.size * 10
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
-        if direction > WEAK_RAD or place > WEAK_RAD * self.size * 10:
-            if self.size < STANDS_STILL_MM:
-                raise DegenerateError(
-                    "E-AXES-STILL",
-                    f"{self.where}: its reflectors stay within {self.size:.3g} mm of one position while its values "
-                    "change; check that it moved and that each position was measured again, or put a reflector off "
-                    "its axis",
-                )
-            raise DegenerateError(
-                "E-AXES-UNDETERMINED",
-                f"{self.where}: σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place "
-                f"{place:.2g} mm, {np.degrees(WEAK_RAD):.1f}° and {WEAK_RAD * self.size * 10:.2g} mm needed; {LONGER}",
+        if (direction > WEAK_RAD or place > most_mm) and self.size < STANDS_STILL_MM:
+            self._undetermined(
+                f"its reflectors stay within {self.size:.3g} mm of one position while its values change; check that it "
+                "moved and that each position was measured again, or put a reflector off its axis",
+                "E-AXES-STILL",
+            )
+        if direction > WEAK_RAD or place > most_mm:
+            self._undetermined(
+                f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm, "
+                f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed; sweep further, or with reflectors farther "
+                "apart"
             )
 
     def oriented(self, moved: np.ndarray) -> "AxisFit":
@@ -347,11 +504,10 @@ class AxisFit:
             allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma_mm, "mm", 1.0
         else:
             place = local[:, 0] + 1j * local[:, 1]
-            weighted = self.member * self.weights[:, None]
-            with_it, against = ((place * np.exp(-1j * sign * moved)) @ weighted for sign in (1, -1))
-            turned = np.abs(against).sum() > np.abs(with_it).sum()
-            arm = self.member @ (against if turned else with_it)
-            deviation = np.abs(np.angle(place * np.exp(-1j * (-1 if turned else 1) * moved) * arm.conj()))
+            back = place * np.exp(-1j * np.array([[1], [-1]]) * moved)  # turned back by the values, and by minus these
+            arms = back @ (self.member * self.weights[:, None])
+            turned = bool(np.abs(arms[1]).sum() > np.abs(arms[0]).sum())
+            deviation = np.abs(np.angle(back[int(turned)] * (self.member @ arms[int(turned)]).conj()))
             near = GROSS * self.sigma_mm / np.maximum(np.abs(place), TINY)
             allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
         wrong = np.flatnonzero((deviation > allowed) & (self.weights > 0))
@@ -367,9 +523,14 @@ class AxisFit:
         return replace(self, world_from_axis=axis, span=float(np.ptp(moved)))
 
 
+ON_AXIS = (
+    "all reflectors stay within {:.3g} mm of one place while it moves, so close to its axis that they say nothing "
+    "about it; put a reflector off the axis"
+)
+
+
 def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
-    """Returns the axis of a joint by robust least squares of the distances of its arcs' points to their circles or
-    lines.
+    """Returns the axis of a joint by robust least squares of the distances of its arcs' points to circles or lines.
 
     ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
     this joint; ``where`` : the joint, for messages.
@@ -379,32 +540,22 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     """
     size = np.array([_spread(points[arc.rows]) for arc in arcs])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
-        raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(where, size.max()))
+        raise DegenerateError("E-AXES-UNDETERMINED", f"{where}: {ON_AXIS.format(size.max())}")
     use = size >= FIRST_SIZE * size.max()
     fit = AxisFit.of(points, [arcs[i] for i in np.flatnonzero(use)], prismatic, where, Rigid()).solved(moved)
     if not prismatic and not use.all():
-        far = np.array([fit.radius_of(points[arc.rows]) for arc in arcs]) > NEAR_AXIS * fit.sigma_mm
+        frame = fit.world_from_axis
+        local = [(points[arc.rows] - frame.translation) @ frame.rotation for arc in arcs]
+        far = np.array([np.hypot(*each.T[:2]).mean() for each in local]) > NEAR_AXIS * fit.sigma_mm
         if (far & ~use).any():
             use |= far
             used = [arcs[i] for i in np.flatnonzero(use)]
-            fit = AxisFit.of(points, used, prismatic, where, fit.world_from_axis).solved(moved, starts=False)
+            fit = AxisFit.of(points, used, prismatic, where, frame).solved(moved, starts=False)
     return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(~use)))
 
 
 def _spread(points: np.ndarray) -> float:
     return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
-
-
-def _on_axis(where: str, spread: float) -> str:
-    return (
-        f"{where}: all reflectors stay within {spread:.3g} mm of one place while it moves, so close to its axis that "
-        "they say nothing about it; put a reflector off the axis"
-    )
-
-
-def _frame(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Returns right-handed axes (3, 3) from two perpendicular ones."""
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 def fit_axes(
@@ -429,34 +580,16 @@ def fit_axes(
         passed.append([np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]) for jacobian in inherited])
         for before, by in zip(response, passed[-1], strict=True):
             to_noise += np.einsum("pq,qmc->pmc", by, before)
-        turn, after = unwound_by(fit.world_from_axis, points, kinematic[:, j], bool(sliding))
-        inherited = [turn @ jacobian for jacobian in inherited]
-        inherited.append(_unwinding_jacobian(fit.world_from_axis, points, after, turn, len(fit.gain)))
+        axis, (turn, after) = fit.world_from_axis, fit.unwound(points, kinematic[:, j])
+        # The unwound points change with rx, ry, tx, ty of the axis: δ = D(U x) − U(D x).
+        shifts = [np.broadcast_to(axis.rotation[:, c], (2, m, 3)) for c in (0, 1)]
+        places = np.stack([after, points]) - axis.translation
+        moves = [np.cross(shift, places) for shift in shifts] + shifts[: len(fit.gain) - 2]
+        by_axis = np.stack([of_after - np.einsum("mij,mj->mi", turn, of_point) for of_after, of_point in moves], axis=2)
+        inherited = [*(turn @ jacobian for jacobian in inherited), by_axis]
         fits.append(fit)
         response.append(to_noise)
         points, turned = after, turn @ turned
     rows = np.concatenate(response)
     stacked = rows.reshape(-1, 3 * m) if virtual is None else virtual.by_pose(rows)
     return fits, stacked @ stacked.T, points, passed
-
-
-def unwound_by(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations (m, 3, 3) that undo the joint's values, and the points after that."""
-    z, origin = axis.rotation[:, 2], axis.translation
-    if sliding:
-        return np.broadcast_to(np.eye(3), (len(points), 3, 3)), points - value[:, None] * z
-    turn = Rotation.from_rotvec(-value[:, None] * z).as_matrix()
-    return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
-
-
-def _unwinding_jacobian(axis: Rigid, before: np.ndarray, after: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
-    """Returns the derivative (m, 3, p) of the unwound points by rx, ry, tx, ty of the axis: δ = D(U x) − U(D x)."""
-    columns = []
-    for component in (0, 1, 3, 4)[:count]:
-        direction = axis.rotation[:, component % 3]
-        if component < 3:
-            after_shift, before_shift = (np.cross(direction, points - axis.translation) for points in (after, before))
-        else:
-            after_shift = before_shift = np.broadcast_to(direction, after.shape)
-        columns.append(after_shift - np.einsum("mij,mj->mi", turn, before_shift))
-    return np.stack(columns, axis=2)

@@ -1,7 +1,7 @@
-"""Measurements as observations of an arm: their residuals, the derivatives by the minimal parameters, and their σ."""
+"""Measurements as observations of an arm: residuals, derivatives by the minimal parameters, σ, and observability."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -19,8 +19,9 @@ from stcal.robot.kinematics.forward import (
     moved_chain,
     with_values,
 )
+from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions
+from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Robot
 
 Kind = Literal["pose", "position", "distance"]
 WIDTH = {"pose": 6, "position": 3, "distance": 1}
@@ -45,6 +46,11 @@ class State:
     def elastic_count(self) -> int:
         """Number of parameters of the elasticity."""
         return (10 if self.hysteresis else 9) * len(self.chain) if self.elastic else 0
+
+    def seen_from(self, names: Sequence[str]) -> Poses:
+        """Returns station_from_world by the names (r,) of stations."""
+        place = {name: i for i, name in enumerate(self.stations)}
+        return Poses.of(self.stations.values())[[place[name] for name in names]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,9 +134,18 @@ def tips_of(state: State, data: Measurements) -> Poses:
     return tips(state, data.q, data.targets, data.conditions)
 
 
-def residuals(state: State, measured: Observed) -> np.ndarray:
-    """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
-    return _beside(state, tips_of(state, measured.data), measured)
+def residuals(state: State, measured: Observed, tip: Poses | None = None) -> np.ndarray:
+    """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station;
+    ``tip`` : world_from_tool (m,), where they are known."""
+    tip = tips_of(state, measured.data) if tip is None else tip
+    if len(state.stations) > 1:
+        tip = state.seen_from(measured.data.stations) @ tip
+    if measured.kind == "pose":
+        return measured.data.poses().difference(tip)
+    if measured.kind == "position":
+        return measured.data.points() - tip.translation
+    apart = tip.translation[measured.first] - tip.translation[measured.second]
+    return (measured.values - np.linalg.norm(apart, axis=1))[:, None]
 
 
 def jacobian(state: State, measured: Observed) -> np.ndarray:
@@ -143,10 +158,11 @@ def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
     tip, full = tip_jacobian(state, measured.data.q, measured.data.targets, measured.kind, measured.data.conditions)
     if len(state.stations) > 1:
         full, names = full.copy(), np.array(measured.data.stations)
-        offset = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
+        begin = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
         for s, name in enumerate(list(state.stations)[1:]):
-            full[names == name, :, offset + 6 * s : offset + 6 * s + 6] = frame_motions(tip[names == name], np.zeros(3))
-    return _beside(state, tip, measured), as_seen(state, measured, tip, full)
+            at = begin + 6 * s
+            full[names == name, :, at : at + 6] = frame_motions(tip[names == name], np.zeros(3))
+    return residuals(state, measured, tip), as_seen(state, measured, tip, full)
 
 
 def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
@@ -160,7 +176,7 @@ def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
 def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
     """Returns the effect (r, 6 or 3 or 1, k), in the station's axes, of motions (m, 6, k) of the tools, rad over mm."""
     if len(state.stations) > 1:
-        turn = _stations(state, measured.data.stations).rotation[:, None]
+        turn = state.seen_from(measured.data.stations).rotation[:, None]
         moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
     if measured.kind == "pose":
         return moves
@@ -169,12 +185,6 @@ def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> 
     apart = tip.translation[measured.first] - tip.translation[measured.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
     return np.einsum("ri,rik->rk", unit, moves[measured.first, 3:] - moves[measured.second, 3:])[:, None]
-
-
-def _stations(state: State, names: Sequence[str]) -> Poses:
-    """Returns station_from_world of each row."""
-    place = {name: i for i, name in enumerate(state.stations)}
-    return Poses.of(state.stations.values())[[place[name] for name in names]]
 
 
 def frame_motions(tip: Poses, centre: np.ndarray) -> np.ndarray:
@@ -191,18 +201,6 @@ def tool_motions(tip: Poses, targets: Sequence[str], tool: str, kind: Kind) -> n
     moves[:, :3, :3] = moves[:, 3:, 3:] = tip.rotation
     moves *= np.array([name == tool for name in targets])[:, None, None]
     return moves[..., -TOOL_WIDTH[kind] :]
-
-
-def _beside(state: State, tip: Poses, measured: Observed) -> np.ndarray:
-    """Returns measured minus modelled values for the poses ``tip`` (m,) of the tools."""
-    if len(state.stations) > 1:
-        tip = _stations(state, measured.data.stations) @ tip
-    if measured.kind == "pose":
-        return measured.data.poses().difference(tip)
-    if measured.kind == "position":
-        return measured.data.points() - tip.translation
-    apart = tip.translation[measured.first] - tip.translation[measured.second]
-    return (measured.values - np.linalg.norm(apart, axis=1))[:, None]
 
 
 def tip_jacobian(
@@ -223,18 +221,17 @@ def tip_jacobian(
 
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     """Returns the state after small motions along the parameters, (k,)."""
-    k = len(chain_parameters(state.chain))
-    width = TOOL_WIDTH[kind]
-    tools = {}
-    for t, (name, tool) in enumerate(state.tools.items()):
-        tool_step = step[k + width * t : k + width * (t + 1)]
-        tools[name] = tool @ Rigid.exp(tool_step if width == 6 else [0, 0, 0, *tool_step])
-    stations, k = dict(state.stations), k + width * len(tools)
-    for s, name in enumerate(list(stations)[1:]):
-        stations[name] = stations[name] @ Rigid.exp(step[k + 6 * s : k + 6 * s + 6])
-    chain = moved_chain(state.chain, step[: len(chain_parameters(state.chain))])
+    later = list(state.stations)[1:]
+    sizes = [len(chain_parameters(state.chain)), *[TOOL_WIDTH[kind]] * len(state.tools), *[6] * len(later)]
+    of_chain, *motions, of_elasticity = np.split(step, np.cumsum(sizes))
+    motions = [Rigid.exp(np.pad(each, (6 - len(each), 0))) for each in motions]
+    tools = {name: tool @ motion for (name, tool), motion in zip(state.tools.items(), motions, strict=False)}
+    stations = dict(state.stations)
+    for name, motion in zip(later, motions[len(tools) :], strict=True):
+        stations[name] = stations[name] @ motion
+    chain = moved_chain(state.chain, of_chain)
     if state.elastic and chain.elasticity is not None:
-        values = elasticity_values(chain.elasticity, state.hysteresis) + step[-state.elastic_count :]
+        values = elasticity_values(chain.elasticity, state.hysteresis) + of_elasticity
         chain = replace(chain, elasticity=with_values(chain.elasticity, values))
     return replace(state, chain=chain, tools=tools, stations=stations)
 
@@ -256,32 +253,31 @@ class Weighting:
 
     def whiten(self, values: np.ndarray, measured: Observed) -> np.ndarray:
         """Returns residuals (r, w) or derivatives (r, w, k) of ``measured`` in units of σ."""
-        flat = values.ndim == 2
-        values = values[..., None] if flat else values
-        width = values.shape[1]
-        if self.given and width > 1:
-            root = self._root(measured, width)
-            values = _decorrelated(np.linalg.solve(root, values), root, measured)
-        else:
-            values = values / self._sigma(width)[:, None]
-        return values[..., 0] if flat else values
+        columns = values.reshape(*values.shape[:2], -1)
+        return self._whitened(columns, measured, back=False).reshape(values.shape)
 
     def pull(self, white: np.ndarray, measured: Observed) -> np.ndarray:
         """Returns half the derivative (r, w) by the residuals of the square sum of ``white``, from :meth:`whiten`."""
-        width = white.shape[1]
-        if not (self.given and width > 1):
-            return white / self._sigma(width)
-        root = self._root(measured, width)
-        white = _decorrelated(white[..., None], root, measured)
-        return np.linalg.solve(np.swapaxes(root, 1, 2), white)[..., 0]
+        return self._whitened(white[..., None], measured, back=True)[..., 0]
 
-    def _sigma(self, width: int) -> np.ndarray:
-        """Returns σ (width,) of the coordinates."""
-        return self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:]
-
-    def _root(self, measured: Observed, width: int) -> np.ndarray:
-        """Returns the roots (r, width, width) of the covariances that came with the measurements, times ``factor``."""
-        return self.factor * np.linalg.cholesky(measured.data.own_covariance()[:, -width:, -width:])
+    def _whitened(self, values: np.ndarray, measured: Observed, back: bool) -> np.ndarray:
+        """Returns W values (r, w, k), or Wᵀ values if ``back``. WᵀW is the inverse covariance: of independent errors,
+        and of common ones F, which leave (1 + F Fᵀ)^-½ where the others have σ 1."""
+        width = values.shape[1]
+        if not self.given or width == 1:
+            sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:]
+            return values / sigma[:, None]
+        data = measured.data
+        root = self.factor * np.linalg.cholesky(data.own_covariance()[:, -width:, -width:])
+        if not back:
+            values = np.linalg.solve(root, values)
+        if data.common is not None:
+            f = np.linalg.solve(root, data.common[:, -width:]).reshape(-1, data.common.shape[2])
+            size, directions = np.linalg.eigh(f.T @ f)
+            size, directions = size[size > 0], directions[:, size > 0]
+            u, flat = f @ directions / np.sqrt(size), values.reshape(len(f), -1)
+            values = (flat - u * (1 - 1 / np.sqrt(1 + size)) @ (u.T @ flat)).reshape(values.shape)
+        return np.linalg.solve(np.swapaxes(root, 1, 2), values) if back else values
 
     def columns(self, width: int) -> dict[str, slice]:
         """Returns the columns among the ``width`` coordinates to which each σ belongs."""
@@ -302,28 +298,102 @@ class Weighting:
         return {n: float(np.median(np.abs(white[:, at]))) for n, at in self.columns(white.shape[1]).items()}
 
 
-def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> np.ndarray:
-    """Returns values (r, w, k) of σ 1 times the inverse root of 1 + F Fᵀ, F being the common errors over ``root``."""
-    if measured.data.common is None:
-        return values
-    common = np.linalg.solve(root, measured.data.common[:, -root.shape[1] :])
-    f = common.reshape(-1, common.shape[2])
-    size, directions = np.linalg.eigh(f.T @ f)
-    size, directions = size[size > 0], directions[:, size > 0]
-    u = f @ directions / np.sqrt(size)
-    flat = values.reshape(len(f), -1)
-    return (flat - u * (1 - 1 / np.sqrt(1 + size)) @ (u.T @ flat)).reshape(values.shape)
-
-
 def parameter_units(derivative: np.ndarray) -> np.ndarray:
     """Returns steps (k,) that move the tool by 1 mm RMS, or by 1 rad if they move no point; 1 if they move nothing."""
-    lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
-    moves = np.sqrt((lengths**2).sum(1).mean(0))
-    turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
+    moves, turns = (np.sqrt((part**2).sum(1).mean(0)) for part in (derivative[:, -3:], derivative[:, :-3]))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
 
 
 def position_errors(found: np.ndarray) -> np.ndarray:
     """Returns the position errors (r,), mm."""
-    return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
+    return np.linalg.norm(found[:, -3:], axis=1)
+
+
+SEEN = 1e-9
+"""Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""
+MEANING = {
+    "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
+    "O2": "inverse condition number",
+    "O3": "the combination of parameters that is seen worst (E-optimality)",
+    "O4": "noise amplification",
+    "O5": "harmonic mean, near to A-optimality",
+}
+"""The meaning of each index."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservabilityIndices:
+    """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
+
+    The indices depend on the units of the parameters, except for the order that O1 gives to sets of poses. Here all
+    parameters are in mm (:func:`parameter_scale`), and measurements are counted in their σ: O1, O3, O4 and O5 are in
+    1/mm, and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
+
+    ``o1`` : (σ₁ … σ_L)^(1/L) / √count (Borm & Menq 1989, 1991); ``o2`` : σ_L / σ₁ (Driels & Pathre 1990); ``o3`` : σ_L
+    (Nahvi, Hollerbach & Hayward 1994); ``o4`` : σ_L² / σ₁ (Nahvi & Hollerbach 1996); ``o5`` : 1 / (1/σ₁ + … + 1/σ_L)
+    (Sun & Hollerbach 2008); see :data:`MEANING`.
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+
+    @classmethod
+    def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
+        """Returns the indices by singular values (L,) of ``count`` poses, all 0 if one value is 0; raises
+        InputError."""
+        sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
+        if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
+            raise InputError(
+                "E-ARRAY-SHAPE",
+                f"observability: {len(sigma)} singular values of {count} poses; at least one of each, none negative",
+            )
+        first, last = float(sigma[0]), float(sigma[-1])
+        if last == 0:
+            return cls(0.0, 0.0, 0.0, 0.0, 0.0)
+        volume = float(np.exp(np.log(sigma).mean()) / np.sqrt(count))
+        return cls(volume, last / first, last, last * last / first, float(1 / (1 / sigma).sum()))
+
+    @classmethod
+    def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
+        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, by its ``seen`` largest singular values."""
+        sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
+        return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
+
+    def values(self) -> dict[str, float]:
+        """Returns the indices by name, O1 … O5."""
+        return {name.upper(): value for name, value in asdict(self).items()}
+
+
+def identification_jacobian(
+    robot: Robot,
+    q: np.ndarray,
+    observe: Kind = "position",
+    sigma_mm: float = 1.0,
+    sigma_rad: float = 1.0,
+    tool: str = "",
+) -> np.ndarray:
+    """Returns the derivatives (m, 6 or 3, k) of the measured values, over σ, at joint vectors (m, n), in the world."""
+    state = State(robot.chain(), {tool: robot.tool(tool)})
+    derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
+    sigma = np.repeat([sigma_rad, sigma_mm], 3)
+    return (derivative / sigma[:, None])[:, -WIDTH[observe] :]
+
+
+def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
+    """Returns factors (k,) that bring all parameters to mm, angles as arcs at the reach with the longest tool."""
+    tools = list(tools)
+    turning = [c < 3 for _, c in chain_parameters(robot.chain())]
+    turning += ([True] * (TOOL_WIDTH[observe] - 3) + [False] * 3) * len(tools)
+    return np.where(turning, 1 / reach_mm(robot, tools), 1.0)
+
+
+def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
+    """Returns random joint values (count, n); without limits, of half a turn, or the reach, to either side."""
+    low, high = robot.limits().T
+    half = np.where(robot.prismatic, reach_mm(robot, [tool]), np.pi)
+    low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
+    return np.random.default_rng(0).uniform(low, high, (count, len(half)))

@@ -15,36 +15,31 @@ from stcal.robot.identification.adjustment import (
     UNSEEN,
     WIDTH,
     Kind,
+    ObservabilityIndices,
     Observed,
     State,
     Weighting,
     jacobian,
     observed,
     parameter_names,
+    parameter_scale,
     parameter_units,
     position_errors,
     residuals,
     tips_of,
 )
-from stcal.robot.identification.observability import (
-    ObservabilityIndices,
-    directions_named,
-    doubts,
-    parameter_scale,
-    predicted,
-    widened,
-)
 from stcal.robot.identification.prior import NominalRows, bending, placed
-from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, ArmProblem, ArmSolution, Relaxation, mostly
+from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, ArmProblem, ArmSolution, agreeing, mostly, relaxed
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Gain,
     HeldOutRows,
     Identified,
     IdentifyOptions,
-    misgivings,
+    Predicted,
+    directions_named,
+    remarks,
 )
-from stcal.robot.identification.row_consensus import agreeing
 from stcal.robot.identification.start import start
 from stcal.robot.identification.unexplained import left, moved_meanwhile
 from stcal.robot.kinematics.dh import robot_from_chain
@@ -68,17 +63,11 @@ STILL_RAD, STILL_MM = 1e-5, 1e-2
 """Motion, in rad or mm, below which a joint did not move."""
 OUTLIER_ROUNDS = 5
 """Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
-REPEATED = "joint values were measured several times: what the model lacks there counts once in σ"
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before open parameters."""
 ROUNDED_RAD, BEYOND, BEYOND_MM = 2e-5, 20.0, 0.3
 """Difference of the turns of the tool from those of the robot file by rounding; and how many times what it does across
 the positions these must err, and by how much at least, for the controller to have computed the orientations."""
-COMPUTED = (
-    "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
-    "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
-)
-TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
 """Number of divisions of the cross-validation for few rows, and largest number of few rows; more are divided once."""
 
@@ -118,50 +107,49 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     1996.
     """
     options = options or IdentifyOptions()
-    _still_joints(robot, data, options.partial)
+    moves = np.ptp(data.q @ robot.coupling.T, axis=0)
+    still = np.flatnonzero(moves < np.where(robot.prismatic, STILL_MM, STILL_RAD)) + 1
+    if len(still) and not options.partial:
+        raise DegenerateError(
+            "E-IDENTIFY-UNMOVED",
+            f"{data.where}: joint {still[0]} never moved, so that its axis is not determined; measure with other "
+            f"values of q{still[0]}, or keep its nominal values with --partial",
+        )
     first = start(robot, data)
     computed = options.observe is None and _turns_as_computed(first, data)
     seen = observed(data, "position" if computed else options.observe)
-    slope = jacobian(first, seen)
-    rows = NominalRows.about(first, parameter_units(slope), robot, options.adjust)
-    seeks = len(parameter_names(first, seen.kind)) - UNSEEN[seen.kind] - int(rows.fixed.sum())
+    units = parameter_units(jacobian(first, seen))
+    rows, names = NominalRows.about(first, units, robot, options.adjust), parameter_names(first, seen.kind)
+    seeks = len(names) - UNSEEN[seen.kind] - int(rows.fixed.sum())
     seen.require_more_than(seeks, "parameters", "better twice that")
     solution, held_out, gain = _modelled(robot, first, seen, options, rows)
-    state, rows = solution.state, solution.rows
-    names = parameter_names(state, seen.kind)
+    state, rows, k = solution.state, solution.rows, len(names)
     undetermined = _undetermined(solution, names, options.partial)
-    full_covariance, rank = solution.covariance(), solution.rank() - _place(seen)
-    named = slice(len(names))
-    covariance = full_covariance[named, named]
+    covariance, rank = solution.covariance(), solution.rank() - _place(seen)
     identified = robot_from_chain(state.chain, state.tools, robot)
-    prediction = predicted(state, robot, seen, full_covariance)
     findings = left(state, identified.world_from_base, seen, solution.problem.weighting, weights=solution.weights)
-    wider, remarks = widened(prediction, findings or ())
-    of_arm = any(not each.advice for each in findings or ())
-    tested = held_out is not None or options.folds < LEAST_FOLDS
     elasticity_sigma = None
     if state.elastic and state.chain.elasticity is not None:
         template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
-        elasticity_sigma = with_values(template, np.sqrt(np.diag(full_covariance))[-state.elastic_count :])
+        elasticity_sigma = with_values(template, np.sqrt(np.diag(covariance))[-state.elastic_count :])
     every = None
     if rows.fixed.any():  # a rigid arm with all dimensions adjusted
         free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
-        all_rows = NominalRows.about(first, parameter_units(slope), free)
-        every = _cross_validated(_adjusted(first, seen, options, all_rows), options)
+        every = _cross_validated(_adjusted(first, seen, options, NominalRows.about(first, units, free)), options)
     result = Identified(
         robot=identified,
         nominal=robot,
         seen=seen,
         adjustment=solution,
         names=tuple(names),
-        covariance=covariance,
+        covariance=covariance[:k, :k],
         rank=rank,
         ranks=_ranks(state, data),
         undetermined=undetermined,
         nominal_mm=position_errors(residuals(first, seen)),
         held_out=held_out,
-        predicted=wider,
-        placed=placed(state, seen.kind, covariance, solution.units[named], robot),
+        predicted=Predicted.of(state, robot, seen, covariance, findings or ()),
+        placed=placed(state, seen.kind, covariance[:k, :k], solution.units[:k], robot),
         left=findings,
         dh_sigma=rows.sigma(identified, covariance),
         observability=_observability(identified, solution, rank),
@@ -169,18 +157,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         elasticity_sigma=elasticity_sigma,
         gain=gain,
         all_held_out=every,
-        notes=data.notes
-        + ((COMPUTED,) if computed else ())
-        + rows.notes(identified)
-        + solution.notes
-        + ((REPEATED,) if solution.places() is not None else ())
-        + doubts(prediction, seen, solution.units[named], covariance, names, tested)
-        + tuple(each.sentence() for each in findings or ())
-        + remarks
-        + ((TRY_ELASTIC,) if remarks and of_arm and not state.elastic else ())
-        + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
-    return replace(result, notes=result.notes + misgivings(result))
+    return replace(result, notes=remarks(result, held_out is not None or options.folds < LEAST_FOLDS, computed))
 
 
 def _modelled(
@@ -220,17 +198,6 @@ def _turns_as_computed(first: State, data: Measurements) -> bool:
     turned = rms(measured - modelled) if len(same) else np.inf
     away = rms(position_errors(residuals(first, observed(data, "position"))))
     return turned < ROUNDED_RAD and away > max(BEYOND_MM, BEYOND * turned * float(np.ptp(data.positions, axis=0).max()))
-
-
-def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
-    moves = np.ptp(data.q @ robot.coupling.T, axis=0)
-    still = np.flatnonzero(moves < np.where(robot.prismatic, STILL_MM, STILL_RAD)) + 1
-    if len(still) and not partial:
-        raise DegenerateError(
-            "E-IDENTIFY-UNMOVED",
-            f"{data.where}: joint {still[0]} never moved, so that its axis is not determined; measure with other "
-            f"values of q{still[0]}, or keep its nominal values with --partial",
-        )
 
 
 def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
@@ -281,7 +248,7 @@ def _without_errors(problem: ArmProblem, state: State, good: np.ndarray, rounds:
 
 def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
     """Solves and estimates σ in turns."""
-    relaxation = Relaxation()
+    last, share = np.zeros(0), 1.0
     for _ in range(rounds):
         solution = problem.solve(state)
         solution = replace(solution, spread=(spread := solution.estimated()))
@@ -289,7 +256,8 @@ def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
         change = float(np.abs(best).max())
         if change < VARIANCE_SETTLED:
             return solution
-        state, problem = solution.state, problem.scaled(relaxation.step(best))
+        last, share = best, relaxed(best, last, share) if len(last) else 1.0
+        state, problem = solution.state, problem.scaled(share * best)
     note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
     return replace(solution, problem=problem, notes=(note,) if change > VARIANCE_UNSETTLED else ())
 
@@ -363,7 +331,10 @@ def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRow
         for test_rows in dealt(rows, options.folds, rng):
             train_rows = np.setdiff1d(np.arange(rows), test_rows)
             train, test = replace(problem, measured=measured[train_rows]), measured[test_rows]
-            state = _of_targets(whole.state, train.measured)
+            state, shown = whole.state, {*train.measured.data.stations, next(iter(whole.state.stations))}
+            tools = {name: tool for name, tool in state.tools.items() if name in train.measured.data.targets}
+            stations = {name: each for name, each in state.stations.items() if name in shown}
+            state = replace(state, tools=tools, stations=stations)
             if WIDTH[measured.kind] * len(train_rows) <= replace(whole, state=state).seeks():
                 return None
             few = rows <= FEW_ROWS
@@ -378,11 +349,3 @@ def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRow
             if measured.kind == "pose":
                 rotation[repeat, test_rows] = np.linalg.norm(errors[:, :3], axis=1)
     return HeldOutRows(min(options.folds, rows), position, rotation)
-
-
-def _of_targets(state: State, measured: Observed) -> State:
-    """Returns the state with the tools and stations that ``measured`` shows, and the first station."""
-    tools = {name: tool for name, tool in state.tools.items() if name in measured.data.targets}
-    first = next(iter(state.stations))
-    stations = {name: each for name, each in state.stations.items() if name in {first, *measured.data.stations}}
-    return replace(state, tools=tools, stations=stations)

@@ -1,6 +1,5 @@
 """Prior knowledge of an arm as observations: nominal D-H rows, and the elasticity expected of it."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, replace
 from typing import Literal
 
@@ -30,36 +29,18 @@ SOME = 0.1
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
     """Prior of :func:`elasticity_values`. ``scale`` : factors to rad at the usual torque, or shares of the usual
-    moment; ``group`` : of σ of each value; ``factor_sigma`` : σ of a factor that all moments have in common."""
+    moment; ``group`` : of σ of each value; ``apart`` : (p, p) that makes the scaled deviations independent, of σ 1 in
+    the group of moments."""
 
     expected: np.ndarray
     scale: np.ndarray
     group: np.ndarray
-    factor_sigma: float = 0.0
-
-    def away(self, chain: Chain) -> np.ndarray:
-        """Returns the deviations of the chain's elasticity from the expected values, in rad or shares."""
-        assert chain.elasticity is not None
-        values = elasticity_values(chain.elasticity, HYSTERESIS in self.group)
-        return self._apart((values - self.expected) * self.scale)
-
-    def jacobian(self) -> np.ndarray:
-        """Returns the derivative of :meth:`away` by the values."""
-        return self._apart(np.diag(self.scale))
-
-    def _apart(self, shares: np.ndarray) -> np.ndarray:
-        """Returns the shares made independent, with σ 1: 1 + σ² m mᵀ is their covariance, m being the usual moments."""
-        if not self.factor_sigma:
-            return shares
-        along = np.where(self.group == MOMENT, self.expected * self.scale, 0.0)
-        size = np.linalg.norm(along)
-        along = along / size
-        less = 1 - 1 / np.sqrt(1 + (self.factor_sigma * size) ** 2)
-        return shares - less * np.multiply.outer(along, along @ shares)
+    apart: np.ndarray
 
 
 def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
-    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show its mass."""
+    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show its mass, and all
+    moments may be wrong by one factor: 1 + σ² m mᵀ is the covariance of their shares, m being the usual ones."""
     n = len(chain)
     gears = np.array([PERIODIC] * (4 * n) + [HYSTERESIS] * (n if hysteresis else 0))
     moment, beside = _moments(chain)
@@ -67,7 +48,12 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(len(gears))])
     scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(len(gears))])
     group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), gears])
-    return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
+    apart = np.eye(len(group))
+    if carried:
+        along = np.where(group == MOMENT, expected * scale, 0.0)
+        size = np.linalg.norm(along)
+        apart -= (1 - 1 / np.sqrt(1 + (HEAVIER * size) ** 2)) * np.outer(along / size, along / size)
+    return UsualElasticity(expected, scale, group, apart)
 
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
@@ -91,33 +77,22 @@ def bending(state: State, robot: Robot, deflection_rad: float, conditions: Condi
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Returns each link's usual moment (n, 3) N m, with what follows at the next joint, and its σ (n,)."""
     n = len(chain)
-    carrier = [chain.after(i) for i in range(n)]
-    last = sorted(set(range(n)) - set(carrier))
-    ends = {i: chain.end(i) for i in last}
-    longest, above = _longest(chain, ends)
-    length_m = 1e-3 * max(longest, 1.0)
-    share = above - 0.5
-    weight = GRAVITY_M_S2 * MASS_KG * length_m**2 * share / (0.5 * above.max() ** 2)
-    whole = chain.gathered(weight)
-    moment = np.zeros((n, 3))
-    for i in range(n):
-        following = [k for k in range(n) if carrier[k] == i]
-        next_mm = chain.translation[following] if following else ends[i].translation[None]
-        moment[i] = next_mm.mean(0) * weight[i] / 2 + whole[following] @ next_mm[: len(following)]
-    return 1e-3 * moment, BESIDE * length_m * whole
-
-
-def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray]:
-    """Returns the longest way, mm, from base to an end, and the number (n,) of joints from each to its farthest end."""
-    length, above = np.zeros(len(chain)), np.ones(len(chain))
-    for i, end in ends.items():
-        length[i] = np.linalg.norm(end.translation)
-    for i in range(len(chain) - 1, -1, -1):
+    following = [[k for k in range(n) if chain.after(k) == i] for i in range(n)]
+    ends = {i: chain.end(i).translation for i in range(n) if not following[i]}
+    length, above = np.array([np.linalg.norm(ends.get(i, np.zeros(3))) for i in range(n)]), np.ones(n)
+    for i in range(n - 1, -1, -1):  # the longest way from base to an end, and the joints from each to its farthest end
         before = chain.after(i)
         if before >= 0:
             length[before] = max(length[before], np.linalg.norm(chain.translation[i]) + length[i])
             above[before] = max(above[before], 1 + above[i])
-    return float(length.max()), above
+    length_m = 1e-3 * max(float(length.max()), 1.0)
+    weight = GRAVITY_M_S2 * MASS_KG * length_m**2 * (above - 0.5) / (0.5 * above.max() ** 2)
+    whole = chain.gathered(weight)
+    moment = np.zeros((n, 3))
+    for i, after in enumerate(following):
+        next_mm = chain.translation[after] if after else ends[i][None]
+        moment[i] = next_mm.mean(0) * weight[i] / 2 + whole[after] @ next_mm[: len(after)]
+    return 1e-3 * moment, BESIDE * length_m * whole
 
 
 DIFFERENCE_MM = 1e-4
@@ -131,7 +106,7 @@ FIXED_LENGTH, FIXED_ANGLE = 8, 9
 FIXED_MM, FIXED_RAD = 1e-4, 1e-7
 """σ of dimensions that are not adjusted: a ten-thousandth of a millimetre at 1 m."""
 Adjusted = Literal["all", "geometry", "zeros", "base,tool"]
-KEPT: Mapping[Adjusted, tuple[int, ...]] = {
+KEPT: dict[Adjusted, tuple[int, ...]] = {
     "all": (),
     "geometry": (ZERO,),
     "zeros": (LENGTH, TWIST),
@@ -175,16 +150,6 @@ class Deviations:
 def dh_values(robot: Robot) -> np.ndarray:
     """Returns a, alpha, d, theta, beta of the rows, (n, 5)."""
     return np.array([astuple(row) for row in robot.rows], float)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Held:
-    """Prior knowledge: ``value + jacobian @ step``, (p,), is 0 with ``sigma``; ``fixed`` : (p,) mask of conditions."""
-
-    value: np.ndarray
-    jacobian: np.ndarray
-    sigma: np.ndarray
-    fixed: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,18 +203,20 @@ class NominalRows:
         elasticity = usual(nominal.chain(), carried, state.hysteresis) if state.elastic else None
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
-    def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
-        """Returns the nominal dimensions as prior knowledge, linear about ``state``, with the σ of ``deviations``."""
+    def held(self, state: State, deviations: Deviations, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the nominal dimensions as prior knowledge about ``state``: values (p,) and their derivatives (p, k),
+        over σ, and a mask (p,) of those that are not adjusted."""
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
         others = len(parameter_names(state, kind)) - jacobian.shape[1]
-        derivative, value = np.pad(jacobian, ((0, 0), (0, others))), away[self.free]
-        if self.elasticity is not None:
-            derivative = np.asarray(block_diag(derivative, self.elasticity.jacobian()))
-            value = np.append(value, self.elasticity.away(state.chain))
+        derivative, value, usual_ = np.pad(jacobian, ((0, 0), (0, others))), away[self.free], self.elasticity
+        if usual_ is not None and state.chain.elasticity is not None:
+            apart = elasticity_values(state.chain.elasticity, state.hysteresis) - usual_.expected
+            derivative = np.asarray(block_diag(derivative, usual_.apart * usual_.scale))
+            value = np.append(value, usual_.apart @ (apart * usual_.scale))
         sigma = np.array([*astuple(deviations), 1.0, FIXED_MM, FIXED_RAD])[self.groups]
-        return Held(value, derivative, sigma, self.groups >= FIXED_LENGTH)
+        return value / sigma, derivative / sigma[:, None], self.groups >= FIXED_LENGTH
 
     @property
     def fixed(self) -> np.ndarray:

@@ -1,5 +1,6 @@
-"""Options and result of an identification."""
+"""Options and result of an identification, its file, and the remarks on it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -9,23 +10,32 @@ from pydantic import AliasPath, BeforeValidator, Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_fields
+from stcal.geometry.arrays import Array, Brief, freeze, require_fields, rms
+from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_written
-from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
-from stcal.robot.identification.adjustment import Kind, Observed, State, Weighting, position_errors, residuals
-from stcal.robot.identification.observability import ObservabilityIndices, Predicted
+from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile, Vector
+from stcal.robot.identification.adjustment import (
+    WIDTH,
+    Kind,
+    ObservabilityIndices,
+    Observed,
+    State,
+    Weighting,
+    over_ranges,
+    position_errors,
+    residuals,
+    tip_jacobian,
+)
 from stcal.robot.identification.prior import Adjusted, Placed, dh_values
-from stcal.robot.identification.problem import ArmSolution
+from stcal.robot.identification.problem import GROSS, ArmSolution
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.robot_file import WRITTEN_MM, RobotText, load_robot
-from stcal.robot.kinematics.robot_model import Elasticity, Robot
+from stcal.robot.kinematics.robot_model import USUAL, Conditions, Elasticity, Robot
 
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
 """Standard errors by which one model must predict better; rows of one fold share the error of their solution."""
-OUTLIER_WEIGHT = 0.5
-"""Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
 NO_GAIN = 0.95
 """Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
 LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
@@ -34,6 +44,22 @@ FAR_FROM_STATED = 3.0
 """Factor between the σ that residuals show and those that are stated from which on it is told."""
 MEDIAN_OF_NORMAL = 0.6745
 """Median of the size of a normal error of σ 1."""
+OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
+"""Change of a length beyond what workshops make of one type of arm, and most lengths to be shown."""
+TOGETHER, MOST_BESIDE = 0.2, 2
+"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of those."""
+SAMPLES = 200
+"""Number of joint vectors over the ranges for which σ is predicted."""
+ELSEWHERE = 3.0
+"""Largest ratio of σ over the ranges to σ at the rows without a warning: 40 rows over 60 % of the ranges have 1.6."""
+FEW = 2.0
+"""Number of measured values per parameter below which σ may come out at a tenth of the true ones."""
+REPEATED = "joint values were measured several times: what the model lacks there counts once in σ"
+COMPUTED = (
+    "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
+    "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
+)
+TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +125,8 @@ class Figures:
     def of(cls, errors: np.ndarray) -> "Figures":
         """Returns the summary of the errors that are finite."""
         errors = errors[np.isfinite(errors)]
-        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
-        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
+        found = errors.mean(), np.median(errors), rms(errors), np.percentile(errors, 95), errors.max()
+        return cls(len(errors), *(float(v) for v in found))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +162,62 @@ class Gain:
     def beyond_chance(self) -> bool:
         """True if the gain is larger than chance explains."""
         return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """σ of the tool's position, mm (root of the summed variances of x, y, z). ``here_mm`` : (m,) at the measured joint
+    values; ``model_mm`` : (s,) at random ones over the joints' ranges, and ``ranges_mm`` with ``left_mm``, the RMS of
+    effects in the residuals; ``covariance`` : (k, k) of all parameters, rad and mm."""
+
+    here_mm: np.ndarray
+    model_mm: np.ndarray
+    covariance: np.ndarray
+    left_mm: float = 0.0
+
+    @classmethod
+    def of(cls, state: State, robot: Robot, seen: Observed, covariance: np.ndarray, left: Sequence[Finding]):
+        """Returns σ for the target of most rows; None for distances, which do not place the arm."""
+        if seen.kind == "distance":
+            return None
+        data = seen.data
+        target = max(dict.fromkeys(data.targets), key=data.targets.count)
+        q = over_ranges(replace(robot, tools={"": Rigid()}), SAMPLES)
+        here = position_sigma(state, data.q, data.targets, seen.kind, covariance, data.conditions)
+        ranges = position_sigma(state, q, (target,) * SAMPLES, seen.kind, covariance)
+        effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
+        return cls(here, ranges, covariance, float(np.sqrt((effects**2).sum())))
+
+    @property
+    def ranges_mm(self) -> np.ndarray:
+        """σ (s,) at random joint values over the ranges, with what the model lacks."""
+        return np.hypot(self.model_mm, self.left_mm)
+
+    def elsewhere(self) -> float:
+        """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
+        return rms(self.ranges_mm) / max(rms(self.here_mm), 1e-9)
+
+    def at(self, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
+        """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in
+        the residuals; nan for tools that were not measured."""
+        sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
+        if known.any():
+            of_known = [name for name in targets if name in state.tools]
+            sigma[known] = np.hypot(position_sigma(state, q[known], of_known, kind, self.covariance), self.left_mm)
+        return sigma
+
+
+def position_sigma(
+    state: State,
+    q: np.ndarray,
+    targets: Sequence[str],
+    kind: Kind,
+    covariance: np.ndarray,
+    conditions: Conditions = USUAL,
+) -> np.ndarray:
+    """Returns σ (r,) of the position at joint values (r, n), mm."""
+    place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
+    return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -189,11 +271,10 @@ class Identified(Brief):
     elasticity_sigma: Elasticity | None
     gain: Gain | None
     all_held_out: HeldOutRows | None
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
-        k = len(self.names)
-        freeze(self, "covariance", (k, k), "covariance")
+        freeze(self, "covariance", (len(self.names), len(self.names)), "covariance")
 
     @property
     def model(self) -> Model:
@@ -232,31 +313,23 @@ class Identified(Brief):
 
     def outliers(self) -> list[tuple[int, float]]:
         """Returns (row of the observations, error in mm) of each observation that weighs less than half."""
-        return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
+        return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < GROSS)]
 
     @property
     def errors(self) -> dict[str, Figures]:
         """Position errors, and their predicted σ, mm, by the keys of :data:`ERRORS`."""
         held_out, every, predicted = self.held_out, self.all_held_out, self.predicted
-        found = {
-            "nominal": self.nominal_mm,
-            "identified": self.fitted_mm,
-            "held_out": None if held_out is None else held_out.position_mm,
-            "all_held_out": None if every is None else every.position_mm,
-            "sigma": None if predicted is None else predicted.here_mm,
-            "sigma_over_ranges": None if predicted is None else predicted.ranges_mm,
-        }
-        return {key: Figures.of(values) for key, values in found.items() if values is not None}
+        found = {"nominal": self.nominal_mm, "identified": self.fitted_mm}
+        found |= {} if held_out is None else {"held_out": held_out.position_mm}
+        found |= {} if every is None else {"all_held_out": every.position_mm}
+        if predicted is not None:
+            found |= {"sigma": predicted.here_mm, "sigma_over_ranges": predicted.ranges_mm}
+        return {key: Figures.of(values) for key, values in found.items()}
 
     @property
     def rows(self) -> np.ndarray:
         """Rows (n, 5) a, alpha, d, theta, beta; mm, rad."""
         return dh_values(self.robot)
-
-    @property
-    def nominal_rows(self) -> np.ndarray:
-        """The same of the nominal robot."""
-        return dh_values(self.nominal)
 
 
 ERRORS = {
@@ -267,13 +340,6 @@ ERRORS = {
     "sigma": "σ of the position, the same rows",
     "sigma_over_ranges": "σ of the position, over the joints' ranges",
 }
-
-
-class ElasticityValues(Part):
-    compliance: Matrix
-    moment: Matrix
-    periodic: Matrix
-    hysteresis: Vector
 
 
 class PlacedPose(Part):
@@ -297,7 +363,7 @@ class IdentifiedFile(ResultFile):
         description="where both were tried: RMS errors of held-out rows, `rigid_mm` and `elastic_mm`; mean by which "
         "elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
-    elasticity_sigma: ElasticityValues | None = Field(
+    elasticity_sigma: Annotated[Elasticity, Named("compliance moment periodic hysteresis")] | None = Field(
         description="σ of the elasticity, a row for each joint: `compliance` (rad/Nm) about its axis and across it, "
         "`moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
     )
@@ -339,13 +405,46 @@ class IdentifiedFile(ResultFile):
     )
 
 
-OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
-"""Change of a length beyond what workshops make of one type of arm, and most lengths to be shown."""
+def directions_named(directions: np.ndarray, names: tuple[str, ...] | list[str]) -> tuple[str, ...]:
+    """Returns names of directions (k, d), ``J2 y (with tool z)``, each led by a parameter of its own."""
+    reduced = directions.copy()
+    lead: list[int] = []
+    for column in range(reduced.shape[1]):
+        free = np.abs(reduced)
+        free[lead] = 0
+        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
+        reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
+        reduced[:, column] /= reduced[i, column]
+        others = np.arange(reduced.shape[1]) != column
+        reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
+        lead.append(int(i))
+    named = []
+    for i, direction in zip(lead, np.abs(reduced.T), strict=True):
+        order = np.argsort(-direction)
+        strong = [names[k] for k in order if k != i and direction[k] > TOGETHER * direction.max()]
+        beside = " and ".join(strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+        named.append(f"{names[i]} (with {beside})" if beside else names[i])
+    return tuple(named)
 
 
-def misgivings(result: Identified) -> tuple[str, ...]:
-    """Returns notes on contradicted σ, no gain over the nominal robot, or lengths that differ by one factor."""
-    notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
+def remarks(result: Identified, tested: bool, computed: bool) -> tuple[str, ...]:
+    """Returns the notes on a result; ``tested`` : rows were held out, or none were asked for; ``computed`` : the
+    controller computed the orientations."""
+    left, rows, conditions = result.left or (), result.adjustment.rows, result.seen.data.conditions
+    notes = [*result.seen.data.notes, *([COMPUTED] if computed else []), *rows.notes(result.robot)]
+    notes += [*result.adjustment.notes, *([REPEATED] if result.adjustment.places() is not None else [])]
+    notes += [*_little_known(result, tested), *(each.sentence() for each in left)]
+    if result.predicted is not None and left:
+        notes.append(
+            f"σ hold for these rows, and for places like theirs: the model leaves {result.predicted.left_mm:.2g} mm "
+            "RMS that goes with what is named above; over the joints' ranges the tool's position is known to "
+            f"{rms(result.predicted.ranges_mm):.2g} mm (σ, with that in it)"
+        )
+        if not result.state.elastic and any(not each.advice for each in left):
+            notes.append(TRY_ELASTIC)
+    if result.robot.elasticity is None:
+        notes += conditions.ignored("the arm as identified")
+    notes += _stated_otherwise(result)
     if result.held_out is not None:
         before, after = (result.errors[key].rms for key in ("nominal", "held_out"))
         if after > NO_GAIN * before > 0:
@@ -354,39 +453,66 @@ def misgivings(result: Identified) -> tuple[str, ...]:
                 "with the nominal one, base and tool fitted: what errs is not the robot's dimensions; check joint "
                 "values and measurements, rounding too"
             )
-    lengths = result.nominal_rows[:, [0, 2]].ravel()
+    return (*notes, *_lengths(result))
+
+
+def _little_known(result: Identified, tested: bool) -> list[str]:
+    """Returns notes on few rows, or on rows of a small part of the ranges."""
+    seen, names, found = result.seen, result.names, result.predicted
+    numbers, notes = WIDTH[seen.kind] * len(seen), []
+    few = "σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
+    if not tested:
+        few = "none can be held out to test the result, and errors of the same rows say nothing; measure twice as many"
+    if not tested or numbers < FEW * len(names):
+        notes.append(f"{len(seen)} {seen.kind}s give {numbers} numbers for {len(names)} parameters: {few}")
+    if found is None:
+        return notes
+    here, ranges = rms(found.here_mm), rms(found.model_mm)
+    times = ranges / max(here, 1e-9)
+    if times > ELSEWHERE:
+        units = result.adjustment.units[: len(names)]
+        sizes, directions = np.linalg.eigh(result.covariance / units[:, None] / units)
+        worst = directions_named(directions[:, -1:], names)[0]
+        notes.append(
+            f"over the joints' ranges the tool's position is known to {ranges:.2g} mm (σ), {times:.0f} times that at "
+            f"the measured rows, {here:.2g} mm: they are few, or of a small part of the ranges; least known: {worst}, "
+            f"± {np.sqrt(sizes[-1]):.2g} mm; add rows (`stcal robot design`), or use the result where it was measured "
+            "only"
+        )
+    return notes
+
+
+def _lengths(result: Identified) -> list[str]:
+    """Returns a note on lengths that all differ by one factor, or that are of another type of arm."""
+    lengths = dh_values(result.nominal)[:, [0, 2]].ravel()
     changes = result.rows[:, [0, 2]].ravel() - lengths
     square, free = float(lengths @ lengths), len(lengths) - 1
     if square > 0 and (changes != 0).sum() >= LEAST_LENGTHS:
         scale = float(lengths @ changes) / square
         rest = float(np.linalg.norm(changes - scale * lengths)) / np.sqrt(free * square)
         if abs(scale) > LEAST_SCALE and 2 * t_distribution.sf(abs(scale) / max(rest, 1e-15), free) < BY_CHANCE:
-            notes.append(
+            return [
                 f"all lengths of the robot are {1 + scale:.5f} ± {rest:.1g} times nominal: rather than of the arm, "
                 "this is the scale of the instrument, or of a board or target by which positions were measured; check "
                 "a known length"
-            )
-            return tuple(notes)
+            ]
     far = np.flatnonzero(np.abs(changes) > OTHER_TYPE_MM)
-    if len(far):
-        which = ", ".join(f"{'ad'[i % 2]} of joint {i // 2 + 1} by {changes[i]:+.1f} mm" for i in far[:SHOWN_LENGTHS])
-        notes.append(
-            f"lengths are not those of the robot file: {which}; arms of one type differ by less than 2 mm: check that "
-            "the file is of this type, and its units"
-        )
-    return tuple(notes)
+    which = ", ".join(f"{'ad'[i % 2]} of joint {i // 2 + 1} by {changes[i]:+.1f} mm" for i in far[:SHOWN_LENGTHS])
+    said = (
+        f"lengths are not those of the robot file: {which}; arms of one type differ by less than 2 mm: check that the "
+        "file is of this type, and its units"
+    )
+    return [said] if len(far) else []
 
 
-def _stated_otherwise(result: Identified) -> str | None:
-    """Returns a note on stated σ that are far from what the residuals show, None where they are not."""
+def _stated_otherwise(result: Identified) -> list[str]:
+    """Returns a note on stated σ that are far from what the residuals show."""
     sigma, kind = result.weighting, result.seen.kind
-    few = np.count_nonzero(result.weights < OUTLIER_WEIGHT)
+    few = np.count_nonzero(result.weights < GROSS)
     remedy = "check --sigma-mm and --sigma-rad, or covariances, and their units; or leave them out, to have σ estimated"
     if 2 * few > len(result.weights):
-        return (
-            f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small: "
-            f"{remedy}"
-        )
+        said = f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small"
+        return [f"{said}: {remedy}"]
     ratios = {"residuals": sigma.factor}
     if not sigma.given:
         medians = replace(sigma, estimated=()).medians(sigma.factor * sigma.whiten(result.residuals, result.seen))
@@ -394,7 +520,7 @@ def _stated_otherwise(result: Identified) -> str | None:
         ratios = {names[n]: v / MEDIAN_OF_NORMAL for n, v in medians.items() if n not in sigma.estimated}
     far = {what: ratio for what, ratio in ratios.items() if not 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED}
     what = max(far, key=lambda each: abs(np.log(max(far[each], 1e-12))), default="")
-    return f"{what} are {far[what]:.2g} times the σ that are stated: {remedy}" if far else None
+    return [f"{what} are {far[what]:.2g} times the σ that are stated: {remedy}"] if far else []
 
 
 def require_identified_written(path: Path | str, result: Identified) -> None:

@@ -1,21 +1,21 @@
 """Start of an identification: base and tools fitted with the nominal axes; refuses data that do not fit the robot."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations, product
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import fminbound, least_squares
+from scipy.optimize import least_squares
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
-from stcal.robot.identification.adjustment import State, observed, residuals, tips_of
+from stcal.robot.identification.adjustment import State, observed, position_errors, residuals, tips_of
 from stcal.robot.identification.problem import USELESS_MM
 from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
@@ -32,8 +32,8 @@ smallest damping, which keeps what these positions leave open at its start, as t
 NEARLY = 1e-3
 """Share of the squared misfit that the next step may still gain: of a wrong robot file the valley is flat."""
 STILL_MM = 0.01
-QUARTERS_DEG, ZERO_STEP_DEG = (90, -90, 180), 30
-"""Errors of a joint's zero by conventions of the home position, and step at which others are looked for."""
+QUARTERS_DEG = (90, -90, 180)
+"""Errors of a joint's zero by conventions of the home position."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
@@ -42,7 +42,7 @@ MOST_NAMED, SHOWN = 3, 6
 GUESS_ROWS = 60
 """Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
 MOST_JOINTS = 8
-"""Largest number of joints of which two or three at a time are tried; their number grows with the third power."""
+"""Largest number of joints of which two at a time are tried."""
 LEAST_ORIENTATIONS = 5
 """Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
 PROBED, MOST_MOVES = 8, 4
@@ -61,20 +61,21 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         return _with_stations(robot, data, fit)
     named = sorted(set(data.targets))
     _require_motion(data, named)
-    missing = [] if robot.tree is None else [name for name in named if name not in robot.tree.carriers]
-    if missing:
-        target, key = "the tool of rows without a target", "[tool] joint"
-        if missing[0]:
-            target, key = f"target {missing[0]}", "it a [[target]] with joint"
-        raise InputError(
-            "E-ROBOT-TREE",
-            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
-            f"{key}",
-        )
-    if "tool" in fit:
-        tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in named}
-    else:
-        tools = {name: robot.tool(name) for name in named}
+    carriers = named if robot.tree is None else robot.tree.carriers
+    for name in named:
+        if name not in carriers:
+            target, key = (
+                (f"target {name}", "it a [[target]] with joint")
+                if name
+                else ("the tool of rows without a target", "[tool] joint")
+            )
+            raise InputError(
+                "E-ROBOT-TREE",
+                f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; "
+                f"give {key}",
+            )
+    default = robot.tools.get("", Rigid())
+    tools = {name: robot.tools.get(name, default) if "tool" in fit else robot.tool(name) for name in named}
     state, misfit = _placed(robot, data, tools, fit)
     extent = _extent(data)
     if misfit > FITS * extent:
@@ -101,44 +102,45 @@ def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
     state = replace(state, tools=tools)
     stations = dict(state.stations)
     for name, rows in others:
-        station_data = data[rows]
+        part = data[rows]
+        places = tips_of(state, part).translation
         try:
-            station = align_rigid(station_data.points(), tips_of(state, station_data).translation)
+            stations[name] = align_rigid(part.points(), places)
         except DegenerateError as error:
             raise DegenerateError(
                 "E-STATION-FEW",
                 f"{data.where}: station {name}: {rows.sum()} positions do not show where it stands; 3 or more off one "
                 "line needed, or leave them out",
             ) from error
-        difference = station_data.points() - (station @ tips_of(state, station_data)).translation
-        misfit, extent = float(np.sqrt((difference**2).sum(1).mean())), _extent(station_data)
+        misfit, extent = _length_rms(part.points() - stations[name] @ places), _extent(part)
         if misfit > FITS * extent:
             raise InputError(
                 "E-IDENTIFY-STATION",
                 f"{data.where}: station {name}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station "
                 f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station",
             )
-        stations[name] = station
     return replace(state, stations=stations)
+
+
+def _length_rms(xyz: np.ndarray) -> float:
+    return float(np.sqrt((xyz**2).sum(-1).mean()))
 
 
 def _extent(data: Measurements) -> float:
     """Returns the RMS of the measured positions about their mean, or of the measured distances, mm."""
     if data.positions is None:
-        return float(np.sqrt((data.lengths()[0] ** 2).mean()))
-    return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
+        return _length_rms(data.lengths()[0][:, None])
+    return _length_rms(data.positions - data.positions.mean(0))
 
 
 def _require_motion(data: Measurements, targets: list[str]) -> None:
-    if data.positions is None:
-        if np.ptp(data.lengths()[0]) < STILL_MM:
-            raise DegenerateError(
-                "E-IDENTIFY-UNDETERMINED",
-                f"{data.where}: all distances are equal; positions apart from one another needed",
-            )
-        return
-    for name in targets:
-        xyz = data.positions[[t == name for t in data.targets]]
+    if data.positions is None and np.ptp(data.lengths()[0]) < STILL_MM:
+        raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
+            f"{data.where}: all distances are equal; positions apart from one another needed",
+        )
+    for name in targets if data.positions is not None else ():
+        xyz = data.points()[[t == name for t in data.targets]]
         moved = float(np.linalg.norm(np.ptp(xyz, axis=0)))
         if moved < STILL_MM and len(xyz) > 1:
             raise DegenerateError(
@@ -168,16 +170,16 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
                 "not determined; move joints that take the target off the line",
             )
     given = None if "base" in fit else robot.world_from_base
-    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
+    base, points = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
+    turns = np.array([tools[name].rotation for name in names])
     if data.rotations is not None and "tool" in fit:
-        seen = base.inverse() @ data.poses()
-        turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
-        for k, name in enumerate(names):
-            rotation, _ = best_rotations(turns[rows == k].sum(0))
-            tools = tools | {name: Rigid(rotation, tools[name].translation)}
-    tools = {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}
-    placed = replace(robot, world_from_base=base)
-    return State(placed.chain(), tools), misfit
+        seen = np.swapaxes(flange.rotation, 1, 2) @ (base.inverse() @ data.poses()).rotation
+        turns = [best_rotations(seen[rows == k].sum(0))[0] for k in range(len(names))]
+    state = State(
+        replace(robot, world_from_base=base).chain(),
+        {name: Rigid(turn, point) for name, turn, point in zip(names, turns, points, strict=True)},
+    )
+    return state, _length_rms(base @ (flange @ points[rows]) - data.positions)
 
 
 def _base_and_points(
@@ -188,8 +190,8 @@ def _base_and_points(
     points: np.ndarray,
     given: Rigid | None = None,
     fit_points: bool = True,
-):
-    """Returns base (unless ``given``) and tool points by least squares, and the RMS misfit, mm."""
+) -> tuple[Rigid, np.ndarray]:
+    """Returns base (unless ``given``) and tool points (t, 3) by least squares, mm."""
     free = np.array([given is None] * 6 + [fit_points] * points.size)
     try:
         base = given or align_rigid(positions, flange @ points[rows])
@@ -217,53 +219,51 @@ def _base_and_points(
             float(at[2] @ (information * at[2])), np.diag(information), information * at[2]
         )
 
-    if free.any():
-        minimum = minimise(
-            (base, points, np.zeros(len(information))),
-            linearise,
-            lambda at, step: (at[0].moved(step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
-            least_damping=REGULAR,
-            settled=SETTLED,
-            max_steps=ROUNDS,
-        )
-        accepted = NEARLY * float(minimum.linear.cost)
-        minimum.required(f"{where}: base and tools", "check the D-H rows and the joint values", accepted)
-        base, points, _ = minimum.state
-    misfit = np.linalg.norm(base @ (flange @ points[rows]) - positions, axis=1)
-    return base, points, float(np.sqrt((misfit**2).mean()))
+    if not free.any():
+        return base, points
+    minimum = minimise(
+        (base, points, np.zeros(len(information))),
+        linearise,
+        lambda at, step: (at[0].moved(step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
+        least_damping=REGULAR,
+        settled=SETTLED,
+        max_steps=ROUNDS,
+    )
+    accepted = NEARLY * float(minimum.linear.cost)
+    return minimum.required(f"{where}: base and tools", "check the D-H rows and the joint values", accepted).state[:2]
 
 
 def _points_of_distances(
     robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray, fit_points: bool
-):
+) -> tuple[np.ndarray, float]:
     """Returns tool points by least squares, starting at those given and around them; and the RMS misfit, mm."""
+    distances, from_row = data.lengths()
 
     def errors(moved: np.ndarray) -> np.ndarray:
         tip = flange @ moved.reshape(-1, 3)[rows]
         return distances - np.linalg.norm(tip - tip[from_row], axis=1)
 
-    distances, from_row = data.lengths()
-    if not fit_points:
-        return points, float(np.sqrt((errors(points.ravel()) ** 2).mean()))
-    reach = reach_mm(robot, robot.tools)
-    around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    # This is a start, converged or not: the adjustment goes on from here, and reports if it does not converge.
-    fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
-    best = min(fits, key=lambda fit: fit.cost)
-    return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
+    if fit_points:
+        around = AROUND * reach_mm(robot, robot.tools) * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        # This is a start, converged or not: the adjustment goes on from here, and reports if it does not converge.
+        fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
+        points = min(fits, key=lambda fit: fit.cost).x.reshape(-1, 3)
+    return points, _length_rms(errors(points.ravel())[:, None])
+
+
+Case = tuple[str, str, Robot, Measurements]
+"""What was mistaken, the remedy, and robot and data without the mistake."""
 
 
 def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
     """Raises an error that says what is wrong with the data, or with the robot file."""
-    says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
-    says += f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; "
-    thinned = _thinned(data)
+    thinned = data  # enough rows of positions to judge a guess; distances, which refer to one another, as they are
+    if data.positions is not None:
+        thinned = data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
     levels = (
         [("", "", robot, data)],
-        chain(_single(robot, thinned), _late(robot, data)),
+        chain(*(kind(robot, thinned) for kind in (_of_values, _of_rows, _of_order)), _of_frames(robot, data)),
         _moves_of(robot, data, tools),
-        _any_zero(robot, thinned, tools),
-        _pairs(robot, thinned),
     )
     most, found = min(EXPLAINS * misfit / extent, FITS), []
     for level in levels:  # one after the other: what a level tries may be impossible where an earlier one explains
@@ -275,17 +275,17 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
             break
     words = []
     for each, _ in found[:MOST_NAMED]:
-        far = _not_there(each.change()[1], _fitting(each.change(), tools)[1])
-        words.append(", and ".join(filter(None, (each.words, far))))
+        guess, far = each.change()[1], _fitting(each.change(), tools)[1]
+        lines = [str(guess.lines[row]) for row in np.flatnonzero(far)]
+        shown = ", ".join(lines[:SHOWN]) + (", …" if len(lines) > SHOWN else "")
+        rows = f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
+        words.append(", and ".join(filter(None, (each.words, rows if lines else ""))))
     cause = "check D-H rows and convention, the order and zero of joints, coupling, and units"
-    raise InputError("E-IDENTIFY-MISFIT", says + (f"it would fit if {', or if '.join(words)}" if words else cause))
-
-
-def _thinned(data: Measurements) -> Measurements:
-    """Returns enough rows of positions to judge a guess; distances, which refer to one another, as they are."""
-    if data.positions is None:
-        return data
-    return data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
+    raise InputError(
+        "E-IDENTIFY-MISFIT",
+        f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, {FITS * extent:.3g} mm "
+        f"allowed, {FITS:.0%} of their spread; " + (f"it would fit if {', or if '.join(words)}" if words else cause),
+    )
 
 
 def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
@@ -298,7 +298,7 @@ def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple
         share = misfit / _extent(used)
         if data.positions is None:
             break
-        errors = np.linalg.norm(residuals(state, observed(data, "position")), axis=1)
+        errors = position_errors(residuals(state, observed(data, "position")))
         limit = max(FAR * float(np.median(errors[near])), FITS * _extent(used))
         before, near = near, errors <= limit
         if share < FITS or (near == before).all() or near.mean() < MOSTLY_NEAR:
@@ -306,37 +306,15 @@ def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple
     return share, ~near
 
 
-def _not_there(data: Measurements, far: np.ndarray) -> str:
-    """Returns the reason that rows (m,) are far off; empty if there are none."""
-    lines = [str(line) for line, off in zip(data.lines, far, strict=True) if off]
-    shown = ", ".join(lines[:SHOWN]) + (", …" if len(lines) > SHOWN else "")
-    said = f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
-    return said if lines else ""
-
-
-Case = tuple[str, str, Robot, Measurements]
-"""What was mistaken, the remedy, and robot and data without the mistake."""
-
-
-def _late(robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Yields joint values that stand one row from the positions they belong to."""
-    if data.positions is None or len(data) < 3:
-        return
-    cure = "pair each position with the joint values of its moment"
-    for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
-        shifted = _thinned(replace(data[places], q=data.q[joints]))
-        yield f"joint values stood one row further {way}", cure, robot, shifted
-
-
 def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
     """Yields the rows before instrument, base or target moved, if the rows between moves all fit by themselves."""
     if data.positions is None or robot.tree is not None:
         return
-    starts = [0]
+    starts, far_mm = [0], FITS * _extent(data)
     while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
         state, misfit = _placed(robot, data[first : first + PROBED], tools)
-        far = np.linalg.norm(residuals(state, observed(data[first:], "position")), axis=1) > FITS * _extent(data)
-        if misfit > FITS * _extent(data) or not far.any():
+        far = position_errors(residuals(state, observed(data[first:], "position"))) > far_mm
+        if misfit > far_mm or not far.any():
             break
         starts.append(first + int(far.argmax()))
     ends = [*starts[1:], len(data)]
@@ -346,18 +324,18 @@ def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
     if any(_placed(robot, each, tools)[1] > FITS * _extent(each) for each in pieces):
         return
     stations = tuple(str(k) for k, piece in enumerate(pieces) for _ in range(len(piece)))
-    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
     try:
         _with_stations(robot, replace(data, stations=stations), BOTH)
         what, column = "the instrument, or the robot's base, had", "station"
     except InputError:
         what, column = "the target, and perhaps the instrument, had", "target"
+    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
     what = f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}"
     yield what, f"name the rows from there on in column {column}", robot, pieces[0]
 
 
-def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Yields frequent mistakes, one at a time."""
+def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields data with joint values and lengths of another unit, sign or coupling."""
     q, sliding, n = data.q, robot.prismatic, len(robot.rows)
     for what, cure, values in (
         ("joint values are radians in columns of degrees", "call the columns q1_rad …", q * (180 / np.pi)),
@@ -372,11 +350,43 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
             scaled = {name: times * values for name, values in lengths.items() if values is not None}
             cure = f"call the columns x_{right} … or distance_{right}"
             yield f"lengths are {held} in columns of {said}", cure, robot, replace(data, **scaled)
-    yield from chain.from_iterable(kind(robot, data) for kind in KINDS)
+    for i in range(n):
+        cure = f"check its direction in the rows, or the sign of q{i + 1}"
+        reversed_ = replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
+        yield f"joint {i + 1} had the opposite sign", cure, robot, reversed_
+    if (robot.coupling != np.eye(n)).any():
+        yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
+        other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
+        cure = "change the signs of coupling off its diagonal"
+        yield "the joints were coupled with the other sign", cure, other, data
+    elif n >= 3:
+        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
+            coupling = np.eye(n)
+            coupling[2, 1] = sign
+            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}"
+            yield what, "give coupling in the robot file", replace(robot, coupling=coupling), data
+
+
+def _of_rows(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields the robot with rows of the other convention, unit, or zeros of joints that neither base nor tool takes."""
+    other = "standard" if robot.convention == "modified" else "modified"
+    cure = f'give convention = "{other}" in the robot file'
+    yield f"rows were of the {other} convention", cure, replace(robot, convention=other), data
     angles = np.array([[row.alpha, row.theta] for row in robot.rows])
     if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
         rows = tuple(replace(row, alpha=np.degrees(row.alpha), theta=np.degrees(row.theta)) for row in robot.rows)
         yield "angles of the robot file were radians", "write them in degrees", replace(robot, rows=rows), data
+    inner = np.flatnonzero(~robot.prismatic[1:-1]) + 1
+    for i, turn in product(inner.tolist(), QUARTERS_DEG):
+        rows = list(robot.rows)
+        rows[i] = replace(rows[i], theta=rows[i].theta + np.radians(turn))
+        turned = replace(robot, rows=tuple(rows))
+        yield f"theta of joint {i + 1} were larger by {turn:+d}°", "correct theta_deg", turned, data
+
+
+def _of_order(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields columns or rows in another order."""
+    q, sliding, n = data.q, robot.prismatic, len(robot.rows)
     for i, k in combinations(range(n), 2) if n <= MOST_JOINTS else ():
         if sliding[i] == sliding[k]:
             order = [{i: k, k: i}.get(r, r) for r in range(n)]
@@ -388,8 +398,17 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     if sliding.all() or not sliding.any():
         backward = replace(data, q=q[:, ::-1])
         yield "joint values were in the opposite order, the last joint first", "correct the columns", robot, backward
+
+
+def _of_frames(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields positions that are of other rows, mirrored, or seen from the tool."""
     if data.positions is None:
         return
+    cure = "pair each position with the joint values of its moment"
+    for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
+        if len(data) > 2:
+            shifted = replace(data[places], q=data.q[joints])
+            yield f"joint values stood one row further {way}", cure, robot, shifted
     moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
     if not moved.all():
         first, last = np.flatnonzero(~moved)[[0, -1]]
@@ -405,90 +424,3 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
         inverted = replace(data, positions=inverse.translation, rotations=inverse.rotation, covariance=None)
         cure = "give the tool in the instrument's frame"
         yield "poses are inverse (instrument seen from the tool)", cure, robot, inverted
-
-
-def _pairs(robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Yields the data with two mistakes undone: of different kinds, two wrong zeros, or several reversed signs."""
-    n = len(robot.rows)
-    if n > MOST_JOINTS:
-        return
-    for i, k in combinations(_inner(robot), 2):
-        for one, two in product(QUARTERS_DEG, repeat=2):
-            what = f"theta of joints {i + 1} and {k + 1} were larger by {one:+d}° and {two:+d}°"
-            yield what, "correct theta_deg", _turned(robot, {i: one, k: two}), data
-    for count in (2, 3):
-        for group in combinations(np.flatnonzero(~robot.prismatic).tolist(), count):
-            what = f"joints {', '.join(str(i + 1) for i in group)} had the opposite sign"
-            reversed_ = replace(data, q=data.q * np.where(np.isin(np.arange(n), group), -1, 1))
-            yield what, "check their directions in the rows, or the signs of q", robot, reversed_
-    for first, second in combinations(KINDS, 2):
-        for what, _, variant, guess in first(robot, data):
-            for more, cure, both, changed in second(variant, guess):
-                yield f"{what} and {more}", cure, both, changed
-
-
-def _other_convention(robot: Robot, data: Measurements) -> Iterator[Case]:
-    other = "standard" if robot.convention == "modified" else "modified"
-    cure = f'give convention = "{other}" in the robot file'
-    yield f"rows were of the {other} convention", cure, replace(robot, convention=other), data
-
-
-def _zeros(robot: Robot, data: Measurements) -> Iterator[Case]:
-    for i, turn in product(_inner(robot), QUARTERS_DEG):
-        yield f"theta of joint {i + 1} were larger by {turn:+d}°", "correct theta_deg", _turned(robot, {i: turn}), data
-
-
-def _any_zero(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
-    """Yields the turn of each inner joint's zero that fits best, whatever its size."""
-    for i in _inner(robot):
-
-        def misfit(turn: float, i: int = i) -> float:
-            return _placed(_turned(robot, {i: turn}), data, tools)[1]
-
-        try:
-            start_deg = min(range(-180, 180, ZERO_STEP_DEG), key=misfit)
-            least = fminbound(misfit, start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG, xtol=0.02)
-        except (DegenerateError, ConvergenceError):
-            continue
-        turn = np.asarray(least).item()
-        what = f"theta of joint {i + 1} were larger by {turn:+.1f}°"
-        yield what, "correct theta_deg, or the joint's zero", _turned(robot, {i: turn}), data
-
-
-def _signs(robot: Robot, data: Measurements) -> Iterator[Case]:
-    for i in range(n := len(robot.rows)):
-        cure = f"check its direction in the rows, or the sign of q{i + 1}"
-        reversed_ = replace(data, q=data.q * np.where(np.arange(n) == i, -1, 1))
-        yield f"joint {i + 1} had the opposite sign", cure, robot, reversed_
-
-
-def _couplings(robot: Robot, data: Measurements) -> Iterator[Case]:
-    n = len(robot.rows)
-    if (robot.coupling != np.eye(n)).any():
-        yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
-        other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
-        cure = "change the signs of coupling off its diagonal"
-        yield "the joints were coupled with the other sign", cure, other, data
-    elif n >= 3:
-        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
-            coupling = np.eye(n)
-            coupling[2, 1] = sign
-            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}"
-            yield what, "give coupling in the robot file", replace(robot, coupling=coupling), data
-
-
-KINDS = (_other_convention, _zeros, _signs, _couplings)
-"""Kinds of mistakes of which two may have been made."""
-
-
-def _inner(robot: Robot) -> list[int]:
-    """Returns the revolute joints whose zeros neither base nor tool can absorb: all but the first and the last."""
-    return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
-
-
-def _turned(robot: Robot, turns_deg: Mapping[int, float]) -> Robot:
-    """Returns the robot with θ of its rows larger by these angles."""
-    rows = list(robot.rows)
-    for i, turn in turns_deg.items():
-        rows[i] = replace(rows[i], theta=rows[i].theta + np.radians(turn))
-    return replace(robot, rows=tuple(rows))

@@ -39,14 +39,7 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An effect found in the residuals.
-
-    ``what`` : its name ("the angle of joint 3, once a turn"); ``joint``, ``turns`` : number of the joint, and of
-    periods in one turn of it, 0 where there is none; ``effect_mm``, ``effect_rad`` : amplitude in the residuals if it
-    is periodic, size of a jump, else RMS; ``share`` : of the squared residuals (weighted as in the fit) explained;
-    ``p`` : probability of such an effect by chance, times the number of tests; ``line`` : of the first row after a jump
-    along the order of the rows; ``advice`` : what to do about it, empty for effects of the robot.
-    """
+    """An effect found in the residuals; the result file of ``identify`` describes the fields (``left``)."""
 
     what: str
     joint: int
@@ -86,22 +79,18 @@ def left(
     ``explained`` : (r, w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are
     left out.
     """
-    if explained is None:
-        explained = jacobian(state, measured)
+    explained = jacobian(state, measured) if explained is None else explained
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
     rows = _Weighted(residuals(state, measured), weighting, measured)
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
-    tests = len(candidates) + len(order)
-    good = np.ones(len(rows.errors), bool) if weights is None else weights >= GROSS
-    root = np.sqrt(np.ones(len(good)) if weights is None else weights) * good
-    rest = _Rest.of(rows, explained, candidates, root)
+    weights = np.ones(len(rows.errors)) if weights is None else weights
+    rest = _Rest.of(rows, explained, candidates, np.sqrt(weights) * (weights >= GROSS))
     findings: list[Finding] = []
     while len(findings) < MOST:
-        tried = rest.strongest(len(order)), _moved_meanwhile(rows, order, explained, tests)
-        beyond_chance = [found for found in tried if found is not None]
-        if not beyond_chance:
+        tried = rest.strongest(len(order)), _moved_meanwhile(rows, order, explained, len(candidates) + len(order))
+        found = min((each for each in tried if each is not None), key=lambda each: each.log_p, default=None)
+        if found is None:
             break
-        found = min(beyond_chance, key=lambda each: each.log_p)
         findings.append(found.finding)
         explained = np.concatenate([explained, found.motions], axis=2)
         rest = found.rest or _Rest.of(rows, explained, candidates, found.root)
@@ -183,31 +172,27 @@ class _Rest:
         square = float(remaining @ remaining)
         return cls(rows.errors[good], before, fitted, remaining, square, freedom, root, effects)
 
-    def _size(self, takes: np.ndarray, part: slice) -> float:
-        """Returns the RMS of ``takes`` (N,), rad or mm."""
-        width = self.errors.shape[1]
-        unit, size, taken = (
-            float((each.reshape(-1, width)[:, part] ** 2).sum()) for each in (self.errors, self.before, takes)
-        )
-        return float(np.sqrt(unit / np.count_nonzero(self.root) / max(size, 1e-300) * taken))
-
     def strongest(self, others: int) -> _Found | None:
         """Returns the candidate that explains most beyond chance; ``others`` : number of further tests."""
         tried = [(each, test) for each, values in self.effects if (test := self._tested(values))]
         if not tried:
             return None
         candidate, (log_p, takes, new) = min(tried, key=lambda each: each[1][0])
-        amplitude = np.sqrt(2) if candidate.turns else 1.0
-        mm = float(amplitude * self._size(takes, slice(-3, None)))
-        rad = float(amplitude * self._size(takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
+        amplitude, width = np.sqrt(2) if candidate.turns else 1.0, self.errors.shape[1]
+
+        def size(part: slice) -> float:
+            """Returns the amplitude, or RMS, of what the candidate takes, rad or mm."""
+            unit, white, taken = (
+                float((each.reshape(-1, width)[:, part] ** 2).sum()) for each in (self.errors, self.before, takes)
+            )
+            return float(amplitude * np.sqrt(unit / np.count_nonzero(self.root) / max(white, 1e-300) * taken))
+
+        mm, rad = size(slice(-3, None)), size(slice(0, 3)) if width == 6 else 0.0
         log_p += float(np.log(len(tried) + others))
-        share, p = float(takes @ takes) / max(self.square, 1e-300), float(np.exp(min(log_p, 0.0)))
-        rest = replace(
-            self,
-            fitted=np.hstack([self.fitted, new]),
-            remaining=self.remaining - takes,
-            freedom=self.freedom - new.shape[1],
-        )
+        share, fitted = float(takes @ takes) / max(self.square, 1e-300), np.hstack([self.fitted, new])
+        freedom = self.freedom - new.shape[1]
+        rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
+        p = float(np.exp(min(log_p, 0.0)))
         finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
         return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
 
@@ -239,8 +224,9 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
 
 def _shared(state: State, measured: Observed) -> np.ndarray:
     """Returns shifts (r, w, c) of positions from which several distances start: each is in all of its distances."""
-    starts = [row for row in np.unique(measured.second) if (measured.second == row).sum() >= SHARED]
-    if measured.kind != "distance" or not starts:
+    starts, counts = np.unique(measured.second, return_counts=True)
+    starts = starts[counts >= SHARED]
+    if measured.kind != "distance" or not len(starts):
         return np.zeros((len(measured), WIDTH[measured.kind], 0))
     place = tips_of(state, measured.data).translation
     away = place[measured.first] - place[measured.second]
@@ -255,22 +241,22 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     """Returns what may move during the measurements; none for distances, which no frame enters."""
     if measured.used == "distance":
         return []
-    tip, data = tips_of(state, measured.data), measured.data
+    tip, data, order = tips_of(state, measured.data), measured.data, []
+
+    def add(what: str, motions: np.ndarray, advice: str, joint: int = 0, slides: bool = False) -> None:
+        order.append(_Effect(what, joint, as_seen(state, measured, tip, motions), 0, advice, slides))
+
+    another = "name these rows another {0} (column {0}), or measure again"
     frame = frame_motions(tip, tip.translation.mean(0))
-    advice = "name these rows another station (column station), or measure again"
-    what = "the instrument or the robot's base elsewhere"
-    order = [_Effect(what, 0, as_seen(state, measured, tip, frame), advice=advice)]
+    add("the instrument or the robot's base elsewhere", frame, another.format("station"))
     for name in dict.fromkeys(data.targets):
         on_flange = tool_motions(tip, data.targets, name, measured.kind)
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
-        advice = "name these rows another target (column target), or measure again"
-        order.append(_Effect(what, 0, as_seen(state, measured, tip, on_flange), advice=advice))
-    twists = joint_motions(state.chain, data.q, tip, data.conditions)
-    twists = twists * state.chain.carries(data.targets)[:, :, None]
-    for i, (twist, slides) in enumerate(zip(twists, state.chain.prismatic.tolist(), strict=True)):
-        motions = twist[:, :, None]
-        what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
-        order.append(_Effect(what, i + 1, as_seen(state, measured, tip, motions), advice=advice, slides=slides))
+        add(what, on_flange, another.format("target"))
+    twists = joint_motions(state.chain, data.q, tip, data.conditions) * state.chain.carries(data.targets)[:, :, None]
+    for i, (twist, slides) in enumerate(zip(twists, state.chain.prismatic.tolist(), strict=True), 1):
+        advice = "look whether it slipped, and measure again"
+        add(f"the zero of joint {i} another one", twist[:, :, None], advice, i, slides)
     return order
 
 
@@ -282,17 +268,15 @@ def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarra
     if not found:
         return None
     moved, change = min(found, key=lambda each: each[1].log_p)
-    log_p = change.log_p + float(np.log(tests))
-    mm, rad = _size(moved, change)
     what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
     if change.kind != "drift":
         lines = rows.measured.lines
         line, advice = lines[change.row], moved.advice
-        likely = f"{lines[change.first]} to {lines[change.last]}"
-        where = f"line {line}" + (f" ({likely} as likely)" if change.first < change.last else "")
-        what = f"the order of the rows, {moved.what} from {where} on"
+        likely = f" ({lines[change.first]} to {lines[change.last]} as likely)" if change.first < change.last else ""
+        what = f"the order of the rows, {moved.what} from line {line}{likely} on"
+    log_p = change.log_p + float(np.log(tests))
     p = float(np.exp(min(log_p, 0.0)))
-    finding = Finding(what, moved.joint, 0, mm, rad, change.share, p, line, advice)
+    finding = Finding(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
     taken = change.moves[:, None, None] * moved.motions
     return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
 
@@ -315,45 +299,41 @@ def _size(moved: _Effect, change: Change) -> tuple[float, float]:
 
 
 def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> list[_Effect]:
+    """Returns what may go with the place, or with the values and torques of joints."""
     chain, data = state.chain, measured.data
     tip = tips_of(state, data)
     turned, origins = joint_frames(chain, data.q, data.conditions)
     base, place = world_from_base.rotation, world_from_base.inverse() @ tip.translation
     along = np.concatenate([np.zeros((3, 3)), base])  # motions along the base's axes
-    values = data.q @ chain.coupling.T
-    carries = chain.carries(data.targets)
-    candidates = []
+    values, carries, candidates = data.q @ chain.coupling.T, chain.carries(data.targets), []
 
     def add(what: str, motions: np.ndarray, joint: int = 0, turns: int = 0) -> None:
         if joint:
             motions = motions * carries[joint - 1, :, None, None]
         candidates.append(_Effect(what, joint, as_seen(state, measured, tip, motions), turns))
 
-    twists = joint_motions(chain, data.q, tip, data.conditions)
+    twists = joint_motions(chain, data.q, tip, data.conditions)[..., None]
     for i, (z, origin, twist) in enumerate(zip(turned[..., 2], origins, twists, strict=True)):
-        joint, arm = i + 1, tip.translation - origin
-        for k in range(len(chain.prismatic)):
-            if k != i:
-                what = f"the value of joint {k + 1}, along the motion of joint {joint}"
-                what += ", as of a coupling that the robot file does not state"
-                add(what, twist[:, :, None] * values[:, k, None, None], joint)
+        joint, arm, own = i + 1, tip.translation - origin, values[:, i, None, None]
+        for k in [k for k in range(len(chain)) if k != i]:
+            what = f"the value of joint {k + 1}, along the motion of joint {joint}"
+            add(f"{what}, as of a coupling that the robot file does not state", twist * values[:, k, None, None], joint)
         if chain.prismatic[i]:
-            add(f"the value of joint {joint}, along its motion", twist[:, :, None] * values[:, i, None, None], joint)
-            add(f"the value of joint {joint}", along * values[:, i, None, None], joint)
+            add(f"the value of joint {joint}, along its motion", twist * own, joint)
+            add(f"the value of joint {joint}", along * own, joint)
             continue
-        add(f"the zero of joint {joint}", twist[:, :, None], joint)
+        add(f"the zero of joint {joint}", twist, joint)
         for turns, period in TURNS.items():
             waves = np.stack([np.cos(turns * values[:, i]), np.sin(turns * values[:, i])], axis=1)
             what = f"the angle of joint {joint}, {period}"
-            add(f"{what}, along its motion", twist[:, :, None] * waves[:, None], joint, turns)
+            add(f"{what}, along its motion", twist * waves[:, None], joint, turns)
             add(what, np.einsum("dc,mt->mdct", along, waves).reshape(len(waves), 6, 6), joint, turns)
         approach = data.conditions.approach
         if approach is not None and approach[:, i].any():
-            add(f"the direction from which joint {joint} came", twist[:, :, None] * approach[:, i, None, None], joint)
+            add(f"the direction from which joint {joint} came", twist * approach[:, i, None, None], joint)
         torque = np.einsum("mi,mi->m", z, np.cross(arm, base[:, 2]))
         if np.abs(torque).max() > NEW * np.linalg.norm(arm, axis=1).max():
-            what = f"gravity's torque about joint {joint}"
-            add(what, (twist * torque[:, None])[:, :, None], joint)
+            add(f"gravity's torque about joint {joint}", twist * torque[:, None, None], joint)
     radial = np.linalg.norm(place[:, :2], axis=1)
     add("the scale of lengths", np.pad(place @ base.T, ((0, 0), (3, 0)))[:, :, None])
     add("the place, linearly", np.einsum("dc,mp->mdcp", along, place).reshape(len(place), 6, 9))

@@ -16,8 +16,7 @@ from stcal.io.json import Part, ResultFile, Shape, Vector
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS, csv_text
 from stcal.parallel import one_thread
-from stcal.robot.identification.adjustment import State, tips
-from stcal.robot.identification.observability import over_ranges
+from stcal.robot.identification.adjustment import State, over_ranges, tips
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import (

@@ -20,6 +20,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.io.json import Matrix, Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.descriptions import few
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
@@ -40,7 +41,6 @@ from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements, unread
 from stcal.robot.kinematics.robot_model import Robot
-from stcal.robot.urdf import few
 
 WHAT = "measured positions"
 SAME_MM = 1e-6

@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, ResultFile
 from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.parallel import one_thread
-from stcal.robot.identification.observability import (
+from stcal.robot.identification.adjustment import (
     SEEN,
     ObservabilityIndices,
     identification_jacobian,

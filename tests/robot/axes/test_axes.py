@@ -7,17 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.axes.axes_model import robot_from_sweeps
-from stcal.robot.axes.checks import pairs_of
-from stcal.robot.axes.fit import fit_axes
-from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
+from stcal.robot.axes.axes_model import pairs_of, robot_from_sweeps
+from stcal.robot.axes.fit import find_arcs, fit_axes, length_of, ring
+from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_file import load_robot
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses
+from tests.scripts import load_script
 from tests.support.arms import two_arms
 
 SIGMA = 0.03
@@ -89,18 +88,6 @@ def test_without_noise_the_arm_comes_back(name):
         assert np.abs(here - there).max() < 1e-9
     assert not result.notes
     assert max(fit.sigma_mm for fit in result.fits) < 1e-11
-
-
-@pytest.mark.parametrize("name", QUICK_AND_SLOW)
-def test_rows_and_chain_of_axes_make_the_same_poses(name):
-    nominal = NOMINALS[name]()
-    true = arm(nominal)
-    result = robot_from_sweeps(measured(true, sweep_values(true), SIGMA), nominal)
-    q = joint_vectors(nominal, 40, np.random.default_rng(4))
-    axes, rows = flange_poses(result.chain, q), flange_poses(result.robot.chain(), q)
-    between = axes.inverse() @ rows  # flange in the last joint's frame: one and the same
-    assert np.abs(between.translation - between.translation[0]).max() < 1e-9
-    assert np.abs(between.rotation - between.rotation[0]).max() < 1e-12
 
 
 def test_a_tracker_that_moved_between_two_rows_is_located():
@@ -209,9 +196,9 @@ def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 40), SIGMA, 2)
-    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 1000)
+    monkeypatch.setattr("stcal.robot.axes.axes_model.REFITTED", 1000)
     exact = robot_from_sweeps(data, nominal).without_one
-    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 0)
+    monkeypatch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)
     linear = robot_from_sweeps(data, nominal).without_one
     assert linear.lines == exact.lines
     change = exact.distance - np.median(exact.distance, axis=0)
@@ -337,27 +324,16 @@ def test_exactly_parallel_axes_have_no_common_normal():
 @pytest.fixture(scope="module")
 def fanuc(shared_data, tmp_path_factory):
     """The tracked sweeps as our files: three rows for each of theirs, and an R-2000's nominal rows."""
-    file = shared_data("fanuc_sweeps/N1N2N3Jval.csv")
-    raw = np.loadtxt(file)
+    shared_data("fanuc_sweeps/N1N2N3Jval.csv")
     folder = tmp_path_factory.mktemp("fanuc")
-    lines = ["target,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"]
-    for row in raw:
-        for k, target in enumerate(("N1", "N2", "N3")):
-            lines.append(",".join([target, *map(repr, [*row[15:].tolist(), *row[3 * k : 3 * k + 3].tolist()])]))
-    (folder / "sweeps.csv").write_text("\n".join(lines) + "\n")
-    rows = ((312, -90, 0, 0), (1075, 180, 0, -90), (225, -90, 0, 0), (0, 90, -1280, 0), (0, -90, 0, 0))
-    rows = [DHRow(a, float(np.radians(al)), d, float(np.radians(t))) for a, al, d, t in (*rows, (0, 180, -215, 0))]
-    coupling = np.eye(6)
-    coupling[2, 1] = 1
-    robot = Robot("R-2000", "standard", tuple(rows), (Joint(),) * 6, coupling)
-    (folder / "robot.toml").write_text(robot_toml(robot))
-    nominal = load_robot(folder / "robot.toml")
-    return folder, robot_from_sweeps(read_measurements(folder / "sweeps.csv", nominal), nominal)
+    load_script("same_results").prepare(folder)
+    nominal = load_robot(folder / "fanuc.toml")
+    return robot_from_sweeps(read_measurements(folder / "fanuc.csv", nominal), nominal)
 
 
 def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(fanuc):
     """Against 311.45, 1075.58, 226.08 mm of separate circle fits (SOURCE.txt), printed to 0.005 mm."""
-    _, result = fanuc
+    result = fanuc
     rms = [np.sqrt((fit.lengths() ** 2).mean()) for fit in result.fits]  # of the points' vectors
     assert min(rms) > 0.02
     assert max(rms) < 0.04
@@ -371,7 +347,7 @@ def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(fanuc):
 
 
 def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
-    _, result = fanuc
+    result = fanuc
     pair = result.pairs[1]
     assert np.pi - pair.angle_rad == pytest.approx(np.radians(0.0104), abs=2 * pair.angle_sigma_rad)
     assert abs(pair.foot_mm) == pytest.approx(5.9e6, abs=2 * pair.foot_sigma_mm)

@@ -48,19 +48,6 @@ def test_fewer_poses_do_for_zeros():
     assert identify(mh80(), data, IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
-@pytest.mark.full
-def test_what_is_kept_costs_held_out_error():
-    _, data = seen_arm(np.random.default_rng(1), 40)
-    errors = {
-        what: np.sqrt(np.nanmean(identify(mh80(), data, IdentifyOptions(adjust=what)).held_out.position_mm ** 2))
-        for what in ("all", "geometry", "zeros", "base,tool")
-    }
-    assert errors["all"] < errors["geometry"] < errors["base,tool"]
-    assert errors["all"] < errors["zeros"] < errors["base,tool"]
-    kept = identify(mh80(), data, IdentifyOptions(adjust="zeros"))
-    assert np.sqrt(np.nanmean(kept.all_held_out.position_mm**2)) == pytest.approx(errors["all"], rel=1e-6)
-
-
 @pytest.mark.slow
 def test_fixed_dimensions_stay_and_are_said(tmp_path):
     _, data = seen_arm(np.random.default_rng(2), 40)

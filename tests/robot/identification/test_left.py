@@ -9,12 +9,11 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import State, Weighting, jacobian, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions
-from stcal.robot.identification.unexplained import _Effect, _size, left
+from stcal.robot.identification.unexplained import left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
-from stcal.row_order import Change
 from tests.levels import sampled
 from tests.robot.identification.test_solve import simulated
 
@@ -35,14 +34,6 @@ def test_clean_sets_say_nothing(kind, sets):
     """At 1 %; of 200 sets five or more once in twenty runs, and 5 % are asked for."""
     said = [found for seed in range(sets) if (found := left_of(*simulated(seed, 40), kind))]
     assert len(said) <= 0.025 * sets
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("kind", ["position", "pose"])
-def test_clean_sets_that_were_identified_say_nothing(kind):
-    options = replace(QUICK, observe=kind)
-    said = [found for seed in range(60) if (found := identify(mh80(), simulated(seed, 40)[1], options).left)]
-    assert len(said) <= 3
 
 
 def bent(seed: int, count: int, joint: int, of) -> tuple[Robot, Measurements]:
@@ -219,10 +210,3 @@ def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
     base, tool = identify(mh80(), distances, QUICK).placed
     assert np.isnan(base.sigma).all()
     assert (tool.sigma[3:] > 0).all()
-
-
-def test_the_zero_of_a_joint_that_slides_has_no_angle():
-    change = Change("jump", 2, 2, 2, np.array([0.5]), np.array([0, 0, 1.0, 1.0]), 0.2, -9.0, np.ones(4, bool))
-    for slides, angle in ((True, 0.0), (False, 0.5)):
-        mm, rad = _size(_Effect("the zero of joint 1", 1, np.ones((4, 3, 1)), slides=slides), change)
-        assert (mm, rad) == (pytest.approx(0.5 * np.sqrt(3)), angle)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.identify import identify
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import robot_toml
@@ -34,7 +35,7 @@ def in_order(data, order, conjugated=False):
     return replace(data, rotations=Poses.from_quaternions(wxyz[:, order], data.points()).rotation)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("order", "conjugated", "said"),
     [
@@ -50,10 +51,10 @@ def test_another_convention_is_named(seed, order, conjugated, said):
     assert str(caught.value).endswith(said)
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("count", [8, 40])
-def test_orientations_as_their_columns_say_are_taken(seed, count):
-    start(mh80(), seen(seed, count))
+def test_orientations_as_their_columns_say_are_taken(count):
+    for seed in range(2):
+        start(mh80(), seen(seed, count))
 
 
 def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
@@ -69,7 +70,7 @@ def turned(*quarters):
     return replace(mh80(), rows=tuple(replace(row, theta=row.theta + k * np.pi / 2) for row, k in rows))
 
 
-WITH_ZERO, WITH_TWO_ZEROS = turned(0, 0, 0, -1, 0, 0), turned(0, 1, 0, 0, -1, 0)
+WITH_ZERO = turned(0, 0, 0, -1, 0, 0)
 EXCHANGED = replace(mh80(), rows=tuple(mh80().rows[i] for i in (0, 2, 1, 3, 4, 5)))
 
 
@@ -79,7 +80,6 @@ EXCHANGED = replace(mh80(), rows=tuple(mh80().rows[i] for i in (0, 2, 1, 3, 4, 5
     [
         (replace(mh80(), convention="modified"), "standard convention"),
         (WITH_ZERO, "theta of joint 4 … +90°"),
-        (WITH_TWO_ZEROS, "theta of joints 2 and 5 … -90° … +90°"),
         (EXCHANGED, "rows 2 and 3 were exchanged"),
         # joint 1 is square to joint 2: half a turn of the one's zero is the opposite sign of the other
         (turned(0, 0, 0, 2, 0, 0), "or if"),
@@ -98,7 +98,6 @@ def test_mistakes_in_the_rows_are_named(mistaken, named):
         (lambda q: q[:, ::-1], "opposite order"),
         (lambda q: np.roll(q, 1, axis=0), "one row further up"),
         (lambda q: np.roll(q, -1, axis=0), "one row further down"),
-        (lambda q: q * [1, -1, 1, -1, 1, 1], "joints 2, 4 had the opposite sign"),
         (lambda q: q + q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by -1"),
         (lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by +1"),
     ],
@@ -129,14 +128,6 @@ def test_a_mistake_is_named_beside_wrong_rows(mistaken, named):
     data = with_wrong_rows(seen(8, 40), [3, 20])
     with fails_with(f"E-IDENTIFY-MISFIT … {named} … lines 5, 22 were not there"):
         start(mistaken, data)
-
-
-@pytest.mark.slow
-def test_two_mistakes_of_different_kinds_are_named():
-    data = replace(seen(9, 40), rotations=None)
-    data = replace(data, q=data.q * [1, 1, -1, 1, 1, 1])
-    with fails_with("E-IDENTIFY-MISFIT … theta of joint 4 … +90° and joint 3 had the opposite sign"):
-        start(WITH_ZERO, data)
 
 
 def test_the_order_of_quaternions_is_an_option(tmp_path, stcal_robot):
@@ -206,4 +197,4 @@ def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():
     positions = np.vstack([part.positions for part in parts])
     data = Measurements.from_arrays(q, positions)
     with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
-        identify(mh80(), data)
+        identify(mh80(), data, IdentifyOptions(folds=0))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.identification.adjustment import ObservabilityIndices, identification_jacobian
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.robot_model import Joint, mh80
