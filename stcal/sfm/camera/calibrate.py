@@ -263,16 +263,14 @@ def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
 
 def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
-    camera = result.camera
+    camera, factor = result.camera, result.factors.centres
     ((group, members),) = by_group([view]).items()
     model = model_of_views(group, view.labels, members, board, camera)
     known = [own for own in result.models if own.group == group]
     places = {label: xyz for own in known for label, xyz in zip(own.labels, own.xyz_model, strict=True)}
-    xyz = np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)])
-    model = replace(model, xyz_model=xyz)
-    factor = result.factors.centres
+    points = Vector(np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)]))
+    model = replace(model, xyz_model=points.array)
     radius: dict[Label, float] = {**board.radius_of()}
-    points = Vector(xyz)
     for _ in range(POSE_PASSES):
         model = replace(model, shift_px=eccentricity_px(model, camera, radius, 1.0))
         begin, poses = model, Poses.of(model.camera_from_model)
@@ -281,11 +279,55 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
             moved = placed(begin, poses.moved(step[None]), points)
             return moved.whiten(moved.residuals_px(camera)).ravel() / factor
 
-        depth = float(np.linalg.norm(begin.camera_from_model[0].translation))
+        depth = float(np.linalg.norm(poses.translation[0]))
         solution = least_squares(left, np.zeros(6), loss="huber", f_scale=2.0, x_scale=[1, 1, 1, depth, depth, depth])
         model = placed(begin, poses.moved(solution.x[None]), points)
     residual = model.residuals_px(camera)
     return residual, model.whiten(residual)
+
+
+GROSS_SIGMAS = 10.0  # smallest deviation of a gross error from camera and board; it is above MAX_RESIDUAL_PX, too
+LEAST_CORNERS = 6  # smallest number of corners of a view of which others were left out: they still check one another
+LEAST_SHARE = 0.5  # of the corners of a view that are no gross errors; with fewer of them the view is not used
+
+
+def without_gross_errors(
+    views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
+) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
+    """Returns the views without gross errors, those that consist of them, and a warning about the others."""
+    suspects = {
+        model.images[image]
+        for model in result.models
+        for image in model.image_index[np.linalg.norm(model.residuals_px(result.camera), axis=1) > MAX_RESIDUAL_PX]
+    }
+    limits = f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px"
+    kept, skipped, off = [], [], []
+    for view in views:
+        own = view
+        while view.name in suspects and len(own) > LEAST_CORNERS:  # one by one: each disturbs the pose, and the others
+            length_px, in_sigmas = (np.linalg.norm(each, axis=1) for each in foretold(own, grid, result))
+            in_sigmas /= result.factors.centres
+            worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
+            if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:
+                break
+            own = own.select(np.delete(np.arange(len(own)), worst))
+        if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
+            reason = (
+                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
+                "other views put them"
+            )
+            skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
+            continue
+        kept.append(own)
+        off += [(view.name, label) for label in view.labels if label not in own.labels]
+    if not off:
+        return kept, skipped, []
+    image, label = off[0]
+    warning = (
+        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
+        f"{limits} from where the camera and all views put them; look whether something hides the board there"
+    )
+    return kept, skipped, [warning]
 
 
 MIN_VIEWS = 3
@@ -361,68 +403,104 @@ def calibrate_camera(
         A stage failed. The one-line message says what to do.
     """
     ellipses, progress = ellipses or EllipseOptions(), progress or (lambda *_: None)
+    with scratch_folder("camera") as cache:
 
-    def of_model(
-        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
-    ) -> CameraCalibration:
-        before: Intrinsics | None = None
-        settled = of_perspective = False
-        with scratch_folder("camera") as cache:
-            for rounds in range(1, MAX_ROUNDS + 1):
-                step, lens = counted(progress, f"detect {rounds}", len(files)), unsized(camera, colmap_model)
-                inputs = files, lens, target, board, ellipses, Path(cache), workers, step
-                found = files, not_images, detect_files(*inputs, pictures=False)
-                try:
-                    views, skipped, result = _of_one_round(*found, board, camera, colmap_model, before is None)
-                except (DetectionError, DegenerateError):
-                    if before is not None or of_perspective or not camera.fisheye:
-                        raise
-                    # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds
-                    # it.
-                    start = start_camera(camera.width, camera.height, PERSPECTIVE)
-                    rough = of_model(files, not_images, start, PERSPECTIVE)
-                    camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
-                    continue
-                result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
-                camera = result.camera
-                settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
-                if settled:
-                    break
-                before = result
-        return judged(result, views, skipped, rounds, settled, board)
+        def find(files: list[ImageFile], lens: CameraModel, camera: Camera, number: int, first: bool) -> Found:
+            step = counted(progress, f"detect {number}", len(files))
+            inputs = files, lens, target, board, ellipses, Path(cache), workers, step
+            return views_of_dots(detect_files(*inputs, pictures=False), board, camera, first)
 
-    return calibrated(of_model, images, board, colmap_model, workers)
+        return calibrated(find, images, board, colmap_model, workers)
+
+
+Found = tuple[list[ImageObservations], tuple[Skipped, ...]]
+Finder = Callable[[list[ImageFile], CameraModel, Camera, int, bool], Found]
+"""Returns views and what was skipped, from files, the camera without its size, the camera, the number of the round of
+detection, and whether it is the first, in which the camera is rough."""
 
 
 def calibrated(
-    of_model: Callable[[list[ImageFile], list[Skipped], Camera, str], CameraCalibration],
-    images: str | Path,
-    board: BoardDesign,
-    colmap_model: str,
-    workers: int | None,
+    find: Finder, images: str | Path, board: BoardDesign, colmap_model: str, workers: int | None, rounds: int = 0
 ) -> CameraCalibration:
-    """Returns the calibration ``of_model`` by a folder's photographs; with ``auto``, of the best lens model."""
+    """Returns the calibration by the views that ``find`` sees in a folder's photographs; with ``auto``, of the best
+    lens model. ``rounds``: of detection, after which gross errors are removed; 0: until the camera settles."""
     if colmap_model == AUTO:
-        return of_chosen_model(lambda model: calibrated(of_model, images, board, model, workers), board, workers)
+        return of_chosen_model(lambda model: calibrated(find, images, board, model, workers, rounds), board, workers)
     if colmap_model not in COLMAP_MODELS:
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
         )
     files, not_images = find_images(images)
-    return of_model(files, not_images, start_camera(*require_common_size(files)[0], colmap_model), colmap_model)
+    start = start_camera(*require_common_size(files)[0], colmap_model)
+    return _of_model(find, files, not_images, start, board, colmap_model, rounds)
 
 
-def unsized(camera: Camera, colmap_model: str) -> CameraModel:
-    """Returns a camera without its size, which then comes from most of the images, and messages say so."""
-    return CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
+def _of_model(
+    find: Finder, files: list[ImageFile], not_images, camera: Camera, board: BoardDesign, colmap_model: str, rounds: int
+) -> CameraCalibration:
+    before: Intrinsics | None = None
+    settled, of_perspective, warnings = False, False, []
+    for number in range(1, (rounds or MAX_ROUNDS) + 1):
+        try:
+            # Without its size, which then comes from most of the images, and messages say so.
+            lens = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
+            views, skipped = find(files, lens, camera, number, before is None)
+            skipped = (*not_images, *skipped)
+            require_views(views, files, skipped)
+            start = closed_form(views, board, camera) if before is None else camera
+            result = adjust_intrinsics(views, board, start, colmap_model)
+            if not rounds:
+                require_determined(result, views, board)
+        except (DetectionError, DegenerateError):
+            if rounds or before is not None or of_perspective or not camera.fisheye:
+                raise
+            # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
+            rough = start_camera(camera.width, camera.height, PERSPECTIVE)
+            found = _of_model(find, files, not_images, rough, board, PERSPECTIVE, rounds)
+            camera, of_perspective = replace(camera, focal=found.intrinsics.camera.focal), True
+            continue
+        result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
+        camera = result.camera
+        settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
+        if settled and not rounds:
+            break
+        before = result
+    if rounds:
+        kept, without, warnings = without_gross_errors(views, board, result)
+        if without or warnings:
+            views, skipped = kept, (*skipped, *without)
+            require_views(views, files, skipped)
+            result = replace(adjust_intrinsics(views, board, camera, colmap_model), restarted=result.restarted)
+        require_determined(result, views, board)
+    calibration = judged(result, views, skipped, number, settled or rounds > 0, board)
+    return replace(calibration, warnings=(*calibration.warnings, *warnings))
+
+
+def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera, first: bool) -> Found:
+    """Returns the views of the board in detected images, sharp but in the ``first`` round, in which depths are
+    unknown, and what was skipped."""
+    views = board_views(detection.images, board, camera)
+    if not first:
+        views, _ = correct_defocus(views, camera, pattern_of_board(board))
+    shown, repeated = {view.name for view in views}, "the board is in view more than once"
+    without = (
+        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
+        for each in detection.images
+        if each.file.name not in shown
+    )
+    return views, (*detection.skipped, *without)
 
 
 def camera_of_dots(
     files: Sequence[ImageFile], detection: DetectionResult, board: BoardDesign, start: Camera, colmap_model: str
 ) -> Intrinsics:
     """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``."""
-    return _of_one_round(files, (), detection, board, start, colmap_model, True)[2]
+    views, skipped = views_of_dots(detection, board, start, first=True)
+    require_views(views, files, skipped)
+    result = adjust_intrinsics(views, board, closed_form(views, board, start), colmap_model)
+    require_determined(result, views, board)
+    return result
 
 
 def camera_of_labelled(
@@ -438,32 +516,6 @@ def camera_of_labelled(
     found = adjust_intrinsics(views, board, start, model)
     require_determined(found, views, board)
     return found, adjust_intrinsics(views, board, camera, model, held=True)
-
-
-def _of_one_round(
-    files: Sequence[ImageFile],
-    not_images: Sequence[Skipped],
-    detection: DetectionResult,
-    board: BoardDesign,
-    camera: Camera,
-    colmap_model: str,
-    first: bool,
-) -> tuple[list[ImageObservations], tuple[Skipped, ...], Intrinsics]:
-    """Views of the board, what was skipped, and the intrinsics; in the ``first`` round depths are unknown."""
-    views = board_views(detection.images, board, camera)
-    if not first:
-        views, _ = correct_defocus(views, camera, pattern_of_board(board))
-    shown, repeated = {view.name for view in views}, "the board is in view more than once"
-    without = (
-        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
-        for each in detection.images
-        if each.file.name not in shown
-    )
-    skipped = (*not_images, *detection.skipped, *without)
-    require_views(views, files, skipped)
-    result = adjust_intrinsics(views, board, closed_form(views, board, camera) if first else camera, colmap_model)
-    require_determined(result, views, board)
-    return views, skipped, result
 
 
 def of_chosen_model(

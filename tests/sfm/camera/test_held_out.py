@@ -22,10 +22,10 @@ from stcal.sfm.camera.calibrate import (
     require_determined,
     require_views,
     residual_rms_px,
+    without_gross_errors,
 )
 from stcal.sfm.camera.camera_report import calibration_file, calibration_report
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
-from stcal.workflows.board_views import without_gross_errors
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of, with_a_field
