@@ -22,12 +22,16 @@ from stcal.parallel import Progress, counted, one_thread, run_in_order, scratch_
 from stcal.sfm.adjust.refine import eccentricity_px, placed
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
+    ProjectionSigma,
     adjust_intrinsics,
     board_views,
     closed_form,
+    image_grid,
     model_of_views,
     model_parameters,
     of_some_views,
+    projection_jacobian,
+    projection_sigma,
     start_camera,
 )
 from stcal.sfm.data.group_model import ImageObservations, by_group
@@ -37,55 +41,7 @@ from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import DetectionResult, detect_files
 
 R = TypeVar("R")
-GRID = (13, 9)
 MIN_REACH = 0.75  # of dots from the middle towards a corner, as advised: beyond it little distortion is extrapolated
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectionSigma:
-    sigma_px: np.ndarray  # (n,) per axis at :func:`image_grid`, up to a rotation of the camera, which poses absorb
-    reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
-    corner_sigma_px: np.ndarray  # (4,)
-
-
-def image_grid(camera: Camera) -> np.ndarray:
-    """Returns a grid of places over the whole image, including the corners, (n, 2) px."""
-    x, y = np.linspace(0, camera.width - 1, GRID[0]), np.linspace(0, camera.height - 1, GRID[1])
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
-def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Returns derivatives (n, 2, q) of projections by the parameters, up to a rotation of the camera."""
-    try:
-        ideal = camera.normalised_from_pixel(image_grid(camera))
-    except ConvergenceError as error:
-        raise DegenerateError(
-            "E-CAMERA-FOLDED",
-            "camera: the distortion folds over in a part of the image without dots; add views that fill the image "
-            "to its corners, or choose a --model with fewer parameters",
-        ) from error
-    jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
-    x, y = ideal.T
-    rotation = np.stack([np.stack([-x * y, 1 + x * x, -y], axis=-1), np.stack([-1 - y * y, x * y, x], axis=-1)], axis=1)
-    by_ideal = camera.pixel_jacobian(ideal)
-    by_rotation = (by_ideal @ rotation).reshape(-1, 3)
-    flat = jacobian.reshape(len(by_rotation), -1)
-    return (flat - by_rotation @ np.linalg.lstsq(by_rotation, flat, rcond=None)[0]).reshape(jacobian.shape)
-
-
-def projection_sigma(result: Intrinsics) -> ProjectionSigma:
-    """Returns σ of projections over the image, and how far dots reach towards its corners."""
-    camera = result.camera
-    xy = image_grid(camera)
-    jacobian = projection_jacobian(camera, result.colmap_model)
-    sigma = np.sqrt(np.einsum("nip,pq,niq->n", jacobian, result.covariance, jacobian) / 2)
-    middle = np.array([camera.width - 1, camera.height - 1]) / 2
-    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    dots = np.concatenate([m.measured_px for m in result.models]) - middle
-    # The smaller of the two coordinates counts: a dot at the side of the image is not in its corner.
-    reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
-    corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
-    return ProjectionSigma(sigma, np.maximum(reach, 0), sigma[corner_index])
 
 
 CELLS = (12, 8)  # number of cells of the image, in x and y, within which residuals are compared

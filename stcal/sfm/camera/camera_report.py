@@ -18,14 +18,13 @@ from stcal.report.text import number
 from stcal.sfm.camera.calibrate import (
     CELLS,
     CORNERS,
-    GRID,
     OUTLIER_WEIGHT,
     CameraCalibration,
     TriedModel,
     mean_residuals,
     residual_rms_px,
 )
-from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
+from stcal.sfm.camera.intrinsics import GRID, Intrinsics, model_parameters
 
 MIN_IN_CELL = 3
 ARROW_SHARE = 0.7  # largest length of a drawn mean residual, as a share of the cell

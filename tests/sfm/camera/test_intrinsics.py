@@ -19,8 +19,16 @@ from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera import intrinsics
-from stcal.sfm.camera.calibrate import image_grid, projection_sigma, require_determined
-from stcal.sfm.camera.intrinsics import adjust_intrinsics, board_views, closed_form, model_parameters, start_camera
+from stcal.sfm.camera.calibrate import require_determined
+from stcal.sfm.camera.intrinsics import (
+    adjust_intrinsics,
+    board_views,
+    closed_form,
+    image_grid,
+    model_parameters,
+    projection_sigma,
+    start_camera,
+)
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
