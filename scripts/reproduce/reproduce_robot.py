@@ -33,7 +33,7 @@ from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
-from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

@@ -13,8 +13,19 @@ from typing import Any
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Rows, Values, numbers
-from stcal.adjust.components import Components, Equations, sigma_factor
+from stcal.adjust.blocks import (
+    Block,
+    Components,
+    Equations,
+    Factor,
+    Huber,
+    Known,
+    Prior,
+    Rows,
+    Values,
+    numbers,
+    sigma_factor,
+)
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise

@@ -49,7 +49,7 @@ from stcal.robot.kinematics.measurements import joint_values, targets_of
 from stcal.robot.kinematics.robot_file import require_robot_written
 from stcal.robot.robot_report import axes_report, compensation_report
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
-from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.measurement.measure_images import MeasureOptions, MeasureResult, measure
 from stcal.sfm.measurement.pose_report import (
     IMAGE,

@@ -28,8 +28,7 @@ from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye_inputs import HandEyeInput, naming_left_out
-from stcal.workflows.robot_at_images import Arm
+from stcal.workflows.handeye_inputs import Arm, HandEyeInput, naming_left_out
 
 ALL = "all"
 """Word in place of a method's name: all methods, compared."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.adjust import Adjustment, Vector
-from stcal.adjust.components import Components, Equations, component_variances, sigma_factor
+from stcal.adjust.blocks import Components, Equations, component_variances, sigma_factor
 
 GROUPS, EACH = 12, 5
 

@@ -24,7 +24,7 @@ from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.urdf import load_urdf
 from stcal.sfm.budget.sources import StatedSize, statement_of
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import read_robot_poses
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.adjust.components import component_variances
+from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Rigid

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import chdtr, chdtrc
 
-from stcal.adjust.components import Components, Equations
+from stcal.adjust.blocks import Components, Equations
 from stcal.geometry.clusters import by_clusters
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.normal_equations import blocks_of

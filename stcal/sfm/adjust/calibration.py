@@ -17,13 +17,19 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
-from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
+from stcal.sfm.adjust.chain import (
+    CalibratedTarget,
+    FaceInGroup,
+    FrameKind,
+    chain_faces,
+    chain_singly,
+    faces_of_group,
+    missing_frame_circles,
+    unlinked_faces,
+)
 from stcal.sfm.adjust.equations import UNKNOWN_SHAPES
-from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
-from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.adjust.scale import Scale, find_scale
+from stcal.sfm.adjust.refine import Scale, adjust, eccentricity_px, find_scale, free_network
 from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.group_model import GroupModel, M, MetricModel, WorldModel
 

@@ -39,7 +39,7 @@ from stcal.sfm.adjust.equations import (
     robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.scale import MIN_DOTS
+from stcal.sfm.adjust.refine import MIN_DOTS
 from stcal.sfm.data.group_model import MetricModel
 
 Values = dict[str, Any]  # unknowns by block

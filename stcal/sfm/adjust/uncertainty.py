@@ -9,7 +9,14 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.chain import (
+    CalibratedTarget,
+    FrameKind,
+    face_frames,
+    missing_frame_circles,
+    placement_sigma_mm,
+    with_unmapped,
+)
 from stcal.sfm.adjust.equations import (
     BOARD,
     CAMERA,
@@ -23,7 +30,6 @@ from stcal.sfm.adjust.equations import (
     robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult
 
 STEP_MM = 1e-3  # step of the central differences, in mm

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from stcal.adjust.blocks import Huber, Vector
-from stcal.adjust.components import sigma_factor
+from stcal.adjust.blocks import Huber, Vector, sigma_factor
 from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError

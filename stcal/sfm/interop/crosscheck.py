@@ -12,8 +12,7 @@ from stcal.parallel import Progress, scratch_folder
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate, on_luminous_surface, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported, write_copy
 from stcal.sfm.interop.export_model import ExportedModel

@@ -24,6 +24,7 @@ from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
+from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -41,7 +42,6 @@ from stcal.sfm.detect.predict import (
     missed_notes,
     predict_circles,
 )
-from stcal.sfm.measurement.known_target import TargetCircles, read_target
 from stcal.sfm.measurement.pose import (
     FAILED,
     MIN_CIRCLES,

@@ -30,9 +30,9 @@ from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
-from stcal.sfm.measurement.known_target import TargetCircles
 
 SETTLED = 1e-4
 """Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two

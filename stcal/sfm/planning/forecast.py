@@ -18,8 +18,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, DotLabel, Label
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
 from stcal.sfm.adjust.faces_file import FacePoses
 from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians

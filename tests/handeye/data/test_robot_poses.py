@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.handeye.data.record import Said
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import read_robot_poses
 from tests.outcome import fails_with
 
 

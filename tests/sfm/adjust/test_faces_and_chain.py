@@ -6,8 +6,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
-from stcal.sfm.adjust.chain import chain_faces, measure_chains
-from stcal.sfm.adjust.faces import FaceInGroup, face_frame
+from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains
 from stcal.sfm.adjust.refine import adjust
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with, refuses

@@ -7,8 +7,7 @@ import pytest
 from scipy.special import chdtrc
 
 from stcal.geometry.rigid import skew
-from stcal.sfm.adjust.network import free_network, solve_score
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px, free_network, solve_score
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.adjust import dense
 

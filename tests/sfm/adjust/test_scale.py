@@ -5,7 +5,7 @@ import pytest
 
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.refine import find_scale
 from stcal.sfm.data.group_model import WorldModel
 from tests.outcome import fails_with
 

@@ -21,7 +21,7 @@ from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
 from stcal.io.device import pictures_of
 from stcal.sfm import MeasureOptions, measure
-from stcal.sfm.measurement.known_target import read_target
+from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of, served
 from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.measurement.pose_report import poses_file

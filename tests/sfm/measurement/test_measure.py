@@ -16,10 +16,10 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.cameras.read import read_camera
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
+from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.detect.labelling import LabelledImage
-from stcal.sfm.measurement.known_target import TargetCircles, read_target
 from stcal.sfm.measurement.measure_images import MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.pose import MOST, NO_FACE, PoseOptions, common_errors, pose_from_circles, resolved
 from stcal.sfm.measurement.pose_report import poses_csv, poses_file

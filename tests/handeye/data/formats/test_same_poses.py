@@ -7,8 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.handeye.data.record import Said
-from stcal.workflows.handeye_inputs import Files, one_source
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import Files, one_source, read_robot_poses
 from tests.handeye.written import FORMATS, REFUSED
 from tests.support.handeye import simulated
 
