@@ -3,18 +3,15 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.special import chdtri
 from threadpoolctl import ThreadpoolController
 
 from stcal.boards.on_faces import why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
-from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -43,8 +40,6 @@ from stcal.sfm.detect.predict import (
     predict_circles,
 )
 from stcal.sfm.measurement.pose import (
-    FAILED,
-    MIN_CIRCLES,
     PoseOptions,
     TargetPose,
     common_errors,
@@ -232,9 +227,6 @@ class Tracker:
         return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
 
 
-MOST_TRIED = 5  # largest number of images, those of most circles, in which mistakes in the camera file are looked for
-
-
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
     """Options of :func:`measure`.
@@ -285,14 +277,9 @@ class MeasureResult(Brief):
     intrinsics_held: bool  # whether the intrinsics were taken as exact
     common: np.ndarray  # (m, 6, r) of the poses, see :func:`stcal.sfm.measurement.pose.common_errors`
     searched: int | None = None  # number of images of a sequence that were searched as a whole
-    mistakes: tuple[str, ...] = ()  # in the camera file, each of which explains why poses do not fit
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
-
-    def remedy(self, otherwise: str) -> str:
-        """Returns what to correct where poses do not fit: the camera file, if that explains it."""
-        return f"{' or '.join(self.mistakes)}; give that of these images" if self.mistakes else otherwise
 
 
 @require_arguments
@@ -370,10 +357,10 @@ def measure(
         printed = design.with_faces(printed=True).faces
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
-        remedy = result.remedy("check target.toml (radii, polarity), faces.json and the exposure")
         raise DetectionError(
             "E-MEASURE-NONE",
-            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; {remedy}",
+            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; check "
+            "target.toml (radii, polarity), camera file, faces.json and the exposure",
         )
     return result
 
@@ -397,37 +384,7 @@ def measure_labelled(
                 pose = resolved(pose, before.camera_from_target)
             outcomes.append(_outcome(image.name, pose, notes[image.name]))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    result = _result_of(outcomes, target, options, prior)
-    shown = [image.observations for image in images if len(image.observations) >= MIN_CIRCLES]
-    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) < len(shown):
-        result = replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
-    return result
-
-
-def _mistakes(
-    images: Sequence[ImageObservations], camera: Camera, target: TargetCircles, options: PoseOptions
-) -> tuple[str, ...]:
-    """Returns the mistakes in the camera file without which most of the images pass the test of their fit."""
-
-    def misfit(own: Camera) -> float:
-        poses = [measured_pose(image, own, target, options) for image in images]
-        passed = [p.chi2 / chdtri(p.redundancy, FAILED) if isinstance(p, TargetPose) else np.inf for p in poses]
-        return float(np.median(passed))
-
-    def times(k: float) -> Camera:
-        return replace(camera, focal=k * camera.focal, centre=k * (camera.centre + 0.5) - 0.5)
-
-    middle = np.array([camera.width - 1, camera.height - 1]) / 2
-    whole, other = "the camera file is of whole images, and these are cut out of them", not camera.fisheye
-    kind = "fisheye" if other else "perspective"
-    lens = camera.width, camera.height, camera.focal, camera.centre, camera.distortion
-    candidates = [
-        Candidate(whole, lambda: replace(camera, centre=middle)),
-        Candidate(f"the camera file is of a {kind} lens", lambda: Camera(*lens, other), 1),
-        Candidate("the distortion of the camera file is wrong", lambda: replace(camera, distortion=np.zeros(8)), 1),
-        *(Candidate(f"the camera file is of images {1 / k:g} times as wide", partial(times, k), 2) for k in (0.5, 2.0)),
-    ]
-    return tuple(each.words for each, _ in explain(candidates, misfit, 1.0))
+    return _result_of(outcomes, target, options, prior)
 
 
 def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[MeasureResult, np.ndarray]:
@@ -437,15 +394,15 @@ def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[Measure
 
 
 def _followed(
-    files: Sequence[ImageFile], camera_model: CameraModel, target, board, options, step: Callable[[object], None]
+    files: Sequence[ImageFile], model: CameraModel, target, board, options, step: Callable[[object], None]
 ) -> tuple[list[MeasuredImage | Skipped], int]:
     """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched."""
-    camera, size_from = sized_by(camera_model, list(files))
+    camera, size_from = sized_by(model, list(files))
     folders: dict[str, list[ImageFile]] = {}
     for file in sorted(files, key=lambda each: each.name):
         folders.setdefault(file.group, []).append(file)
-    model = replace(camera_model, width=camera.width, height=camera.height)
-    jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
+    setting = target, replace(model, width=camera.width, height=camera.height), board, options.pose, options.ellipses
+    jobs = [(own, setting, camera, size_from) for own in folders.values()]
     followed: dict[int, tuple[list[MeasuredImage | Skipped], int]] = {}
     for i, found in run_on_images(_follow_folder, jobs, options.workers):
         followed[i] = found
@@ -455,24 +412,21 @@ def _followed(
 
 
 def _follow_folder(
-    files: Sequence[ImageFile], model: CameraModel, camera: Camera, size_from: str, target, board, options
+    files: Sequence[ImageFile], setting: tuple, camera: Camera, size_from: str
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    tracker = Tracker(target, model, board, options.pose, options.ellipses)
+    tracker, searched = Tracker(*setting), 0
     outcomes: list[MeasuredImage | Skipped] = []
     name_of_digest: dict[str, str] = {}
-    searched = 0
     for file in files:
-        loaded = load_image(file, camera, size_from)
-        if isinstance(loaded, Skipped):
-            outcomes.append(loaded)
-            continue
-        data, image = loaded
-        first = name_of_digest.setdefault(hashlib.sha256(data).hexdigest(), file.name)
-        if first != file.name:
-            outcomes.append(copy_of(file, first))
-            continue
-        outcome, _ = _observed(tracker, image, file.name)
-        searched += tracker.searched
+        outcome = load_image(file, camera, size_from)
+        if not isinstance(outcome, Skipped):
+            data, image = outcome
+            first = name_of_digest.setdefault(hashlib.sha256(data).hexdigest(), file.name)
+            if first == file.name:
+                outcome, _ = _observed(tracker, image, file.name)
+                searched += tracker.searched
+            else:
+                outcome = copy_of(file, first)
         outcomes.append(outcome)
     return outcomes, searched
 

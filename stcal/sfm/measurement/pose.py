@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields, rms
-from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import (
     MAX_OUTLIER_SHARE,
@@ -30,6 +30,7 @@ from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
+from stcal.sfm.adjust.equations import coordinates
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
@@ -67,7 +68,7 @@ class PoseProblem:
     def without(self, bad: np.ndarray, outliers: list[Outlier]) -> "PoseProblem":
         """Returns the problem without the circles of a mask (n,), which are ``outliers``."""
         keep = np.flatnonzero(~bad)
-        rows = (3 * keep[:, None] + np.arange(3)).ravel()
+        rows = coordinates(keep)
         by_circle = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
         return replace(
             self,
@@ -127,27 +128,24 @@ def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple
         )
     reasons = []
     for face in by_size:
-        if len(faces[face]) >= MIN_CIRCLES:
-            try:
-                pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
-            except DegenerateError as error:
-                reasons.append(error)
-                continue
-            return Poses.of([pose]), target.target_from_plane[face]
+        rows, target_from_plane = faces[face], target.target_from_plane[face]
+        if len(rows) < MIN_CIRCLES:
+            break
+        plane_from_target = target_from_plane.inverse()
+        xy = (plane_from_target @ problem.xyz[rows])[:, :2]
+        long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+        if broad < MIN_BREADTH * long:
+            reasons.append(f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line")
+            continue
+        try:
+            pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
+        except DegenerateError as error:
+            reasons.append(str(error))
+            continue
+        if (problem.xyz @ pose.rotation[2] + pose.translation[2] > 0).all():
+            return Poses.of([pose]), target_from_plane
+        reasons.append("its circles would be behind the camera; check their labels")
     raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
-
-
-def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid:
-    plane_from_target = target_from_plane.inverse()
-    xy = (plane_from_target @ problem.xyz[rows])[:, :2]
-    long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
-    if broad < MIN_BREADTH * long:
-        reason = f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
-        raise DegenerateError("E-MEASURE-AMBIGUOUS", reason)
-    pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
-    if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
-        raise DegenerateError("E-MEASURE-AMBIGUOUS", "its circles would be behind the camera; check their labels")
-    return pose
 
 
 def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, where: str) -> tuple[Minima, PoseProblem]:
@@ -316,12 +314,6 @@ class TargetPose(ImageFit, Brief):
         ):
             freeze(self, name, shape, f"pose: {name}")
 
-    def swapped(self) -> "TargetPose":
-        """Returns the second solution as ``resolved``, with this one as its second; this one if there is no second."""
-        if self.second is None:
-            return self
-        return replace(self.second, status="resolved", second=replace(self, second=None))
-
 
 def pose_from_circles(
     labels: Sequence[str],  # texts ``face:circle``; dots of the board are ignored
@@ -387,20 +379,24 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
             f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it",
         )
     place = np.array([target.place[labels[i]] for i in used], int)
-    rows = (3 * place[:, None] + np.arange(3)).ravel()
+    rows = coordinates(place)
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
     ideal = camera.normalised_from_pixel(centre[used])
     px_by_centre = camera.pixel_jacobian(ideal)
     centre_by_px = np.linalg.inv(px_by_centre)
-    by_camera, prior_covariance = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
-    if prior is not None:
-        by_camera = centre_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        prior_covariance = prior.covariance
-    circles = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
-    noise_of_centres = factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2)
-    shape = target.covariance[np.ix_(rows, rows)]
-    names = circle_labels(labels[i] for i in used)
-    return PoseProblem(names, *circles, noise_of_centres, by_camera, prior_covariance, shape)
+    basis = np.zeros((len(PARAMETER_NAMES), 0)) if prior is None else intrinsic_basis(prior.colmap_model)
+    return PoseProblem(
+        labels=circle_labels(labels[i] for i in used),
+        xyz=target.xyz[place],
+        normal=target.normal[place],
+        radius=target.radius[place],
+        centre=ideal,
+        px_by_centre=px_by_centre,
+        noise=factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2),
+        by_camera=centre_by_px @ (camera.parameter_jacobian(ideal) @ basis),
+        prior=np.zeros((0, 0)) if prior is None else prior.covariance,
+        shape=target.covariance[np.ix_(rows, rows)],
+    )
 
 
 def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
@@ -516,7 +512,9 @@ def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
     )
     if turn <= NEAR_PREVIOUS * turn_of_second:
         return replace(pose, status="resolved")
-    return pose.swapped() if turn_of_second <= NEAR_PREVIOUS * turn else pose
+    if turn_of_second > NEAR_PREVIOUS * turn:
+        return pose
+    return replace(pose.second, status="resolved", second=replace(pose, second=None))
 
 
 def fit_verdict(pose: TargetPose) -> str:
@@ -542,8 +540,7 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
     circles, intrinsics = _root(target.covariance), np.zeros((0, 0)) if prior is None else _root(prior.covariance)
     effects = []
     for pose in poses:
-        place = np.array([target.place[label] for label in pose.labels])
-        rows = (3 * place[:, None] + np.arange(3)).ravel()
+        rows = coordinates(np.array([target.place[label] for label in pose.labels]))
         effects.append(np.hstack([pose.by_circles @ circles[rows], pose.by_intrinsics @ intrinsics]))
     full = np.array(effects)
     pose_roots = np.linalg.cholesky(np.array([pose.covariance for pose in poses]))
