@@ -167,8 +167,8 @@ def handeye(
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye_inputs import Timing, without_flips
-    from stcal.workflows.handeye_run import ALL, calibrate_handeye
+    from stcal.workflows.handeye_inputs import Timing
+    from stcal.workflows.handeye_run import ALL, calibrate_handeye, without_flips
 
     turns = (None if each is None else math.radians(each) for each in (sigma_robot_deg, sigma_camera_deg))
     noise = Noise(next(turns), sigma_robot_mm, next(turns), sigma_camera_mm, sigma_px, sigma_board_mm)

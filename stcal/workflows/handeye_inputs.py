@@ -1,7 +1,6 @@
-"""Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses at them."""
+"""Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.several import load_boards
-from stcal.errors import InputError, StcalError
+from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
@@ -27,7 +26,6 @@ from stcal.handeye.data.inputs import (
 from stcal.handeye.data.pose_pairs import SIDES, Setup, read_side
 from stcal.handeye.data.record import Said, require_each_once
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.handeye.judge.conventions import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.solving import HandEyeProblem
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
@@ -53,7 +51,8 @@ class RobotPoses:
     """``images`` : image of each pose; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` :
     place of each pose in ``where``, for messages; ``understood`` : how the file was read; ``own`` : whether it is a
     table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images``, the
-    poses belong to the images in their order."""
+    poses belong to the images in their order. At the times of images: ``left_out`` : (image, why); ``stream``,
+    ``seconds`` : the stream and the time of each image, by name."""
 
     images: tuple[str, ...]
     base_from_flange: Poses
@@ -63,6 +62,9 @@ class RobotPoses:
     understood: str = ""
     own: bool = True
     timed: bool = False
+    left_out: tuple[tuple[str, str], ...] = ()
+    stream: Stream | None = None
+    seconds: dict[str, float] | None = None
 
     @property
     def file(self) -> str:
@@ -138,11 +140,7 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
         return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
     if statements.options():
         require_own(path, quaternions)
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{where}: the names of its columns state unit and rotation; leave {', '.join(statements.options())} out, "
-            "and rename those that are wrong (x_m in place of x_mm)",
-        )
+        _require_unsaid(statements, where)
     table = read_table(path, "robot poses", quaternions)
     timed = "image" not in table and TIME in table
     images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
@@ -164,52 +162,58 @@ class Timing:
     offset: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AtImages:
-    """``robot`` : its poses by image, unchanged if no times were needed; ``left_out`` : (image, why); ``stream``,
-    ``seconds`` : the stream and the time of each remaining image, by name."""
-
-    robot: RobotPoses
-    left_out: tuple[tuple[str, str], ...] = ()
-    stream: Stream | None = None
-    seconds: dict[str, float] | None = None
-
-    def timed(self, names: Sequence[str]) -> Timed | None:
-        """Returns the stream and the times of these images; None if no times were needed."""
-        if self.stream is None or self.seconds is None:
-            return None
-        return Timed(self.stream, np.array([self.seconds[name] for name in names]))
-
-
-def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> AtImages:
+def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> RobotPoses:
     """Returns poses at the times of images, where both have times that are not simply equal; as they are if ``timing``
     is None. Raises InputError: an option needs times, or no image lies within the stream."""
     if timing is None:
-        return AtImages(robot)
+        return robot
     images = _times_of_images(names, timing)
     samples = [time_of(name) for name in robot.images] if robot.timed else stamps_of(robot.images)
+    needed = timing.offset or timing.image_times or robot.timed
+    if needed and images is None:
+        raise InputError(
+            "E-IMAGE-NAME-TIME",
+            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); name "
+            "images by seconds (1689.25.png), or give --image-times",
+        )
+    if needed and (samples is None or None in samples):
+        first = f", but {robot.images[0]} …" if robot.images else ""
+        raise InputError(
+            "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
+        )
     if images is None or samples is None or None in samples:
-        if timing.offset or timing.image_times or robot.timed:
-            _require_times(robot, images, samples, names)
-        return AtImages(robot)
+        return robot
     if not robot.timed and any(stem_of(name) != name for name in robot.images):  # poses of images by their names
-        return AtImages(robot)
-    seen, times = list(images), [time for time in samples if time is not None]
-    if not timing.offset and all(time in times for time in images.values()):
-        rows = {name: times.index(time) for name, time in images.items()}
+        return robot
+    times = [time for time in samples if time is not None]
+    exact = not timing.offset and all(time in times for time in images.values())
+    if exact:  # rows without an image are no mistake
+        rows = [times.index(time) for time in images.values()]
+        robot_then = replace(
+            robot,
+            images=tuple(images),
+            base_from_flange=robot.base_from_flange[rows],
+            covariance=None if robot.covariance is None else robot.covariance[rows],
+            places=tuple(robot.places[i] for i in rows),
+            understood=f"{robot.understood}; {len(rows)} of them at the times of images",
+            own=False,
+            timed=False,
+        )
         if not len(images) < len(times) == len(set(times)):
-            return AtImages(_of_rows(robot, rows))
-        stream = Stream.of(times, robot.base_from_flange, robot.file)
-        seconds = stream.after_origin(list(images.values())).tolist()
-        return AtImages(_of_rows(robot, rows), (), stream, dict(zip(seen, seconds, strict=True)))
+            return robot_then
     stream = Stream.of(times, robot.base_from_flange, robot.file)
     seconds = stream.after_origin(list(images.values()))
-    interpolated = taken_at(stream, seconds, timing.tolerance_s)
+    clock = {"stream": stream, "seconds": dict(zip(images, seconds.tolist(), strict=True))}
+    if exact:
+        return replace(robot_then, **clock)
+    interpolated, seen = taken_at(stream, seconds, timing.tolerance_s), list(images)
     if not interpolated.kept.any():
         raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {seen[0]}: {interpolated.why[0]}")
     kept = tuple(seen[i] for i in np.flatnonzero(interpolated.kept))
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    robot_then = replace(
+    left_out = [(name, why) for name, why in zip(seen, interpolated.why, strict=True) if why]
+    left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
+    return replace(
         robot,
         images=kept,
         base_from_flange=interpolated.base_from_flange,
@@ -218,24 +222,8 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         understood=f"{robot.understood}{note}; {interpolated.said}",
         own=False,
         timed=False,
-    )
-    left_out = [(name, why) for name, why in zip(seen, interpolated.why, strict=True) if why]
-    left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
-    return AtImages(robot_then, tuple(left_out), stream, dict(zip(seen, seconds.tolist(), strict=True)))
-
-
-def _of_rows(robot: RobotPoses, rows: dict[str, int]) -> RobotPoses:
-    """Returns the poses whose times are those of images: ``rows`` by image. Rows without an image are no mistake."""
-    at = list(rows.values())
-    return replace(
-        robot,
-        images=tuple(rows),
-        base_from_flange=robot.base_from_flange[at],
-        covariance=None if robot.covariance is None else robot.covariance[at],
-        places=tuple(robot.places[i] for i in at),
-        understood=f"{robot.understood}; {len(at)} of them at the times of images",
-        own=False,
-        timed=False,
+        left_out=tuple(left_out),
+        **clock,
     )
 
 
@@ -266,21 +254,6 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
             f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here",
         )
     return time_of_image
-
-
-def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples: object, names: Sequence[str]) -> None:
-    """Raise an error that says which side has no times."""
-    if images is None:
-        raise InputError(
-            "E-IMAGE-NAME-TIME",
-            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); name "
-            "images by seconds (1689.25.png), or give --image-times",
-        )
-    if not isinstance(samples, list) or None in samples:
-        first = f", but {robot.images[0]} …" if robot.images else ""
-        raise InputError(
-            "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,8 +296,7 @@ class Arm:
 
 
 def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
-    """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV); ``understood`` says how far
-    base_from_flange_… beside them are off.
+    """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV).
 
     Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
     """
@@ -332,15 +304,8 @@ def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[Rob
     arm = Arm(robot, joint_values(table, robot))
     images, places = tuple(table.text("image")), tuple(f"line {line}" for line in table.lines)
     require_each_once(images, places, table.where, "image ")
-    flange = arm.poses(np.zeros(len(arm.angles)))
     understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
-    if any(name.startswith(side) for side in SIDES[0] for name in table.columns):
-        reported, *_ = read_side(table, *SIDES[0])
-        apart = (reported.inverse() @ flange).difference((reported.inverse() @ flange)[[0] * len(flange)])
-        understood += (
-            f"; its flange moves against the one reported by up to {np.linalg.norm(apart[:, 3:], axis=1).max():.3g} mm "
-            f"and {np.degrees(np.linalg.norm(apart[:, :3], axis=1).max()):.2g}°"
-        )
+    flange = arm.poses(np.zeros(len(arm.angles)))
     return RobotPoses(images, flange, None, places, table.where, understood, own=False), arm
 
 
@@ -393,17 +358,6 @@ def one_source(
     _require_unsaid(statements, f"{first}, {second}")
     joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
-
-
-@contextmanager
-def naming_left_out(left_out: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Adds to the message of an error what was left out before: (image or row, why)."""
-    try:
-        yield
-    except StcalError as error:
-        if left_out:
-            error.append(f"; {len(left_out)} left out before, first {left_out[0][0]}: {left_out[0][1]}")
-        raise
 
 
 @require_arguments
@@ -474,9 +428,7 @@ def read_handeye(
 class Files:
     """Files of poses, or a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``statements`` : the user's statements about what files do not state; ``quaternions`` : ``xyzw`` where their columns
-    hold x, y, z, w in the order in which they stand; ``timing`` : of poses by time; ``robot`` : the robot at whose
-    joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
+    ``statements`` : the user's statements about what files do not state; the others as of :func:`read_handeye`.
     """
 
     source: Source
@@ -558,8 +510,7 @@ def _require_unsaid(statements: Said, where: str) -> None:
         raise InputError(
             "E-OPTION-NEEDS",
             f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
-            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, board_from_camera_x_mm in place "
-            "of camera_from_board_x_mm)",
+            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm)",
         )
 
 
@@ -576,7 +527,6 @@ class _Photographs:
     model: CameraModel
     images: list[ImageFile]
     robot: RobotPoses
-    at_images: AtImages
     arm: Arm | None
     row_of: dict[str, int]
     matching: str
@@ -601,8 +551,8 @@ class _Photographs:
             robot, arm = read_arm(poses, files.robot, files.quaternions)
         design, model = load_boards(board), read_camera(camera)
         images, skipped = find_images(folder)
-        at_images = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
-        robot, late = at_images.robot, dict(at_images.left_out)
+        robot = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
+        late = dict(robot.left_out)
         names = [image.name for image in images if image.name not in late]
         row_of, missing, matching = robot.pairing(names)
         if not row_of:
@@ -611,7 +561,7 @@ class _Photographs:
         left_out = [(each.name, each.reason) for each in skipped]
         left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        return cls(files, folder, design, model, images, robot, at_images, arm, row_of, matching, tuple(left_out))
+        return cls(files, folder, design, model, images, robot, arm, row_of, matching, tuple(left_out))
 
     def robot_lines(self) -> tuple[str, ...]:
         """Returns lines on how the robot's poses were read and matched."""
@@ -639,6 +589,7 @@ class _Photographs:
         if self.robot.covariance is not None:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
         understood = () if self.robot.own else self.robot_lines()
+        stream, seconds = self.robot.stream, self.robot.seconds
         return HandEyeInput(
             f"{self.folder.name}, {self.files.poses.name if self.files.poses else ''}",
             pairs,
@@ -650,42 +601,7 @@ class _Photographs:
             (*understood, *(f"board: {part}" for part in detections.unused())),
             self.files.statements.setup,
             arm=self.arm and self.arm[rows],
-            timed=self.at_images.timed(tuple(found)),
+            timed=None
+            if stream is None or seconds is None
+            else Timed(stream, np.array([seconds[name] for name in found])),
         )
-
-
-MOST_ROUNDS = 3
-"""Largest number of rounds of solving and tilting; a flip by few degrees stands out when the larger ones are gone."""
-
-
-@require_arguments
-def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) -> tuple[HandEyeInput, str]:
-    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree only so.
-
-    Parameters
-    ----------
-    given : pairs of poses, of :func:`stcal.workflows.read_handeye`
-    options : as for :func:`stcal.workflows.calibrate_handeye`
-
-    Returns
-    -------
-    HandEyeInput, str
-        The input, and a sentence that names the poses.
-
-    Raises InputError: the input consists of images, which determine the poses by themselves.
-    """
-    problem = given.problem(options or HandEyeOptions())
-    if given.views is not None:
-        raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
-    undone = np.zeros(len(problem), bool)
-    for _ in range(MOST_ROUNDS):
-        result, pairs = problem.solved("pose").result, problem.pairs
-        flips = flipped(problem.loop, result.mount_from_camera, result.stand_from_board, result.outliers) & ~undone
-        if not flips.any():
-            break
-        seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
-        turned = Poses(np.where(flips[:, None, None], other.rotation, seen.rotation), seen.translation)
-        problem, undone = replace(problem, pairs=replace(pairs, camera_from_board=turned)), undone | flips
-    shown = ", ".join(name for name, flip in zip(given.pairs.names, undone, strict=True) if flip)
-    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(problem)} poses: {shown or 'none'}"
-    return replace(given, pairs=problem.pairs), said

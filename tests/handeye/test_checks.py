@@ -19,7 +19,8 @@ from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.solving import handeye
 from stcal.io.poses.rotations import INVERTED
-from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
+from stcal.workflows.handeye_inputs import HandEyeInput
+from stcal.workflows.handeye_run import without_flips
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import (

@@ -1,5 +1,5 @@
-"""One group: scale, weighted bundle adjustment alternating with the circles' eccentricity, and the free network with its
-score tests (Rao 1948; Baarda 1968)."""
+"""One group: scale, bundle adjustment alternating with the circles' eccentricity, and the free network with its score
+tests (Rao 1948; Baarda 1968)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
