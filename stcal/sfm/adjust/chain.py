@@ -224,18 +224,18 @@ class CalibratedTarget(Brief):
 
     def with_larger_sigma(self, factor: float) -> "CalibratedTarget":
         """Returns the target with all σ multiplied by a factor."""
-        square = factor**2
+
+        def times(by: float, values: dict) -> dict:
+            return {key: times(by, own) if isinstance(own, dict) else by * own for key, own in values.items()}
+
         return replace(
             self,
-            face_covariance={k: square * c for k, c in self.face_covariance.items()},
-            circle_covariance={k: square * c for k, c in self.circle_covariance.items()},
-            distance_sigma_mm={k: factor * s for k, s in self.distance_sigma_mm.items()},
+            face_covariance=times(factor**2, self.face_covariance),
+            circle_covariance=times(factor**2, self.circle_covariance),
+            distance_sigma_mm=times(factor, self.distance_sigma_mm),
             scale_sigma=None if self.scale_sigma is None else factor * self.scale_sigma,
-            covariance_mm2=None if self.covariance_mm2 is None else square * self.covariance_mm2,
-            position_sources_mm={
-                face: {kind: factor * s for kind, s in of_kind.items()}
-                for face, of_kind in self.position_sources_mm.items()
-            },
+            covariance_mm2=None if self.covariance_mm2 is None else factor**2 * self.covariance_mm2,
+            position_sources_mm=times(factor, self.position_sources_mm),
         )
 
 
@@ -386,10 +386,8 @@ def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], t
     """Returns circle centres in the target frame: weighted means over the groups, taken in the face frame."""
     weight: dict[CircleLabel, np.ndarray] = {}
     total: dict[CircleLabel, np.ndarray] = {}
-    for face_in_group in faces:
-        for label, xyz, information in zip(
-            face_in_group.labels, face_in_group.xyz_face, face_in_group.information, strict=True
-        ):
+    for own in faces:
+        for label, xyz, information in zip(own.labels, own.xyz_face, own.information, strict=True):
             weight[label] = weight.get(label, 0) + information
             total[label] = total.get(label, 0) + information @ xyz
     return {

@@ -236,8 +236,8 @@ def reproject(
         return np.full_like(measured_px, np.inf) if behind else camera_at(*lens).project(xyz) - measured_px
 
     def derivatives(points: Vector, poses: Poses, *lens: Vector) -> list[np.ndarray]:
-        xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
-        of_poses, by_point = jacobians(xyz, own.rotation, own.translation, camera)
+        xyz, camera = seen(points, poses), camera_at(*lens)
+        of_poses, by_point = _jacobians(xyz, poses[image], camera)
         return [by_point, of_poses, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
 
     root = model.whiten(np.tile(np.eye(2), (len(image), 1, 1)))
@@ -251,16 +251,13 @@ def placed(model: M, poses: Poses, points: Vector) -> M:
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
-    own = Poses.of(model.camera_from_model)[model.image_index]
-    return jacobians(model.xyz_camera(), own.rotation, own.translation, camera)
+    return _jacobians(model.xyz_camera(), Poses.of(model.camera_from_model)[model.image_index], camera)
 
 
-def jacobians(
-    xyz: np.ndarray, rotation: np.ndarray, translation: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
+def _jacobians(xyz: np.ndarray, poses: Poses, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Returns :func:`projection_jacobians` of points (n, 3) in the frames of n cameras."""
     by_camera = camera.projection_jacobian(xyz)
-    return by_pose(by_camera, xyz - translation), by_camera @ rotation
+    return by_pose(by_camera, xyz - poses.translation), by_camera @ poses.rotation
 
 
 MAX_ROUNDS = 20
