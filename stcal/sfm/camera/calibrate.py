@@ -388,13 +388,7 @@ def calibrated(
             f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
         )
     files, not_images = find_images(images)
-    start = start_camera(*require_common_size(files)[0], colmap_model)
-    return _of_model(find, files, not_images, start, board, colmap_model, rounds)
-
-
-def _of_model(
-    find: Finder, files: list[ImageFile], not_images, camera: Camera, board: BoardDesign, colmap_model: str, rounds: int
-) -> CameraCalibration:
+    camera = start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
     settled, of_perspective, warnings = False, False, []
     for number in range(1, (rounds or MAX_ROUNDS) + 1):
@@ -412,11 +406,9 @@ def _of_model(
             if rounds or before is not None or of_perspective or not camera.fisheye:
                 raise
             # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
-            rough = start_camera(camera.width, camera.height, PERSPECTIVE)
-            found = _of_model(find, files, not_images, rough, board, PERSPECTIVE, rounds)
+            found = calibrated(find, images, board, PERSPECTIVE, workers)
             camera, of_perspective = replace(camera, focal=found.intrinsics.camera.focal), True
             continue
-        result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
         camera = result.camera
         settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
         if settled and not rounds:
@@ -427,7 +419,7 @@ def _of_model(
         if without or warnings:
             views, skipped = kept, (*skipped, *without)
             require_views(views, files, skipped)
-            result = replace(adjust_intrinsics(views, board, camera, colmap_model), restarted=result.restarted)
+            result = adjust_intrinsics(views, board, camera, colmap_model)
         require_determined(result, views, board)
     calibration = judged(result, views, skipped, number, settled or rounds > 0, board)
     return replace(calibration, warnings=(*calibration.warnings, *warnings))
@@ -576,10 +568,6 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
 
 def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
     centres, dots, differ = result.factors.centres, result.factors.dots, result.differ
-    restarted = (
-        "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
-        "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
-    )
     corners = [
         f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, the "
         f"distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
@@ -594,4 +582,4 @@ def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesig
         f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
         "focus and zoom fixed, and the light even": differ,
     }
-    return [restarted] * result.restarted + corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]
+    return corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]

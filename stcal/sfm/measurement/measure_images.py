@@ -24,21 +24,12 @@ from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
+from stcal.sfm.detect import predict
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
-from stcal.sfm.detect.predict import (
-    PredictedCircles,
-    common_shift,
-    contradicted_notes,
-    contradictions,
-    measure_near,
-    measure_predicted,
-    missed_notes,
-    predict_circles,
-)
 from stcal.sfm.measurement.pose import (
     PoseOptions,
     TargetPose,
@@ -190,8 +181,8 @@ class Tracker:
         predicted = self._predicted(expected, camera, (), MAX_TRIED_TILT_RAD)
         if len(predicted.labels) < MIN_FOUND:
             return None
-        predicted = predicted.shifted(common_shift(grey_8bit(image), predicted))
-        labels, centres = measure_near(grey_fine(image), camera, predicted)
+        predicted = predicted.shifted(predict.common_shift(grey_8bit(image), predicted))
+        labels, centres = predict.measure_near(grey_fine(image), camera, predicted)
         if len(labels) < max(MIN_FOUND, MIN_SHARE * len(predicted.labels)):
             return None
         labelled = labelled_image(name, "", labels, centres, ())
@@ -208,19 +199,23 @@ class Tracker:
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
-        wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
-        seen = seen.without(wrong, contradicted_notes(wrong))
+        wrong = predict.contradictions(
+            self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera
+        )
+        seen = seen.without(wrong, predict.contradicted_notes(wrong))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
-        measured = measure_predicted(image, camera, predicted, self.ellipses)
-        missed = missed_notes(measured.missed)
+        measured = predict.measure_predicted(image, camera, predicted, self.ellipses)
+        missed = predict.missed_notes(measured.missed)
         if not measured.labels:
             return replace(seen, notes=(*seen.notes, *missed))
         return seen.plus(measured.labels, measured.centres, missed)
 
-    def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
-        return predict_circles(pose, self._planes, seen, self._patterns, camera, max_tilt_rad)
+    def _predicted(
+        self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float
+    ) -> predict.PredictedCircles:
+        return predict.predict_circles(pose, self._planes, seen, self._patterns, camera, max_tilt_rad)
 
     def _pose(self, seen: ImageObservations, camera: Camera) -> TargetPose | StcalError:
         sharp = correct_defocus([seen], camera, self._patterns)[0][0]
