@@ -22,7 +22,6 @@ from stcal.sfm.adjust.chain import (
     FaceInGroup,
     FrameKind,
     chain_faces,
-    chain_singly,
     faces_of_group,
     missing_frame_circles,
     unlinked_faces,
@@ -154,7 +153,7 @@ def calibrate(
         for face_id in unlinked
     ]
     try:
-        calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
+        calibrated = chain_faces(faces, target, options.reference_face, published)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factors = image_sigma_factors(models, camera, target.printed_ids())

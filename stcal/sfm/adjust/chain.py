@@ -239,33 +239,12 @@ class CalibratedTarget(Brief):
         )
 
 
-def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Combines the faces of all groups into the frame of the reference face by weighted least squares."""
-    chains = _ways(faces, target, reference)
-    target_from_face, target_from_group = _adjust(faces, chains, reference)
-    circles = _circles(faces, target_from_face, target)
-    return CalibratedTarget(reference, target_from_face, circles, target_from_group)
-
-
-def chain_singly(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Chains each face by single transforms along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they
-    belong). The circles of a face are those of the last group of its way."""
-    shortest = {face_id: ways[0] for face_id, ways in _ways(faces, target, reference).items()}
-    target_from_face = {face_id: _along(way, faces) for face_id, way in shortest.items()}
-    nearest: dict[str, FaceInGroup] = {}
-    for face in sorted(faces, key=lambda face: len(shortest[face.face][1])):
-        nearest.setdefault(face.group, face)
-    target_from_group = {g: target_from_face[f.face] @ f.group_from_face.inverse() for g, f in nearest.items()}
-    last = {face_id: groups[-1] for face_id, (_, groups) in shortest.items() if groups}
-    last.setdefault(reference, next(face.group for face in faces if face.face == reference))
-    faces_used = [face for face in faces if face.group == last[face.face]]
-    return CalibratedTarget(
-        reference, target_from_face, _circles(faces_used, target_from_face, target), target_from_group
-    )
-
-
-def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> dict[str, list[Way]]:
-    """Returns the ways from the reference face to every face, by face, the shortest first."""
+def chain_faces(
+    faces: Sequence[FaceInGroup], target: TargetDesign, reference: str, singly: bool = False
+) -> CalibratedTarget:
+    """Combines the faces of all groups into the frame of the reference face by weighted least squares; ``singly``: each
+    along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they belong), with the circles of its last group.
+    """
     target.face(reference)
     mapped = {face.face for face in faces}
     if reference not in mapped:
@@ -274,15 +253,24 @@ def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) ->
             f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
             f"{', '.join(sorted(mapped)) or 'none'} with --reference-face",
         )
-    chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(mapped)}
-    unlinked = [face_id for face_id, ways in chains.items() if not ways]
-    if unlinked:
+    shortest = {face_id: next(iter(_chains(faces, reference, face_id)), None) for face_id in sorted(mapped)}
+    ways = {face_id: way for face_id, way in shortest.items() if way}
+    if len(ways) < len(mapped):
         raise MappingError(
             "E-FACE-UNLINKED",
-            f"face {', '.join(unlinked)}: never linked to reference face {reference}; "
+            f"face {', '.join(sorted(shortest.keys() - ways))}: never linked to reference face {reference}; "
             f"add a group that shows it together with {reference} or a face that is linked",
         )
-    return chains
+    from_face, from_group = {face_id: _along(way, faces) for face_id, way in ways.items()}, {}
+    for face in sorted(faces, key=lambda face: len(ways[face.face][1])):
+        from_group.setdefault(face.group, from_face[face.face] @ face.group_from_face.inverse())
+    if singly:
+        last = {face_id: groups[-1] for face_id, (_, groups) in ways.items() if groups}
+        last.setdefault(reference, next(face.group for face in faces if face.face == reference))
+        faces = [face for face in faces if face.group == last[face.face]]
+    else:
+        from_face, from_group = _adjust(faces, from_face, from_group, reference)
+    return CalibratedTarget(reference, from_face, _circles(faces, from_face, target), from_group)
 
 
 def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
@@ -342,33 +330,29 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
     return result
 
 
-def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
+def _adjust(
+    faces: Sequence[FaceInGroup], from_face: dict[str, Rigid], from_group: dict[str, Rigid], reference: str
+) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
     """Estimates the poses of faces and groups in the target frame. Poses are perturbed on the right, so that the step
     of a face enters its residual with the factor −1."""
-    start = {face_id: _along(ways[0], faces) for face_id, ways in chains.items()}
-    groups = list(dict.fromkeys(face_in_group.group for face_in_group in faces))
-    start_group = {}
-    for face_in_group in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
-        start_group.setdefault(face_in_group.group, start[face_in_group.face] @ face_in_group.group_from_face.inverse())
-    free = [face_id for face_id in start if face_id != reference]
     roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
-    for each in faces:
-        by_pose = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
-        information = np.einsum("nki,nkl,nlj->ij", by_pose, each.information, by_pose)
+    for own in faces:
+        by_pose = np.concatenate([-skew(own.xyz_face), np.broadcast_to(np.eye(3), (len(own.labels), 3, 3))], axis=2)
+        information = np.einsum("nki,nkl,nlj->ij", by_pose, own.information, by_pose)
         roots.append(np.linalg.cholesky(information + 1e-12 * np.eye(6)).T)
-
-    names = [("face", f) for f in free] + [("group", g) for g in groups]
-    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(names)}
-    initial = {("face", f): start[f] for f in (reference, *free)} | {("group", g): start_group[g] for g in groups}
+    free = [("face", f) for f in from_face if f != reference]
+    free += [("group", g) for g in dict.fromkeys(own.group for own in faces)]
+    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(free)}
+    initial = {("face", f): pose for f, pose in from_face.items()} | {("group", g): p for g, p in from_group.items()}
 
     def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
         jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
-        for k, (face_in_group, root) in enumerate(zip(faces, roots, strict=True)):
-            rows, group, face = slice(6 * k, 6 * k + 6), ("group", face_in_group.group), ("face", face_in_group.face)
-            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ face_in_group.group_from_face).log()
-            r, t = face_in_group.group_from_face.rotation.T, face_in_group.group_from_face.translation
+        for k, (own, root) in enumerate(zip(faces, roots, strict=True)):
+            rows, group, face = slice(6 * k, 6 * k + 6), ("group", own.group), ("face", own.face)
+            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ own.group_from_face).log()
+            r, t = own.group_from_face.rotation.T, own.group_from_face.translation
             jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
-            if face_in_group.face != reference:
+            if face in column:
                 jacobian[rows, column[face]] = -root
         return NormalEquations.of(residual, jacobian)
 
@@ -379,7 +363,7 @@ def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[
     # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
     # iteration ends when they gain nothing.
     poses = solution.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
-    return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
+    return {f: poses["face", f] for f in from_face}, {g: poses["group", g] for g in from_group}
 
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
