@@ -201,13 +201,7 @@ class Values(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vector:
-    """Members without curvature.
-
-    Parameters
-    ----------
-    array : (n, dim) array
-        The members.
-    """
+    """Members without curvature: ``array`` (n, dim)."""
 
     array: np.ndarray
 
@@ -226,15 +220,8 @@ class Vector:
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """Huber's loss of the lengths of rows over their σ.
-
-    Parameters
-    ----------
-    limit : float
-        Length up to which it is the square.
-    gross : float
-        Length beyond which it is constant, and the row has no weight.
-    """
+    """Huber's loss of the lengths of rows over their σ, the square up to ``limit``. It is constant beyond ``gross``,
+    where a row has no weight."""
 
     limit: float = np.inf
     gross: float = np.inf
@@ -250,19 +237,8 @@ class Huber:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """A block of unknowns; to be had from :meth:`Adjustment.block`.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    start : Vector or Poses
-        Its n members at the start.
-    eliminate : bool
-        Whether it is eliminated.
-    fixed : (n,) bool array
-        Members that stay.
-    """
+    """A block of unknowns, from :meth:`Adjustment.block`: its ``name``; its n members at the ``start``; whether to
+    ``eliminate`` it; ``fixed`` (n,), whether a member stays."""
 
     name: str
     start: Values

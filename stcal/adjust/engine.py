@@ -51,10 +51,8 @@ class Adjustment:
 
     Parameters
     ----------
-    blocks, factors, priors : lists
-        What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
-    sigma : dict of str to float
-        Factor on the σ of a kind of rows, 1 where it is not stated.
+    blocks, factors, priors : What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
+    sigma : Factor on the σ of a kind of rows, 1 where it is not stated.
 
     Examples
     --------
@@ -177,15 +175,7 @@ class Adjustment:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An adjustment linearised about a state.
-
-    Parameters
-    ----------
-    problem : Adjustment
-        The adjustment.
-    values : dict of str to Vector or Poses
-        The members of each block, by its name.
-    """
+    """The adjustment ``problem`` linearised about a state: ``values``, the members of each block by its name."""
 
     problem: Adjustment
     values: dict[str, Any]
@@ -397,17 +387,11 @@ def _by_clusters(normal: np.ndarray, told: Iterable[tuple[np.ndarray, np.ndarray
 class Joined:
     """Adjustments that have blocks in common, such as those of groups of photographs by one camera.
 
-    Parameters
-    ----------
-    parts : sequence of Adjustment
-        The adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of their
-        clusters.
-    shared : tuple of str
-        Names of the blocks in common, the first ones of each part. What is known of them stands in one part only. All
-        other unknowns are eliminated.
-    free : callable, optional
-        Returns of a state the orthonormal directions (s, f) of the shared unknowns in which nothing changes, such as
-        motions of all points; the datum is that of smallest trace over them.
+    ``parts`` : the adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of
+    their clusters. ``shared`` : names of the blocks in common, the first ones of each part. What is known of them
+    stands in one part only. All other unknowns are eliminated. ``free`` : returns of a state the orthonormal directions
+    (s, f) of the shared unknowns in which nothing changes, such as motions of all points, if there are any; the datum
+    is that of smallest trace over them.
     """
 
     parts: Sequence[Adjustment]

@@ -328,24 +328,17 @@ def calibration_images(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of the photographs, and of folders of them.
-    camera : Camera
-        The camera that took them, or its file.
-    board : BoardDesign or another board design
-        The board, mm, of :func:`stcal.load_flat_board`.
-    dictionaries : tuple of str
-        Dictionaries of the tags.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of the photographs, and of folders of them.
+    camera : The camera that took them, or its file.
+    board : The board, mm, of :func:`stcal.load_flat_board`.
+    dictionaries : Dictionaries of the tags.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CalibrationImages
-        ``views``, ``tags``, ``names``, ``camera`` and ``symmetries``, the arguments of :func:`stcal.locate.calibrate`;
-        ``left_out``, images that are not used, and why.
+    CalibrationImages : ``views``, ``tags``, ``names``, ``camera`` and ``symmetries``, the arguments of
+        :func:`stcal.locate.calibrate`; ``left_out``, images that are not used, and why.
     """
     files, skipped = find_images(images)
     told, model = progress or (lambda *_: None), camera_model(camera)
@@ -373,26 +366,19 @@ def calibrate_camera_by_corners(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of photographs, or of folders of them.
-    board : board design
-        The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
-    colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, or of folders of them.
+    board : The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CameraCalibration
-        The same result as from dots; a corner (row, column) stands for the dot of that place.
+    CameraCalibration : The same result as from dots; a corner (row, column) stands for the dot of that place.
 
     Raises
     ------
-    StcalError
-        One of its subclasses, with a one-line message that says what to do.
+    StcalError : One of its subclasses, with a one-line message that says what to do.
     """
     grid, told = corner_grid(board), progress or (lambda *_: None)
 

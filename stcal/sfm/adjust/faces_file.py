@@ -251,20 +251,16 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
 
     Parameters
     ----------
-    path : path
-        ``faces.json`` of a finished run.
-    design : TargetDesign or path
-        Design of the same target, or its ``target.toml``.
+    path : ``faces.json`` of a finished run.
+    design : Design of the same target, or its ``target.toml``.
 
     Returns
     -------
-    TargetCircles
-        Centres of all circles with their joint covariance, target frame, mm and mm².
+    TargetCircles : Centres of all circles with their joint covariance, target frame, mm and mm².
 
     Raises
     ------
-    InputError
-        If the file is no ``faces.json``, or belongs to another design.
+    InputError : If the file is no ``faces.json``, or belongs to another design.
     """
     path, design = Path(path), load_target(design) if isinstance(design, str | Path) else design
     faces = read_result(path, FacesFile, "faces", "give RUN/faces.json, the faces.json of a run")

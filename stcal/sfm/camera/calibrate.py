@@ -332,31 +332,23 @@ def calibrate_camera(
 
     Parameters
     ----------
-    images : path
-        Folder of photographs, or of folders of them.
-    target : TargetDesign
-        Target that may also be in view; its circles are then not taken for dots.
-    board : BoardDesign
-        The dot board, mm, with the σ of its dots.
-    colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest model that predicts held-out
-        views as well as the best one.
-    ellipses : EllipseOptions, optional
-        Options of detection; the defaults if None.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, or of folders of them.
+    target : Target that may also be in view; its circles are then not taken for dots.
+    board : The dot board, mm, with the σ of its dots.
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest model that predicts
+        held-out views as well as the best one.
+    ellipses : Options of detection; the defaults if None.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CameraCalibration
-        Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; the views used, and warnings.
+    CameraCalibration : Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; the views
+        used, and warnings.
 
     Raises
     ------
-    StcalError
-        A stage failed. The one-line message says what to do.
+    StcalError : A stage failed. The one-line message says what to do.
     """
     ellipses, progress = ellipses or EllipseOptions(), progress or (lambda *_: None)
     with scratch_folder("camera") as cache:

@@ -58,32 +58,24 @@ class Tracker:
 
     Parameters
     ----------
-    target : TargetCircles
-        Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
-    camera : Camera
-        Camera from :func:`stcal.load_camera`, or of the run: ``result.refined_camera or result.camera``. Its
+    target : Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
+    camera : Camera from :func:`stcal.load_camera`, or of the run: ``result.refined_camera or result.camera``. Its
         covariance, if any, is part of the poses' covariances.
-    board : BoardDesign, optional
-        A dot board that may be in view, so that its dots are not taken for circles of the target.
-    pose : PoseOptions, optional
-        The defaults if None.
-    ellipses : EllipseOptions, optional
-        Options of the search; the defaults if None.
+    board : A dot board that may be in view, so that its dots are not taken for circles of the target.
+    pose : The defaults if None.
+    ellipses : Options of the search; the defaults if None.
 
     Attributes
     ----------
-    notes : tuple of str
-        Circles of the last image that were left out, with reasons.
-    searched : bool
-        Whether the last image was searched as a whole.
-    recent : tuple of Rigid
-        camera_from_target of the last one or two images, from which the next is predicted; empty before the first image
-        and after a cut. Another tracker of the same target continues the sequence if its ``recent`` is set to them.
+    notes : Circles of the last image that were left out, with reasons.
+    searched : Whether the last image was searched as a whole.
+    recent : camera_from_target of the last one or two images, from which the next is predicted; empty before the first
+        image and after a cut. Another tracker of the same target continues the sequence if its ``recent`` is set to
+        them.
 
     Raises
     ------
-    InputError
-        If the target has no design.
+    InputError : If the target has no design.
     """
 
     def __init__(
@@ -120,24 +112,18 @@ class Tracker:
 
         Parameters
         ----------
-        image : (height, width) array, uint8 or uint16
-            Grey values of the unprocessed image.
-        name : str
-            Name of the image, for messages.
+        image : (height, width) grey values of the unprocessed image, uint8 or uint16.
+        name : Name of the image, for messages.
 
         Returns
         -------
-        TargetPose
-            Pose in mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
+        TargetPose : Pose in mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
 
         Raises
         ------
-        InputError
-            If the image is not grey, or not of the camera's size.
-        DetectionError
-            If no face of the target is seen.
-        StcalError
-            If the circles give no pose. The next image is then searched as a whole.
+        InputError : If the image is not grey, or not of the camera's size.
+        DetectionError : If no face of the target is seen.
+        StcalError : If the circles give no pose. The next image is then searched as a whole.
         """
         with self._threads.limit(limits=1):
             labelled, pose = self.observe(image, name)
@@ -226,20 +212,11 @@ class Tracker:
 class MeasureOptions:
     """Options of :func:`measure`.
 
-    Parameters
-    ----------
-    pose : PoseOptions
-        Options of the pose of a single image.
-    previous : bool
-        Whether an ambiguous pose is decided by that of the image before, by name and in the same folder.
-    sequence : bool
-        Whether the images of each folder follow each other, by name. The target is then looked for at its predicted
-        place, and in the whole image only if it is not there; see :class:`stcal.sfm.Tracker`. An
-        ambiguous pose is decided by the one before.
-    ellipses : EllipseOptions
-        Options of detection.
-    workers : int, optional
-        Number of processes; one per core if None.
+    ``pose`` : of the pose of a single image; ``previous`` : whether an ambiguous pose is decided by that of the image
+    before, by name and in the same folder; ``sequence`` : whether the images of each folder follow each other, by name:
+    the target is then looked for at its predicted place, and in the whole image only if it is not there, as by
+    :class:`stcal.sfm.Tracker`, and an ambiguous pose is decided by the one before; ``ellipses`` : options of detection;
+    ``workers`` : number of processes; one per core if None.
     """
 
     pose: PoseOptions = field(default_factory=PoseOptions)
@@ -295,35 +272,25 @@ def measure(
 
     Parameters
     ----------
-    images : path
-        Folder of photographs, with its subfolders.
-    camera : Camera or path
-        Camera from :func:`stcal.load_camera`, its file, or of the run: ``result.refined_camera or result.camera``. Its
-        covariance, if any, is part of the poses' covariances.
-    target : TargetCircles or path
-        Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
-    design : TargetDesign or path, optional
-        Design with radii and polarity, for detection and labels, or its ``target.toml``; that of the circles, or the
-        reference design, if None.
-    board : BoardDesign, optional
-        A dot board that may be in view, so that its dots are not taken for circles of the target.
-    options : MeasureOptions, optional
-        The defaults if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, with its subfolders.
+    camera : Camera from :func:`stcal.load_camera`, its file, or of the run: ``result.refined_camera or result.camera``.
+        Its covariance, if any, is part of the poses' covariances.
+    target : Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
+    design : Design with radii and polarity, for detection and labels, or its ``target.toml``; that of the circles, or
+        the reference design, if None.
+    board : A dot board that may be in view, so that its dots are not taken for circles of the target.
+    options : The defaults if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    MeasureResult
-        camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left perturbation
-        in the camera frame; and the images left out, with reasons.
+    MeasureResult : camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left
+        perturbation in the camera frame; and the images left out, with reasons.
 
     Raises
     ------
-    InputError
-        If no image is usable, or the camera file does not belong to the images.
-    DetectionError
-        If no image shows a face.
+    InputError : If no image is usable, or the camera file does not belong to the images.
+    DetectionError : If no image shows a face.
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     if design is None and isinstance(target, TargetCircles):

@@ -97,23 +97,18 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
 
     Parameters
     ----------
-    result : MeasureResult
-        Of :func:`~stcal.sfm.measure`.
-    joints : Table, optional
-        Further columns by ``image``, of :func:`stcal.load_table`. Only images of this table are then written.
+    result : Of :func:`~stcal.sfm.measure`.
+    joints : Further columns by ``image``, of :func:`stcal.load_table`. Only images of this table are then written.
 
     Returns
     -------
-    text : str
-        CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
-    notes : tuple of str
-        Images of only one of both.
+    text : str : CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
+    notes : tuple of str : Images of only one of both.
 
     Raises
     ------
-    InputError
-        The table has no column ``image``, an image twice, a column of the name of a measured one, or no image that was
-        measured.
+    InputError : The table has no column ``image``, an image twice, a column of the name of a measured one, or no image
+        that was measured.
     """
     header = [IMAGE, "faces", "circles", "status", *POSE, *COVARIANCE, "rms_px", "chi2_per_dof"]
     common = common_columns(result.common.shape[2])
