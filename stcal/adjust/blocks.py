@@ -43,7 +43,6 @@ class Equations:
         return Equations(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
 
     def flat(self) -> np.ndarray:
-        """Return all numbers in a row."""
         return np.concatenate([np.ravel(getattr(self, each.name)) for each in fields(self)])
 
     def filled(self, flat: np.ndarray) -> "Equations":
@@ -186,17 +185,13 @@ class Values(Protocol):
     """The members of a block, such as a :class:`Vector` or :class:`~stcal.geometry.rigid.Poses`."""
 
     @property
-    def dim(self) -> int:
-        """Number of unknowns of a member."""
-        ...
+    def dim(self) -> int: ...
 
     def __len__(self) -> int:
         """Return the number of members."""
         ...
 
-    def moved(self, step: np.ndarray) -> Any:
-        """Return the members after steps (n, dim)."""
-        ...
+    def moved(self, step: np.ndarray) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,14 +202,12 @@ class Vector:
 
     @property
     def dim(self) -> int:
-        """Number of unknowns of a member."""
         return self.array.shape[1]
 
     def __len__(self) -> int:
         return len(self.array)
 
     def moved(self, step: np.ndarray) -> "Vector":
-        """Return the members after steps (n, dim)."""
         return Vector(self.array + step)
 
 
@@ -227,11 +220,9 @@ class Huber:
     gross: float = np.inf
 
     def cost(self, length: np.ndarray) -> np.ndarray:
-        """Return the loss of lengths (r,)."""
         return huber_cost(np.minimum(length, self.gross), self.limit)
 
     def weight(self, length: np.ndarray) -> np.ndarray:
-        """Return the weights of lengths (r,)."""
         return np.where(length > self.gross, 0.0, huber_weights(length, self.limit))
 
 
@@ -261,7 +252,6 @@ class Factor:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of its residuals."""
         return (self.kind,) if isinstance(self.kind, str) else self.kind
 
     def white(self, values: Mapping[str, Any], sigma: Mapping[str, float]) -> np.ndarray:
@@ -305,9 +295,7 @@ class Known(Protocol):
     """Knowledge of a kept block: any cost with its equations."""
 
     @property
-    def block(self) -> Block:
-        """The block."""
-        ...
+    def block(self) -> Block: ...
 
     def cost(self, values: Mapping[str, Any]) -> float:
         """Return the cost of a state, in σ²."""
@@ -331,12 +319,10 @@ class Prior:
         return (values[self.block.name].array - self.mean).ravel()
 
     def cost(self, values: Mapping[str, Any]) -> float:
-        """Return the cost, in σ²."""
         away = self.away(values)
         return float(away @ self.weight @ away)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return normal matrix and right side."""
         return self.weight, -self.weight @ self.away(values)
 
 
@@ -374,7 +360,6 @@ class Rows:
         return cls(factor, places, slopes, white * root[:, None], length, weight)
 
     def of_kinds(self, kinds: Collection[str]) -> "Rows | None":
-        """Return the residuals of some kinds."""
         own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
         if isinstance(self.factor.kind, str) or not own:
             return self if own else None

@@ -205,7 +205,6 @@ class Solution:
 
     @cached_property
     def dropped(self) -> Block | None:
-        """The block that is eliminated."""
         return next((block for block in self.problem.blocks if block.eliminate), None)
 
     @cached_property

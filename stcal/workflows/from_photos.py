@@ -188,7 +188,6 @@ POSES = "poses.csv"
 
 
 def _results(result: FromPhotos) -> dict[str, ResultFile]:
-    """Returns the result files, by name."""
     models: dict[str, type[ResultFile]] = {
         "axes": AxesFile,
         "identified": IdentifiedFile,

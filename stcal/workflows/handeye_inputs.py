@@ -68,7 +68,6 @@ class RobotPoses:
 
     @property
     def file(self) -> str:
-        """Name of the file, without its folders."""
         return Path(self.where.removeprefix("robot poses ")).name
 
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
@@ -340,7 +339,6 @@ class HandEyeInput:
     notes: tuple[str, ...] = ()
 
     def problem(self, options: HandEyeOptions) -> HandEyeProblem:
-        """Returns what is to be solved."""
         return HandEyeProblem(self.pairs, self.setup or "eye-in-hand", self.views, options)
 
 
@@ -459,7 +457,6 @@ class Files:
         return HandEyeInput(where, told.pairs, setup=stated or told.setup, **more)
 
     def _of_images(self) -> dict[str, Path | None]:
-        """Returns the options of images, by name."""
         return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
 
     def _require_no_images(self) -> None:
@@ -531,7 +528,6 @@ class _Photographs:
 
     @classmethod
     def of(cls, files: Files, folder: Path) -> "_Photographs":
-        """Returns the images of a folder, matched with the poses in their file."""
         poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
         if poses is None or camera is None or board is None:
             missing = ", ".join(name for name, path in files._of_images().items() if path is None)
@@ -566,7 +562,6 @@ class _Photographs:
         return f"robot: {self.robot.understood}", *matched
 
     def lines(self) -> list[str]:
-        """Returns lines on how the files were understood."""
         (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
         camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
         size = f"{width} × {height} px, focal length {focal_px:.6g} px"

@@ -116,7 +116,6 @@ class Calibration(Brief):
     circle_sigma_px: float | None = None  # of the target's points in the joint adjustment, RMS per axis
 
     def with_larger_sigma(self, factor: float) -> "Calibration":
-        """Returns the calibration with all σ of the joint adjustment multiplied by a factor."""
         if self.joint is None or factor == 1:
             return self
         return replace(self, target=self.target.with_larger_sigma(factor), joint=self.joint.with_larger_sigma(factor))

@@ -223,8 +223,6 @@ class CalibratedTarget(Brief):
     position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
     def with_larger_sigma(self, factor: float) -> "CalibratedTarget":
-        """Returns the target with all σ multiplied by a factor."""
-
         def times(by: float, values: dict) -> dict:
             return {key: times(by, own) if isinstance(own, dict) else by * own for key, own in values.items()}
 

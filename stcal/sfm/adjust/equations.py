@@ -70,7 +70,6 @@ class RowsOfView:
         return cls(rows, np.linalg.qr(by_pose.reshape(2 * n, 6))[0])
 
     def free(self, values: np.ndarray) -> np.ndarray:
-        """Returns (2n, …) without what the pose takes."""
         return values - self.pose @ (self.pose.T @ values)
 
     def along(self, directions: np.ndarray) -> np.ndarray:
@@ -95,11 +94,9 @@ class Group:
     circle_place: np.ndarray  # of each circle among all
 
     def name(self, block: str) -> str:
-        """Returns the name of a block of its own."""
         return f"{block} of {self.model.group}"
 
     def values(self) -> dict[str, Any]:
-        """Returns its own unknowns at the start."""
         return {
             self.name(POSES): Poses.of(self.model.camera_from_model),
             self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
@@ -107,14 +104,12 @@ class Group:
         }
 
     def at(self, values: Mapping[str, Any]) -> MetricModel:
-        """Returns its model at a state."""
         points = np.empty_like(self.model.xyz_model)
         points[self.circles] = values[CIRCLES].array[self.circle_place]
         points[self.dots] = values[self.name(DOTS)].array
         return placed(self.model, values[self.name(POSES)], Vector(points))
 
     def board_at(self, values: Mapping[str, Any]) -> Rigid:
-        """Returns model_from_board at a state."""
         return values[self.name(BOARD)][0]
 
     def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
@@ -128,7 +123,6 @@ class Group:
         return place[self.model.point_index]
 
     def observations(self, kind: str) -> np.ndarray:
-        """Returns the model's observations of circles or of dots."""
         return np.flatnonzero(np.isin(self.model.point_index, self.circles if kind == CIRCLES else self.dots))
 
 
@@ -176,7 +170,6 @@ class Setting:
         return {CIRCLES: Vector(xyz), CAMERA: Vector(away[None]), **own}
 
     def camera(self, values: Mapping[str, Any]) -> Camera:
-        """Returns the camera at a state."""
         return self.camera_at(*(values[CAMERA],) * bool(self.basis.shape[1]))
 
     def camera_at(self, *away: Vector) -> Camera:
@@ -299,7 +292,6 @@ class Shape:
         return cls(members, pose.rotation, off, weight, by_pose, prior, value, bool(size_sigma))
 
     def cost(self) -> float:
-        """Returns the squared deviations over σ²."""
         return float((self.weight * self.off_mm**2).sum() + self.prior[6:] @ self.value**2)
 
     def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
@@ -368,12 +360,10 @@ class OfTarget:
         return self.last[1:]
 
     def cost(self, values: Mapping[str, Any]) -> float:
-        """Returns squared deviations over σ²."""
         rows, known = self._known(values)
         return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns normal matrix (3c, 3c) and right side (3c,)."""
         size = values[CIRCLES].array.size
         normal, right = np.zeros((size, size)), np.zeros(size)
         rows, known = self._known(values)

@@ -43,7 +43,6 @@ class FacePoses(Part):
     target_from_face: dict[str, Pose]
 
     def poses(self) -> dict[str, Rigid]:
-        """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
 
 
@@ -174,7 +173,6 @@ class FacesFile(ResultFile):
         return cls.model_validate(content)
 
     def poses(self) -> dict[str, Rigid]:
-        """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
 
 

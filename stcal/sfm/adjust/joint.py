@@ -95,7 +95,6 @@ class JointResult:
         return self.enlarged * max(1.0, self.sigma0)
 
     def with_larger_sigma(self, factor: float) -> "JointResult":
-        """Returns the result with all σ multiplied by a factor."""
         covariances = {k: factor**2 * getattr(self, k) for k in ("covariance_mm2", "camera_covariance")}
         return replace(self, enlarged=factor * self.enlarged, **covariances)
 
@@ -117,12 +116,10 @@ class Adjusted:
 
     @property
     def models(self) -> list[MetricModel]:
-        """The groups' models."""
         return [group.at(self.solution.values) for group in self.setting.groups]
 
     @property
     def camera(self) -> Camera:
-        """The camera."""
         return self.setting.camera(self.solution.values)
 
     def result(self, sigma0: float | None = None) -> JointResult:

@@ -60,7 +60,6 @@ class Scale:
         return Similarity(self.mm_per_unit, Rigid())
 
     def rms_mm(self) -> float:
-        """Returns the RMS of the residuals' lengths."""
         return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
 
     def mean_mm(self) -> float:
@@ -245,7 +244,6 @@ def reproject(
 
 
 def placed(model: M, poses: Poses, points: Vector) -> M:
-    """Returns the model with these poses and points."""
     return replace(model, camera_from_model=tuple(poses), xyz_model=points.array)
 
 
@@ -470,7 +468,6 @@ class Network:
 
 
 def free_network(model: GroupModel, camera: Camera) -> Network:
-    """Returns the free network of an adjusted model."""
     by_pose, by_point = projection_jacobians(model, camera)
     a, b = model.whiten(by_pose), model.whiten(by_point)
     m, p = len(model.images), len(model.labels)
