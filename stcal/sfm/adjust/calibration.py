@@ -67,10 +67,6 @@ class AdjustOptions:
             )
 
 
-JOINT_ROUNDS = 2
-"""Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
-
-
 MIN_REDUNDANCY = 30.0
 """Smallest redundancy of a kind of circle for a factor of its own; below, that of all circles holds. Of 30, a factor is
 known to 13 %."""
@@ -139,7 +135,8 @@ def calibrate(
     """
     published = options.solve == "paper"
     prior = prior if options.refine_camera else None
-    joint_rounds = 0 if options.solve != "joint" else JOINT_ROUNDS + (prior is not None)  # refined intrinsics: one more
+    # Eccentricity changes by nanometres between the first and the second; refined intrinsics take one more.
+    joint_rounds = 0 if options.solve != "joint" else 2 + (prior is not None)
     step = counted(progress or (lambda *_: None), "faces", 1 + joint_rounds + (joint_rounds > 0))
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]

@@ -188,7 +188,6 @@ def faces_of_group(
     return faces, notes
 
 
-MAX_CHAIN_STEPS = 4
 MAX_CHAINS = 12
 Way = tuple[tuple[str, ...], tuple[str, ...]]
 """The faces from the first to the last, and the groups that link them."""
@@ -307,7 +306,7 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
             if len(complete) == MAX_CHAINS:
                 break
             continue
-        longest = len(complete[0][0]) if complete else max(MAX_CHAIN_STEPS, len(by_group))
+        longest = len(complete[0][0]) if complete else max(4, len(by_group))
         if len(way) <= longest:
             queue += [
                 ((*way, face_id), (*groups, group))

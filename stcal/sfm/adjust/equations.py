@@ -239,10 +239,6 @@ def is_dots_first_cheaper(group: Group) -> bool:
     return 6 * len(group.model.images) < 3 * len(group.dots)
 
 
-SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
-"""Most steps of a design that is laid over points, and the step (rad, mm) at which they end."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
     """The n points of a face of known shape against its design, which is laid over them with their weights."""
@@ -277,7 +273,7 @@ class Shape:
             [np.zeros(6), [size_sigma**-2] if size_sigma else [], (amplitude * modes.spread_mm) ** -2.0]
         )
         pose, value = align_rigid(xyz, design), np.zeros(len(prior) - 6)
-        for _ in range(SHAPE_STEPS):
+        for _ in range(20):
             in_face = (xyz - pose.translation) @ pose.rotation
             off = in_face - design + others @ value
             by_pose = np.concatenate([skew(in_face), -unit, others], axis=2).reshape(len(weight) * 3, -1)
@@ -286,7 +282,7 @@ class Shape:
             right[6:] += prior[6:] * value
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
             step = -scale * np.linalg.lstsq(normal * scale[:, None] * scale, scale * right, rcond=1e-12)[0]
-            if np.abs(step).max() < SHAPE_SETTLED:
+            if np.abs(step).max() < 1e-13:  # rad, mm
                 break
             pose, value = pose @ Rigid.exp(step[:6]), value + step[6:]
         return cls(members, pose.rotation, off, weight, by_pose, prior, value, bool(size_sigma))

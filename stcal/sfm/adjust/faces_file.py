@@ -177,7 +177,6 @@ class FacesFile(ResultFile):
 
 
 SAME_DESIGN_MM = 0.5  # largest RMS deviation of a face from the design; another design is off by far more
-SAME_RADIUS_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -310,7 +309,7 @@ def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> 
     for label, own in zip(target.labels, target.radius, strict=True):
         if label not in radius:
             faults.append(f"circle {label} is not in target {design.name}")
-        elif abs(own - radius[label]) > SAME_RADIUS_MM:
+        elif abs(own - radius[label]) > 1e-6:
             faults.append(f"circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}")
     for face in () if faults else design.faces:
         xyz, flat = target.of_face(face)

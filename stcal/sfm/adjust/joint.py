@@ -205,8 +205,6 @@ def adjust_part(
     return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
 
 
-SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
-"""Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
 LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but is never exact
@@ -215,10 +213,10 @@ LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but
 def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors) -> tuple[Setting, Values]:
     """Returns the state near its minimum with the σ of faces of known shape that belong to it."""
     setting = replace(setting, factors=factors)
-    for _ in range(SHAPE_ROUNDS):
+    for _ in range(6):
         minimum, before = _descent(setting, values, NEARLY), setting.factors
         values, setting = minimum.state, replace(setting, factors=_shape_factors(setting, minimum.linear))
-        if np.abs(np.log(np.divide(setting.factors, before))).max() < SETTLED_FACTOR:
+        if np.abs(np.log(np.divide(setting.factors, before))).max() < 0.03:
             break
     return setting, values
 

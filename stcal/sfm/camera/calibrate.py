@@ -106,7 +106,6 @@ LIKELY = 2.0
 """Number of standard errors by which a model with fewer parameters may be worse than the best and still be selected;
 after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
 HOPELESS = 3.0  # ratio of residuals to those of the best model from which on a model is not tried further
-POSE_PASSES = 2  # of pose and eccentricity; few suffice, as eccentricity hardly changes with the pose
 CLIP_SIGMAS = 5.0  # limit of residuals: gross errors of dots carry no information about the lens
 
 
@@ -227,7 +226,7 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
     points = Vector(np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)]))
     model = replace(model, xyz_model=points.array)
     radius: dict[Label, float] = {**board.radius_of()}
-    for _ in range(POSE_PASSES):
+    for _ in range(2):  # eccentricity hardly changes with the pose
         model = replace(model, shift_px=eccentricity_px(model, camera, radius, 1.0))
         begin, poses = model, Poses.of(model.camera_from_model)
 

@@ -187,7 +187,6 @@ FOCAL_LIMITS = (0.2, 50.0)  # of the focal length over the longer image side; cl
 TRIED_FOCALS, TRIED_VIEWS = tuple(np.geomspace(0.4, 12.8, 11).tolist()), 12
 """Focal lengths over the longer side that are tried where the closed form gives none, a factor of √2 apart, and the
 number of views, those of most dots, by which they are judged."""
-SETTLING_PASSES = 3
 
 
 def start_camera(width: int, height: int, colmap_model: str) -> Camera:
@@ -303,7 +302,7 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
     chosen = [0] * len(fields)
     order = sorted(range(len(fields)), key=lambda i: -np.count_nonzero(fields[i][0]))
     total = np.zeros_like(fields[0][0])
-    for turn in range(SETTLING_PASSES):
+    for turn in range(3):
         for i in order:
             if turn:
                 total -= fields[i][chosen[i]]
@@ -313,7 +312,6 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
 
 
 MAX_ROUNDS = 20
-LEAST_ROUNDS = 2
 SETTLED_FACTOR = 0.005  # largest relative change of a variance component in the last round
 SETTLED_SHIFT_PX = 1e-5  # largest change of an eccentricity in the last round, px
 LEAST_ROBUST = 1e-6  # smallest robust σ of normalised residuals, for exact data
@@ -458,7 +456,7 @@ def _adjusted(fit: Fit, board: BoardDesign, colmap_model: str) -> Intrinsics:
         ]
         factors, fit = updated, replace(fit, boards=boards)
         change = float(np.abs(np.log(changes)).max())
-        settled = bool(round_index >= LEAST_ROUNDS and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        settled = bool(round_index >= 2 and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
             break
     return _intrinsics(last, colmap_model, factors, settled)

@@ -213,22 +213,16 @@ def covariance_of_likelihood(
         image_pose = mirrored(pose, plane)
         step_to_mirrored = image_pose.difference(pose)[0]
         square = float(step_to_mirrored @ np.linalg.solve(covariance, step_to_mirrored))
-        delta = _best_of_tilt(problem, image_pose, plane, whiten) - least
+        residual, image = problem.seen(image_pose)
+        free = np.zeros((6, 4))  # all parameters but the tilt of the plane, which are adjusted to first order
+        free[:3, 0] = image_pose.rotation[0] @ plane.rotation[:, 2]
+        free[3:, 1:] = np.eye(3)
+        a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
+        delta = float(((r - a @ np.linalg.lstsq(a, r)[0]) ** 2).sum()) - least
         if delta < min(plausible, square / 2) and square > OTHER_SIDE**2:
             other_side, curved = float(delta), True
             first = covariance + np.outer(step_to_mirrored, step_to_mirrored) / 4
     return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
-
-
-def _best_of_tilt(problem: PoseProblem, pose: Poses, plane: Rigid, whiten: np.ndarray) -> float:
-    """Returns χ² of a pose after all parameters but the tilt of the plane are adjusted, to first order."""
-    residual, image = problem.seen(pose)
-    free = np.zeros((6, 4))
-    free[:3, 0] = pose.rotation[0] @ plane.rotation[:, 2]
-    free[3:, 1:] = np.eye(3)
-    a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
-    residual_after = r - a @ np.linalg.lstsq(a, r)[0]
-    return float(residual_after @ residual_after)
 
 
 def _sampled(excess, least: float, pose: Poses, covariance: np.ndarray, second: Poses | None) -> np.ndarray:
@@ -277,9 +271,6 @@ class PoseOptions:
                 f"flip odds {self.flip_odds:g}, σ margin {self.sigma_margin:g}, σ factor {factor:g}: odds between "
                 "0 and 1, a margin of at least 1 and a positive factor needed",
             )
-
-    def needed(self, chi2_per_dof: float) -> float:
-        return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -400,7 +391,17 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
 
 
 def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
-    excess, second = _second_solution(problem, found)
+    excess, second = np.inf, None  # of the second minimum in χ², and its pose
+    if len(found.cost) > 1:
+        excess, second = float(found.cost[1] - found.cost[0]), found.poses[[1]]
+    if second is not None and excess <= HOPELESS * max(1.0, found.cost[0] / (2 * len(problem.labels) - 6)):
+        # Both minima give a circle the same weight, the smaller of the two. Else an outlier of one could decide.
+        residual, image = problem.seen(found.poses)
+        common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
+        weighed = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
+        excess, second = np.inf, None
+        if distinct(weighed.poses, weighed.normal[0]):
+            excess, second = float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
     alone = second is None and len({label.face for label in problem.labels}) == 1
     first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
     first = replace(first, delta_chi2=min(excess, first.delta_chi2))
@@ -411,22 +412,6 @@ def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOpti
     other = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
     other = replace(other, status="ambiguous", delta_chi2=-excess, needed_chi2=first.needed_chi2)
     return replace(first, status="ambiguous", second=other)
-
-
-def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, Poses | None]:
-    """Returns the excess in χ² of the second minimum, and its pose; infinite and None if there is none. Both minima
-    give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide."""
-    if len(found.cost) == 1:
-        return np.inf, None
-    delta = float(found.cost[1] - found.cost[0])
-    if delta > HOPELESS * max(1.0, found.cost[0] / (2 * len(problem.labels) - 6)):  # whatever the weights
-        return delta, found.poses[[1]]
-    residual, image = problem.seen(found.poses)
-    common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
-    weighed = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
-    if not distinct(weighed.poses, weighed.normal[0]):
-        return np.inf, None
-    return float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
 
 
 def _solution(
@@ -453,7 +438,7 @@ def _solution(
     }
     gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
     chi2, redundancy = float(last.chi2[0]), 2 * len(problem.labels) - 6
-    needed = options.needed(chi2 / redundancy)
+    needed = deciding_delta(options.flip_odds, options.sigma_margin, chi2 / redundancy)
     # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
     plausible = needed / options.sigma_margin**2
     covariance, other_side = covariance_of_likelihood(

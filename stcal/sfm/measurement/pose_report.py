@@ -233,7 +233,6 @@ def summary(result: MeasureResult) -> list[str]:
 
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
-ELLIPSE_SHARE = 0.06  # length with which the largest σ is drawn, as a share of the plot's width
 HEADS = ("<image", "<faces", "circles", "<status", "x mm", "y", "z", "σ µm", "σ mdeg", "RMS px", "χ²/dof", "<fit")
 
 
@@ -242,7 +241,7 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     images, left_out = result.images, [[each.name, each.reason] for each in result.left_out]
     at = np.array([image.pose.camera_from_target.translation for image in images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in images))
-    times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
+    times = round_below(0.06 * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
     statuses = {image.pose.status for image in images}
     counts, *remarks = summary(result)
     every = every or len(images) <= MOST_LISTED
