@@ -156,9 +156,6 @@ class Setting:
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
 
-    def shape_sigma_mm(self) -> float:
-        return self.board.sigma_mm * float(np.sqrt(self.common))
-
     def cells(self) -> np.ndarray:
         """Returns the cells of the board of whose dots the common shape consists."""
         return np.unique(np.concatenate([group.cells for group in self.groups])) if self.common else np.zeros(0, int)
@@ -192,7 +189,7 @@ class Setting:
                     a.factor(
                         lambda v: v.array,
                         [(shape, np.arange(len(shape.start)))],
-                        self.shape_sigma_mm(),
+                        self.board.sigma_mm * float(np.sqrt(self.common)),
                         lambda v: [np.broadcast_to(np.eye(3), (len(v), 3, 3))],
                         kind=BOARD,
                     )

@@ -78,11 +78,6 @@ class Fit:
         """Observed coordinates minus unknowns of poses and camera; dots are observed as often as unknown."""
         return sum(2 * len(m.image_index) - 6 * len(m.images) for m in self.models) - self.basis.shape[1]
 
-    def dots_cost(self) -> float:
-        """Returns the χ² of the places of dots by themselves, without the modes of the prints."""
-        off = [(self.boards[model.group], model.xyz_model) for model in self.models]
-        return float(sum(own.modes.costs(xyz - own.places, self.sigma_mm)[0] for own, xyz in off))
-
     def camera_at(self, away: Vector) -> Camera:
         """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
         parameters = self.start.parameters() + self.basis @ away.array[0]
@@ -505,8 +500,10 @@ def _updated_factors(last: LinearFit, factors: BoardSigmaFactors) -> tuple[Board
     """Returns variance components of centres and dots (Förstner 1979), and the boards with their amplitudes."""
     fit, (dots_left, boards) = last.fit, last.with_found_prints()
     dots, image_redundancy = factors.dots, fit.redundancy() - dots_left
-    if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(LEAST_DOTS, dots * sigma_factor(fit.dots_cost(), dots_left))
+    if dots_left > MIN_BOARD_REDUNDANCY:  # by the χ² of the places of dots by themselves, without the modes of prints
+        off = [(fit.boards[model.group], model.xyz_model) for model in fit.models]
+        square = float(sum(own.modes.costs(xyz - own.places, fit.sigma_mm)[0] for own, xyz in off))
+        dots = max(LEAST_DOTS, dots * sigma_factor(square, dots_left))
     return BoardSigmaFactors(factors.centres * sigma_factor(fit.cost(), image_redundancy), dots), boards
 
 

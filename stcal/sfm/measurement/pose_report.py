@@ -167,31 +167,33 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
 
 
 def poses_file(result: MeasureResult) -> PosesFile:
+    images = []
+    for image in result.images:
+        pose = image.pose
+        circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
+        named = {
+            "image": image.name,
+            "notes": image.notes,
+            "covariance_parts": pose.parts,
+            "alternative": pose.second,
+            "delta_chi2_needed": pose.needed_chi2,
+            "rms_px": pose.rms_px(),
+            "dof": pose.redundancy,
+            "p_value": pose.p_value(),
+            "fit": fit_verdict(pose),
+            "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
+        }
+        alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
+        images.append(ImagePose.model_validate(named | alike))
     return PosesFile(
         format="stcal poses 1",
         unit="mm",
         sigma_factor=result.sigma_factor,
         intrinsics_held=result.intrinsics_held,
         notes=list(result.notes),
-        images=[_image_pose(image.pose, image=image.name, notes=image.notes) for image in result.images],
+        images=images,
         left_out=[NamedReason.model_validate(each) for each in result.left_out],
     )
-
-
-def _image_pose(pose: TargetPose, **named) -> ImagePose:
-    circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
-    named |= {
-        "covariance_parts": pose.parts,
-        "alternative": pose.second,
-        "delta_chi2_needed": pose.needed_chi2,
-        "rms_px": pose.rms_px(),
-        "dof": pose.redundancy,
-        "p_value": pose.p_value(),
-        "fit": fit_verdict(pose),
-        "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
-    }
-    alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
-    return ImagePose.model_validate({name: (named | alike)[name] for name in ImagePose.model_fields})
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -245,9 +247,18 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     statuses = {image.pose.status for image in images}
     counts, *remarks = summary(result)
     every = every or len(images) <= MOST_LISTED
-    doubtful = [image for image in images if not _is_sound(image.pose)]
+    doubtful = [
+        image
+        for image in images
+        if image.pose.status != "certain" or fit_verdict(image.pose) != "passed" or image.pose.outliers
+    ]
     listed = images if every else doubtful[:MOST_LISTED]
-    figures = ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), _figures(images)).lines()
+    values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
+    rows = [
+        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", images[int(v.argmax())].name]
+        for what, v in zip(("σ position µm", "σ rotation mdeg", "residuals RMS px"), values, strict=True)
+    ]
+    figures = ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), rows).lines()
     rest = f"{len(listed)} of them need a look; the table that is written has all, and --verbose prints them"
     outliers = [
         [image.name, outlier.label, number(outlier.residual_px, 3), number(outlier.limit_px, 3)]
@@ -293,23 +304,10 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     )
 
 
-def _figures(images: Sequence[MeasuredImage]) -> list[list[str]]:
-    values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
-    names = "σ position µm", "σ rotation mdeg", "residuals RMS px"
-    return [
-        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", images[int(v.argmax())].name]
-        for what, v in zip(names, values, strict=True)
-    ]
-
-
 def _largest_sigma(pose: TargetPose) -> tuple[float, float]:
     """Returns the largest σ of three axes: position, µm, and rotation, mdeg."""
     sigma = 1e3 * np.sqrt(np.diag(pose.covariance))
     return float(sigma[3:].max()), float(np.degrees(sigma[:3].max()))
-
-
-def _is_sound(pose: TargetPose) -> bool:
-    return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
 
 
 def _row(each: MeasuredImage) -> list[str]:
