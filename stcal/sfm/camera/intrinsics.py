@@ -198,16 +198,16 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
     it."""
     if camera.fisheye:
         return camera
-    coefficients, constants, rows = [], [], []
+    conics = []
     for image in observations:
         h = _homography(image, board, camera)
         first, second = h[:, 0], h[:, 1]
         first, second = np.array([first, second]) / np.sqrt(np.linalg.norm(first[:2]) * np.linalg.norm(second[:2]))
-        coefficients += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
-        constants += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
-        rows += [_conic(first, second), _conic(first, first) - _conic(second, second)]
-    square = float(np.dot(coefficients, coefficients))
-    inverse = float(np.dot(coefficients, constants)) / square if square else 0.0  # (assumed focal / focal)²
+        conics += [_conic(first, second), _conic(first, first) - _conic(second, second)]
+    rows = np.array(conics)
+    equal, constants = rows[:, 0] + rows[:, 1], -rows[:, 4]
+    square = float(equal @ equal)
+    inverse = float(equal @ constants) / square if square else 0.0  # (assumed focal / focal)²
     low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
     largest = sorted(observations, key=len)[-TRIED_VIEWS:]
 
@@ -224,7 +224,7 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
     else:  # the one of several that fits best, by the mean over views of the RMS distance
         longer = max(camera.width, camera.height)
         usual = min((replace(camera, focal=np.full(2, share * longer)) for share in TRIED_FOCALS), key=misfit_px)
-    free = _of_any_pixels(np.array(rows), camera, low, high) if len(observations) >= LEAST_FREE else None
+    free = _of_any_pixels(rows, camera, low, high) if len(observations) >= LEAST_FREE else None
     return free if free is not None and misfit_px(free) < FAR_BETTER * misfit_px(usual) else usual
 
 
