@@ -389,9 +389,11 @@ def read_handeye(
     second : file of the camera's poses
     key : column by which rows of both files belong together, or ``image=Point Name``
     setup : {"eye-in-hand", "eye-to-hand"}, what carries the camera; as a file says, or ``eye-in-hand``, if None
-    rotation : ``robot=`` or ``camera=`` in front for one side
+    rotation : convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
+        ``robot=`` or ``camera=`` in front for one side
     length_unit : unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise
-    poses_are : ``camera_from_board`` or ``board_from_camera``
+    poses_are : names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
+        ``camera_from_board`` or ``board_from_camera``
     quaternions : {"wxyz", "xyzw"}, as columns of quaternions are named, or x, y, z, w in the order in which they stand
     tolerance_s : time within which the nearest of the robot's poses is taken where none can be interpolated, s
     image_times : table of the times of photographs
@@ -402,7 +404,8 @@ def read_handeye(
 
     Returns
     -------
-    HandEyeInput : ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
+    HandEyeInput
+        ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
         :func:`stcal.workflows.calibrate_handeye` and :func:`stcal.workflows.plan_handeye`.
 
     Raises InputError: A file is missing or not of the required form, one file too many was given, or no image shows the

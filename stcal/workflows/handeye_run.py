@@ -66,7 +66,8 @@ def calibrate_handeye(
     Parameters
     ----------
     given : of :func:`stcal.workflows.read_handeye`
-    method : if None
+    method : one of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best
+        if None
     options : known errors, and further unknowns; the symmetries of the board are those of ``given``
     refine_camera : whether the intrinsics are adjusted, from those of the camera file with their σ
     time_offset : whether the offset of the two clocks is estimated first
@@ -79,8 +80,8 @@ def calibrate_handeye(
 
     Returns
     -------
-    Outcome : ``result``, a :class:`stcal.handeye.HandEye`, mm and rad; its errors on poses ``held_out``;
-        ``all_notes()``.
+    Outcome
+        ``result``, a :class:`stcal.handeye.HandEye`, mm and rad; its errors on poses ``held_out``; ``all_notes()``.
 
     Raises StcalError: as of :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
@@ -305,7 +306,8 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
     Returns
     -------
-    Planned : ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
+    Planned
+        ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
 
     Raises InputError: for the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of
     the poses taken. Raises DegenerateError: for the reasons given in :func:`stcal.handeye.handeye`.
@@ -357,7 +359,8 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
 
     Returns
     -------
-    HandEyeInput, str : The input, and a sentence that names the poses.
+    HandEyeInput, str
+        The input, and a sentence that names the poses.
 
     Raises InputError: the input consists of images, which determine the poses by themselves.
     """

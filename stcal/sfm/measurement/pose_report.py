@@ -102,8 +102,8 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
 
     Returns
     -------
-    text : str : CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
-    notes : tuple of str : Images of only one of both.
+    text : CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
+    notes : Images of only one of both.
 
     Raises
     ------
