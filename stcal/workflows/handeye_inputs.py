@@ -308,8 +308,6 @@ def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[Rob
     return RobotPoses(images, flange, None, places, table.where, understood, own=False), arm
 
 
-PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
-"""Keys in board files for the distance by which a board's size is stated."""
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | ToldPairs
 
@@ -348,8 +346,7 @@ def one_source(
     """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
     tables of the package's own are joined as tables."""
     timing = timing or Timing()
-    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
-    if told is not None:
+    if told := read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset):
         return told, ()
     for path in (first, second):
         require_own(path, quaternions)
@@ -560,7 +557,6 @@ class _Photographs:
         return cls(files, folder, design, model, images, robot, arm, row_of, matching, tuple(left_out))
 
     def robot_lines(self) -> tuple[str, ...]:
-        """Returns lines on how the robot's poses were read and matched."""
         matched = (f"images matched {self.matching}",) if self.matching else ()
         return f"robot: {self.robot.understood}", *matched
 
@@ -585,13 +581,15 @@ class _Photographs:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
         understood = () if self.robot.own else self.robot_lines()
         stream, seconds = self.robot.stream, self.robot.seconds
+        stated = ("pitch_mm", "square_mm", "spacing_mm")  # by which boards state their size
+        pitch_mm = next((getattr(self.design, key) for key in stated if hasattr(self.design, key)), None)
         return HandEyeInput(
             f"{self.folder.name}, {self.files.poses.name if self.files.poses else ''}",
             pairs,
             views,
             detections.symmetries,
             camera_prior(refinable(self.model.calibrated(camera.width, camera.height))),
-            next((getattr(self.design, key) for key in PITCHES if hasattr(self.design, key)), None),
+            pitch_mm,
             (*without_board, *self.left_out),
             (*understood, *(f"board: {part}" for part in detections.unused())),
             self.files.statements.setup,
