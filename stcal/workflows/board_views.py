@@ -115,7 +115,15 @@ def _find_flat(
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
     if isinstance(board, AsymmetricCirclesDesign):
-        return _find_asymmetric(image, name, camera, board)
+        if board.radius_mm is None:
+            radius = _radius_seen(image, camera, board)
+            if radius is None:
+                return None, f"no {board.polarity} circles"
+            board = replace(board, radius_mm=radius)
+        grid = board.lattice()
+        place = np.full((grid.rows, grid.columns), -1)
+        place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
+        return _find_circles(image, name, camera, board, grid, place)
     if isinstance(board, ChessboardDesign):
         view = find_chessboard(image, name, board)
         return view, "" if view else why_no_chessboard(image, board)
@@ -158,20 +166,6 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     if not fits:
         return f"{few}, not where rows and columns of its file put them; correct them"
     return f"{few}, as on a board of {fits[0][0].words}; correct its file"
-
-
-def _find_asymmetric(
-    image: np.ndarray, name: str, camera: Camera, board: AsymmetricCirclesDesign
-) -> tuple[BoardView | None, str]:
-    if board.radius_mm is None:
-        radius = _radius_seen(image, camera, board)
-        if radius is None:
-            return None, f"no {board.polarity} circles"
-        board = replace(board, radius_mm=radius)
-    grid = board.lattice()
-    place = np.full((grid.rows, grid.columns), -1)
-    place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
-    return _find_circles(image, name, camera, board, grid, place)
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
