@@ -2,8 +2,7 @@
 next within an arm's reach. The offset of the clocks and parameters of the arm may be unknowns too. It composes three
 systems."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -33,17 +32,6 @@ from stcal.workflows.handeye_inputs import Arm, HandEyeInput
 
 ALL = "all"
 """Word in place of a method's name: all methods, compared."""
-
-
-@contextmanager
-def naming_left_out(left_out: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Adds to the message of an error what was left out before: (image or row, why)."""
-    try:
-        yield
-    except StcalError as error:
-        if left_out:
-            error.append(f"; {len(left_out)} left out before, first {left_out[0][0]}: {left_out[0][1]}")
-        raise
 
 
 @require_arguments
@@ -91,7 +79,7 @@ def calibrate_handeye(
     choosing = method is None and not (options.names_unknowns or options.camera is not None)
     if time_offset:
         given, options, offset = at_offset(given, options)
-    with naming_left_out(given.left_out):
+    try:
         if options.camera is None:
             options = replace(options, camera=given.prior)
         pairs, rows = given.pairs, np.zeros((0, 0), int)
@@ -121,6 +109,11 @@ def calibrate_handeye(
         outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
         if given.arm is not None:
             outcome = with_arm(outcome, given.arm, mended, given.prior, rows, workers, partial(told, "with the arm"))
+    except StcalError as error:
+        if given.left_out:
+            name, why = given.left_out[0]
+            error.append(f"; {len(given.left_out)} left out before, first {name}: {why}")
+        raise
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
