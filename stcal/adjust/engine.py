@@ -1,4 +1,4 @@
-"""One adjustment by least squares: blocks of unknowns, factors that tie them, elimination, and σ.
+"""One adjustment by least squares: blocks of unknowns, factors that tie them, elimination, σ, and influence.
 
 A factor states residuals row by row; each row depends on one member of each block that the factor is on, or on a block
 of a single member. A block of many members that no row ties to one another is eliminated (Schur complement).
@@ -24,6 +24,7 @@ from stcal.adjust.blocks import (
     Rows,
     Values,
     numbers,
+    sigma_factor,
 )
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
@@ -40,6 +41,8 @@ from stcal.geometry.normal_equations import (
 
 HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
+LEFT = 1e-9
+"""Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 LOOSE = 1e-10
 """Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
 AT_ONCE = 10_000  # number of rows whose derivatives are multiplied at once; it bounds the memory
@@ -342,6 +345,30 @@ class Solution:
     def _each(self) -> dict[str, np.ndarray]:
         return self._ways()
 
+    def without(self, cluster: int) -> dict[str, Any]:
+        """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
+        dropped = self.reduction.step.shape
+        totals, slopes, residuals = [], [], []
+        for rows in self.rows:
+            if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
+                continue
+            totals.append(rows.total(self._each)[own].reshape(-1, self.kept))
+            residuals.append(rows.residual[own].ravel())
+            by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
+            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                if block.eliminate:
+                    by_dropped[np.arange(own.sum()), :, numbers(index, slope)[own]] = slope[own]
+            slopes.append(by_dropped.reshape(residuals[-1].size, *dropped))
+        if not totals:
+            raise InputError("E-OPTION-NEEDS", f"adjustment: no row of cluster {cluster}; give one that factors have")
+        total, slope, residual = (np.concatenate(each) for each in (totals, slopes, residuals))
+        solved = np.einsum("mab,rmb->rma", self.reduction.inverse, slope)
+        taken = total @ self.inverse @ total.T + np.einsum("rma,sma->rs", slope, solved)
+        pull = np.linalg.lstsq(np.eye(len(residual)) - taken, residual, rcond=LEFT)[0]
+        kept = self.inverse @ (total.T @ pull)
+        away = np.einsum("rma,r->ma", solved, pull) - self.reduction.from_kept @ kept
+        return self.problem.moved(self.values, np.concatenate([kept, away.ravel()]))
+
     def redundancy(self, kind: str | None = None) -> float:
         """Return the redundancy of the rows of one kind, or of all."""
         left = 0.0
@@ -354,6 +381,12 @@ class Solution:
                     taken += float(((slope @ inverse) * slope).sum())
             left += rows.residual.shape[1] * np.count_nonzero(rows.weight) - taken
         return left
+
+    def component(self, kind: str) -> float:
+        """Return the factor on the σ of a kind that its residuals ask for (Förstner 1979)."""
+        own = [rows for rows in self.rows if rows.factor.kind == kind]
+        square = sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in own)
+        return sigma_factor(square, self.redundancy(kind))
 
     def components(self, kinds: Sequence[str], caution: float | np.ndarray = 0.0) -> Components:
         """Return what all residuals tell together about the σ of some ``kinds``, those of the others being known.
