@@ -24,11 +24,9 @@ import typer.main
 from hypothesis import HealthCheck, settings
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.adjust.chain import chain_faces
-from stcal.sfm.adjust.faces import faces_of_group
+from stcal.sfm.adjust.chain import chain_faces, faces_of_group
 from stcal.sfm.adjust.joint import adjusted
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.refine import adjust, eccentricity_px, find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
 from stcal.sfm.pipeline import run

@@ -32,7 +32,7 @@ from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.evaluation import MeasuredPoses, SetResult, verify
-from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

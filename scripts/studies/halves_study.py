@@ -40,10 +40,10 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import read_measurements
 from stcal.robot.kinematics.robot_file import load_robot
 from stcal.sfm import measure, pipeline
+from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.measurement.known_target import read_target
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 from stcal.workflows.handeye_inputs import read_handeye
 

@@ -13,8 +13,19 @@ from typing import Any
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Rows, Values, numbers
-from stcal.adjust.components import Components, Equations, sigma_factor
+from stcal.adjust.blocks import (
+    Block,
+    Components,
+    Equations,
+    Factor,
+    Huber,
+    Known,
+    Prior,
+    Rows,
+    Values,
+    numbers,
+    sigma_factor,
+)
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
@@ -43,10 +54,8 @@ class Adjustment:
 
     Parameters
     ----------
-    blocks, factors, priors : lists
-        What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
-    sigma : dict of str to float
-        Factor on the σ of a kind of rows, 1 where it is not stated.
+    blocks, factors, priors : What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
+    sigma : Factor on the σ of a kind of rows, 1 where it is not stated.
 
     Examples
     --------
@@ -169,15 +178,7 @@ class Adjustment:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An adjustment linearised about a state.
-
-    Parameters
-    ----------
-    problem : Adjustment
-        The adjustment.
-    values : dict of str to Vector or Poses
-        The members of each block, by its name.
-    """
+    """The adjustment ``problem`` linearised about a state: ``values``, the members of each block by its name."""
 
     problem: Adjustment
     values: dict[str, Any]
@@ -211,7 +212,6 @@ class Solution:
 
     @cached_property
     def dropped(self) -> Block | None:
-        """The block that is eliminated."""
         return next((block for block in self.problem.blocks if block.eliminate), None)
 
     @cached_property
@@ -397,27 +397,6 @@ class Solution:
         each = [self.equations((kind,)) for kind in kinds]
         return Components(each, self.equations(others), caution=caution, held=LOOSE)
 
-    def score(self, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return normal matrix (p, p) and right side (p,) of further unknowns, all others adjusted.
-
-        ``columns`` : derivatives (r, w, p) of the residuals of each factor by them, over σ as the factors state it.
-        ``right @ inv(normal) @ right`` is χ² of p degrees of freedom if they are not needed (Rao 1948).
-        """
-        p = columns[0].shape[2]
-        normal, right, mixed = np.zeros((p, p)), np.zeros(p), np.zeros((p, self.kept))
-        dropped = self.reduction.step.shape
-        by_dropped, inverse = np.zeros((*dropped, p)), self.reduction.inverse
-        for rows, raw in zip(self.rows, columns, strict=True):
-            own = rows.factor.over(raw, self.problem.sigma) * np.sqrt(rows.weight)[:, None, None]
-            normal += np.einsum("rwp,rwq->pq", own, own)
-            right -= np.einsum("rwp,rw->p", own, rows.residual)
-            mixed += np.einsum("rwp,rwk->pk", own, rows.total(self._each))
-            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
-                if block.eliminate:
-                    np.add.at(by_dropped, numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)
-        normal -= np.einsum("map,mab,mbq->pq", by_dropped, inverse, by_dropped)
-        return normal - mixed @ self.inverse @ mixed.T, right - mixed @ (self.inverse @ self.right)
-
 
 def _alone(normal: np.ndarray, at: slice) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (q, q) of some unknowns alone, and how all (k, q) go with them."""
@@ -444,17 +423,11 @@ def _by_clusters(normal: np.ndarray, told: Iterable[tuple[np.ndarray, np.ndarray
 class Joined:
     """Adjustments that have blocks in common, such as those of groups of photographs by one camera.
 
-    Parameters
-    ----------
-    parts : sequence of Adjustment
-        The adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of their
-        clusters.
-    shared : tuple of str
-        Names of the blocks in common, the first ones of each part. What is known of them stands in one part only. All
-        other unknowns are eliminated.
-    free : callable, optional
-        Returns of a state the orthonormal directions (s, f) of the shared unknowns in which nothing changes, such as
-        motions of all points; the datum is that of smallest trace over them.
+    ``parts`` : the adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of
+    their clusters. ``shared`` : names of the blocks in common, the first ones of each part. What is known of them
+    stands in one part only. All other unknowns are eliminated. ``free`` : returns of a state the orthonormal directions
+    (s, f) of the shared unknowns in which nothing changes, such as motions of all points, if there are any; the datum
+    is that of smallest trace over them.
     """
 
     parts: Sequence[Adjustment]

@@ -17,8 +17,7 @@ from stcal.errors import InputError
 if TYPE_CHECKING:
     from stcal.handeye.methods.closed_form import Bounds
     from stcal.robot import Robot
-    from stcal.workflows.handeye_inputs import Files
-    from stcal.workflows.robot_at_images import Timing
+    from stcal.workflows.handeye_inputs import Files, Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,9 +166,8 @@ def handeye(
     from stcal.io.files import require_same
     from stcal.io.static_transforms import messages
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye_inputs import without_flips
-    from stcal.workflows.handeye_run import ALL, calibrate_handeye
-    from stcal.workflows.robot_at_images import Timing
+    from stcal.workflows.handeye_inputs import Timing
+    from stcal.workflows.handeye_run import ALL, calibrate_handeye, without_flips
 
     turns = (None if each is None else math.radians(each) for each in (sigma_robot_deg, sigma_camera_deg))
     noise = Noise(next(turns), sigma_robot_mm, next(turns), sigma_camera_mm, sigma_px, sigma_board_mm)
@@ -307,8 +305,8 @@ def plan(
     from stcal.handeye.plan import HandEyePlanFile, planned_csv, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
+    from stcal.workflows.handeye_inputs import Timing
     from stcal.workflows.handeye_run import plan_handeye
-    from stcal.workflows.robot_at_images import Timing
 
     robot = load_robot(robot_file) if robot_file else None
     given = files.given(Timing())

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.optimize import root_scalar
 
-from stcal.adjust.blocks import Huber, Vector
-from stcal.adjust.components import sigma_factor
+from stcal.adjust.blocks import Huber, Vector, sigma_factor
 from stcal.adjust.engine import Adjustment, Solution
 from stcal.boards.board_designs import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges

@@ -1,3 +1,4 @@
+from .adjust.faces_file import read_target as read_target
 from .budget.budget_page import uncertainty_budget as uncertainty_budget
 from .camera.calibrate import calibrate_camera as calibrate_camera
 from .checks.significance import Trial as Trial
@@ -12,7 +13,6 @@ from .interop.export_colmap import export_model as export_model
 from .make import DesignOptions as DesignOptions
 from .make import design_tag_body as design_tag_body
 from .make import design_target as design_target
-from .measurement.known_target import read_target as read_target
 from .measurement.measure_images import MeasureOptions as MeasureOptions
 from .measurement.measure_images import Tracker as Tracker
 from .measurement.measure_images import measure as measure

@@ -2,8 +2,8 @@ from .board_views import calibrate_camera_by_corners as calibrate_camera_by_corn
 from .board_views import calibration_images as calibration_images
 from .from_photos import robot_from_photos as robot_from_photos
 from .handeye_inputs import read_handeye as read_handeye
-from .handeye_inputs import without_flips as without_flips
 from .handeye_run import calibrate_handeye as calibrate_handeye
 from .handeye_run import plan_handeye as plan_handeye
+from .handeye_run import without_flips as without_flips
 from .register_robot import RegisteredRobot as RegisteredRobot
 from .register_robot import register_with_robot as register_with_robot

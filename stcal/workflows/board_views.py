@@ -35,17 +35,7 @@ from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size
 from stcal.labels import DotLabel
 from stcal.locate.layout_calibration import CalibrationImages
 from stcal.parallel import Progress, one_thread
-from stcal.sfm.camera.calibrate import (
-    MAX_RESIDUAL_PX,
-    CameraCalibration,
-    calibrated,
-    foretold,
-    judged,
-    require_determined,
-    require_views,
-    unsized,
-)
-from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
+from stcal.sfm.camera.calibrate import CameraCalibration, Found, calibrated
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
@@ -123,7 +113,15 @@ def _find_flat(
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
     if isinstance(board, AsymmetricCirclesDesign):
-        return _find_asymmetric(image, name, camera, board)
+        if board.radius_mm is None:
+            radius = _radius_seen(image, camera, board)
+            if radius is None:
+                return None, f"no {board.polarity} circles"
+            board = replace(board, radius_mm=radius)
+        grid = board.lattice()
+        place = np.full((grid.rows, grid.columns), -1)
+        place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
+        return _find_circles(image, name, camera, board, grid, place)
     if isinstance(board, ChessboardDesign):
         view = find_chessboard(image, name, board)
         return view, "" if view else why_no_chessboard(image, board)
@@ -166,20 +164,6 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     if not fits:
         return f"{few}, not where rows and columns of its file put them; correct them"
     return f"{few}, as on a board of {fits[0][0].words}; correct its file"
-
-
-def _find_asymmetric(
-    image: np.ndarray, name: str, camera: Camera, board: AsymmetricCirclesDesign
-) -> tuple[BoardView | None, str]:
-    if board.radius_mm is None:
-        radius = _radius_seen(image, camera, board)
-        if radius is None:
-            return None, f"no {board.polarity} circles"
-        board = replace(board, radius_mm=radius)
-    grid = board.lattice()
-    place = np.full((grid.rows, grid.columns), -1)
-    place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
-    return _find_circles(image, name, camera, board, grid, place)
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
@@ -336,24 +320,17 @@ def calibration_images(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of the photographs, and of folders of them.
-    camera : Camera
-        The camera that took them, or its file.
-    board : BoardDesign or another board design
-        The board, mm, of :func:`stcal.load_flat_board`.
-    dictionaries : tuple of str
-        Dictionaries of the tags.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of the photographs, and of folders of them.
+    camera : The camera that took them, or its file.
+    board : The board, mm, of :func:`stcal.load_flat_board`.
+    dictionaries : Dictionaries of the tags.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CalibrationImages
-        ``views``, ``tags``, ``names``, ``camera`` and ``symmetries``, the arguments of :func:`stcal.locate.calibrate`;
-        ``left_out``, images that are not used, and why.
+    CalibrationImages : ``views``, ``tags``, ``names``, ``camera`` and ``symmetries``, the arguments of
+        :func:`stcal.locate.calibrate`; ``left_out``, images that are not used, and why.
     """
     files, skipped = find_images(images)
     told, model = progress or (lambda *_: None), camera_model(camera)
@@ -366,11 +343,6 @@ def calibration_images(
         replace(each, corners_px=each.corners_px - shift_by_curves(each.corners_px, detections.camera)) for each in tags
     )
     return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)
-
-
-GROSS_SIGMAS = 10.0  # smallest deviation of a gross error from camera and board; it is above MAX_RESIDUAL_PX, too
-LEAST_CORNERS = 6  # smallest number of corners of a view of which others were left out: they still check one another
-LEAST_SHARE = 0.5  # of the corners of a view that are no gross errors; with fewer of them the view is not used
 
 
 @require_arguments
@@ -386,97 +358,37 @@ def calibrate_camera_by_corners(
 
     Parameters
     ----------
-    images : str or Path
-        Folder of photographs, or of folders of them.
-    board : board design
-        The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
-    colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, or of folders of them.
+    board : The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CameraCalibration
-        The same result as from dots; a corner (row, column) stands for the dot of that place.
+    CameraCalibration : The same result as from dots; a corner (row, column) stands for the dot of that place.
 
     Raises
     ------
-    StcalError
-        One of its subclasses, with a one-line message that says what to do.
+    StcalError : One of its subclasses, with a one-line message that says what to do.
     """
-    grid = corner_grid(board)
-    told, rounds = progress or (lambda *_: None), ROUNDS.get(type(board), 1)
+    grid, told = corner_grid(board), progress or (lambda *_: None)
 
-    def of_model(
-        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
-    ) -> CameraCalibration:
-        for done in range(1, rounds + 1):
-            step = partial(told, f"detect {done}")
-            detections = detect_boards(files, unsized(camera, colmap_model), board, (), workers, step)
-            views = _observations(files, detections.views(), grid, camera)
-            skipped = (*not_images, *detections.skipped)
-            require_views(views, files, skipped)
-            start = camera if done > 1 else closed_form(views, grid, camera)
-            result = adjust_intrinsics(views, grid, start, colmap_model)
-            camera = result.camera
-        kept, without, warnings = without_gross_errors(views, grid, result)
-        if without or warnings:
-            views, skipped = kept, (*skipped, *without)
-            require_views(views, files, skipped)
-            result = replace(adjust_intrinsics(views, grid, camera, colmap_model), restarted=result.restarted)
-        require_determined(result, views, grid)
-        calibration = judged(result, views, skipped, rounds, True, grid)
-        return replace(calibration, warnings=(*calibration.warnings, *warnings))
-
-    return calibrated(of_model, images, grid, colmap_model, workers)
-
-
-def without_gross_errors(
-    views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
-) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
-    """Returns the views without gross errors, those that consist of them, and a warning about the others."""
-    suspects = {
-        model.images[image]
-        for model in result.models
-        for image in model.image_index[np.linalg.norm(model.residuals_px(result.camera), axis=1) > MAX_RESIDUAL_PX]
-    }
-    limits = f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px"
-    kept, skipped, off = [], [], []
-    for view in views:
-        own = _gated(view, grid, result) if view.name in suspects else view
-        if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
-            reason = (
-                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
-                "other views put them"
+    def find(files: list[ImageFile], lens: CameraModel, camera: Camera, number: int, _first: bool) -> Found:
+        detections = detect_boards(files, lens, board, (), workers, partial(told, f"detect {number}"))
+        group = {file.name: file.group for file in files}
+        views = []
+        for name, view in detections.views().items():
+            labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
+            rays, shape, covariance = (
+                camera.normalised_from_pixel(view.xy_px),
+                np.zeros((len(view), 2, 2)),
+                covariance_px2(view),
             )
-            skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
-            continue
-        kept.append(own)
-        off += [(view.name, label) for label in view.labels if label not in own.labels]
-    if not off:
-        return kept, skipped, []
-    image, label = off[0]
-    warning = (
-        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
-        f"{limits} from where the camera and all views put them; look whether something hides the board there"
-    )
-    return kept, skipped, [warning]
+            views.append(ImageObservations(name, group[name], labels, view.xy_px, rays, shape, covariance))
+        return views, detections.skipped
 
-
-def _gated(view: ImageObservations, grid: BoardDesign, result: Intrinsics) -> ImageObservations:
-    """Returns a view without its gross errors, one by one, as each disturbs the pose and thereby the others."""
-    while len(view) > LEAST_CORNERS:
-        residual_px, in_sigma = foretold(view, grid, result)
-        length_px = np.linalg.norm(residual_px, axis=1)
-        in_sigmas = np.linalg.norm(in_sigma, axis=1) / result.factors.centres
-        worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
-        if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:
-            break
-        view = view.select(np.delete(np.arange(len(view)), worst))
-    return view
+    return calibrated(find, images, grid, colmap_model, workers, ROUNDS.get(type(board), 1))
 
 
 ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3, HexagonalCirclesDesign: 3}
@@ -493,15 +405,3 @@ def corner_grid(board: FlatBoard) -> CornerBoard:
             "or hexagonal circles needed to calibrate a camera",
         )
     return CornerBoard.of(board)
-
-
-def _observations(
-    files: Sequence[ImageFile], views: dict[str, BoardView], grid: CornerBoard, camera: Camera
-) -> list[ImageObservations]:
-    group = {file.name: file.group for file in files}
-    observations = []
-    for name, view in views.items():
-        labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
-        rays, shape = camera.normalised_from_pixel(view.xy_px), np.zeros((len(view), 2, 2))
-        observations.append(ImageObservations(name, group[name], labels, view.xy_px, rays, shape, covariance_px2(view)))
-    return observations

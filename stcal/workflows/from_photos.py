@@ -49,16 +49,9 @@ from stcal.robot.kinematics.measurements import joint_values, targets_of
 from stcal.robot.kinematics.robot_file import require_robot_written
 from stcal.robot.robot_report import axes_report, compensation_report
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
-from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.adjust.faces_file import TargetCircles
+from stcal.sfm.measurement import pose_report
 from stcal.sfm.measurement.measure_images import MeasureOptions, MeasureResult, measure
-from stcal.sfm.measurement.pose_report import (
-    IMAGE,
-    measure_report,
-    poses_csv,
-    poses_file,
-    require_table_written,
-    summary,
-)
 
 STAGES = {
     "poses": "Poses of the target in the photographs",
@@ -113,7 +106,7 @@ MOST_NOTES = 20
 def story(result: FromPhotos) -> list[str]:
     """Returns the steps and their results, one sentence a step."""
     identified, least, compensated = result.identified, list(result.errors.values())[-1], result.compensated
-    sentences = [*summary(result.measured), f"{len(result.data)} poses have joint values"]
+    sentences = [*pose_report.summary(result.measured), f"{len(result.data)} poses have joint values"]
     if result.axes is None:
         sentences.append(f"the axis method was left out: {result.without_axes}")
     else:
@@ -195,7 +188,6 @@ POSES = "poses.csv"
 
 
 def _results(result: FromPhotos) -> dict[str, ResultFile]:
-    """Returns the result files, by name."""
     models: dict[str, type[ResultFile]] = {
         "axes": AxesFile,
         "identified": IdentifiedFile,
@@ -203,7 +195,7 @@ def _results(result: FromPhotos) -> dict[str, ResultFile]:
     }
     parts = {name: getattr(result, name) for name in models}
     found = {f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None}
-    return {"poses.json": poses_file(result.measured), **found}
+    return {"poses.json": pose_report.poses_file(result.measured), **found}
 
 
 def files_of(result: FromPhotos) -> dict[str, str]:
@@ -211,8 +203,8 @@ def files_of(result: FromPhotos) -> dict[str, str]:
     identified, compensated = result.identified.robot, result.compensated
     source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
     files = {name: json_text(content) for name, content in _results(result).items()} | {
-        POSES: poses_csv(result.measured)[0],
-        "poses.html": measure_report(result.measured, result.images).page(),
+        POSES: pose_report.poses_csv(result.measured)[0],
+        "poses.html": pose_report.measure_report(result.measured, result.images).page(),
         "identified.toml": robot_toml(identified, [source]),
         "identified.html": identified_report(result.identified).page(),
     }
@@ -234,7 +226,7 @@ def require_files_written(out: Path, result: FromPhotos) -> None:
     """Read the files of :func:`files_of` in ``out`` again, and require what was reported."""
     for name, content in _results(result).items():
         require_result_written(out / name, content)
-    require_table_written(out / POSES, result.measured)
+    pose_report.require_table_written(out / POSES, result.measured)
     require_identified_written(out / "identified.toml", result.identified)
     if result.axes is not None:
         require_robot_written(out / "axes.toml", result.axes.robot, result.axes.chain)
@@ -299,8 +291,8 @@ def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal:
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
     join_tables(files, values, key)
     joint_values(values, nominal)
-    remaining = {name: column for name, column in values.columns.items() if name not in (key, IMAGE)}
-    return replace(values, columns={IMAGE: values.text(key)} | remaining, rows=())
+    remaining = {name: column for name, column in values.columns.items() if name not in (key, pose_report.IMAGE)}
+    return replace(values, columns={pose_report.IMAGE: values.text(key)} | remaining, rows=())
 
 
 def from_measured(
@@ -314,9 +306,9 @@ def from_measured(
     """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
     :func:`robot_from_photos`."""
     with scratch_folder("photos") as folder:
-        poses_file = folder / POSES
-        save(poses_file, poses_csv(measured)[0])
-        joined = join_tables(replace(read_table(poses_file, "poses"), where=PHOTOGRAPHS), values, IMAGE)
+        written = folder / POSES
+        save(written, pose_report.poses_csv(measured)[0])
+        joined = join_tables(replace(read_table(written, "poses"), where=PHOTOGRAPHS), values, pose_report.IMAGE)
     data = read_measurements(joined.table, nominal)
     axes, without = _axes(data, nominal)
     identified = identify(nominal, data, options)

@@ -1,45 +1,313 @@
 """Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from stcal.boards.target_file import load_boards
-from stcal.errors import InputError, StcalError
+from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.conventions import flipped, tilted
-from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import ToldPairs, own_told, read_pairs, read_two, require_own
-from stcal.handeye.data.pose_pairs import Setup
-from stcal.handeye.data.stream import TOLERANCE_S, Timed
+from stcal.handeye.data.pose_content import Said, require_each_once
+from stcal.handeye.data.pose_files import (
+    ToldPairs,
+    own_told,
+    partners,
+    read_pairs,
+    read_robot,
+    read_two,
+    require_own,
+    trailing_number,
+)
+from stcal.handeye.data.pose_pairs import SIDES, Setup, read_side
+from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import motions_missing
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
+from stcal.io.covariance import TWIST
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
-from stcal.io.table import Table
+from stcal.io.table import LENGTHS, Table, read_table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
+from stcal.robot.kinematics.measurements import joint_values
+from stcal.robot.kinematics.robot_model import Chain
 from stcal.workflows.board_views import Board, detect_boards, kind_of
-from stcal.workflows.robot_at_images import (
-    Arm,
-    AtImages,
-    RobotPoses,
-    Timing,
-    read_arm,
-    read_robot_poses,
-    robot_at_images,
-)
 
-PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
-"""Keys in board files for the distance by which a board's size is stated."""
+TIME = "time_s"
+"""Column of a stream of poses, in place of ``image``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotPoses:
+    """``images`` : image of each pose; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` :
+    place of each pose in ``where``, for messages; ``understood`` : how the file was read; ``own`` : whether it is a
+    table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images``, the
+    poses belong to the images in their order. At the times of images: ``left_out`` : (image, why); ``stream``,
+    ``seconds`` : the stream and the time of each image, by name."""
+
+    images: tuple[str, ...]
+    base_from_flange: Poses
+    covariance: np.ndarray | None
+    places: tuple[str, ...]
+    where: str
+    understood: str = ""
+    own: bool = True
+    timed: bool = False
+    left_out: tuple[tuple[str, str], ...] = ()
+    stream: Stream | None = None
+    seconds: dict[str, float] | None = None
+
+    @property
+    def file(self) -> str:
+        return Path(self.where.removeprefix("robot poses ")).name
+
+    def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
+        """Returns the row by image, the images of rows without a partner, and how they were matched.
+
+        The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
+        the ends of names; poses without names, by order. The last result is empty where images are matched by name.
+        """
+        if not self.images:
+            if len(names) != len(self.base_from_flange):
+                raise InputError(
+                    "E-NAMES-COUNT",
+                    f"{self.where}: {len(self.base_from_flange)} poses without names for {len(names)} images; as many, "
+                    "or a name for each, needed",
+                )
+            numbers = [trailing_number(name) for name in names]
+            order = list(range(len(names)))
+            if None not in numbers and len(set(numbers)) == len(numbers):
+                order.sort(key=lambda i: numbers[i] or 0)
+            description = f"by order, for the poses have no names: {self.places[0]} is of {names[order[0]]}"
+            return {names[i]: row for row, i in enumerate(order)}, (), description
+        rows, missing = self.rows(names)
+        if rows or (matches := partners(self.images, names)) is None:
+            return rows, missing, ""
+        rows = {names[j]: i for i, j in matches[0]}
+        used = set(rows.values())
+        return rows, tuple(name for i, name in enumerate(self.images) if i not in used), matches[1]
+
+    def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
+        """Returns the row of each of ``names`` that has one, and the images of rows that are not among them. Names may
+        lack folder and ending where that leaves one image."""
+        short: dict[str, list[str]] = {}
+        for name in names:
+            file_name = name.rsplit("/", 1)[-1]
+            for key in {file_name, file_name.rsplit(".", 1)[0]}:
+                short.setdefault(key, []).append(name)
+        row_of_image, missing = {}, []
+        for row, image in enumerate(self.images):
+            fitting = [image] if image in names else short.get(image, [])
+            if len(fitting) > 1:
+                raise InputError(
+                    "E-IMAGE-NAME-AMBIGUOUS",
+                    f"{self.where}: {self.places[row]}: {image} may be {fitting[0]} or {fitting[1]}; give its path",
+                )
+            if fitting and fitting[0] in row_of_image:
+                both = f"{self.places[row_of_image[fitting[0]]]} and {self.places[row]}"
+                raise InputError(
+                    "E-POSE-REPEATED", f"{self.where}: {both}: both are of image {fitting[0]!r}; one row needed"
+                )
+            if fitting:
+                row_of_image[fitting[0]] = row
+            else:
+                missing.append(image)
+        return row_of_image, tuple(missing)
+
+
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: Said | None = None) -> RobotPoses:
+    """Read the robot's poses in any format of :mod:`stcal.handeye.data.pose_files`.
+
+    A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
+    ``statements`` : the user's statements about what a file of another program does not state itself.
+    """
+    path, statements = Path(path), statements or Said()
+    poses = read_robot(path, statements, "image", quaternions)
+    where = f"robot poses {path}"
+    if poses is not None:
+        return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
+    if statements.options():
+        require_own(path, quaternions)
+        _require_unsaid(statements, where)
+    table = read_table(path, "robot poses", quaternions)
+    timed = "image" not in table and TIME in table
+    images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
+    require_each_once(images, places, table.where, "image ")
+    poses, covariance, _ = read_side(table, *SIDES[0])
+    frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
+    understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
+    return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """``tolerance_s`` : within which the nearest sample replaces a pose that cannot be interpolated; ``image_times`` :
+    file with ``image`` and ``time_s``, where names of images are not times; ``offset`` : whether the clocks' offset is
+    estimated."""
+
+    tolerance_s: float = TOLERANCE_S
+    image_times: Path | None = None
+    offset: bool = False
+
+
+def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> RobotPoses:
+    """Returns poses at the times of images, where both have times that are not simply equal; as they are if ``timing``
+    is None. Raises InputError: an option needs times, or no image lies within the stream."""
+    if timing is None:
+        return robot
+    images = _times_of_images(names, timing)
+    samples = [time_of(name) for name in robot.images] if robot.timed else stamps_of(robot.images)
+    needed = timing.offset or timing.image_times or robot.timed
+    if needed and images is None:
+        raise InputError(
+            "E-IMAGE-NAME-TIME",
+            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); name "
+            "images by seconds (1689.25.png), or give --image-times",
+        )
+    if needed and (samples is None or None in samples):
+        first = f", but {robot.images[0]} …" if robot.images else ""
+        raise InputError(
+            "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
+        )
+    if images is None or samples is None or None in samples:
+        return robot
+    if not robot.timed and any(stem_of(name) != name for name in robot.images):  # poses of images by their names
+        return robot
+    times = [time for time in samples if time is not None]
+    exact = not timing.offset and all(time in times for time in images.values())
+    if exact:  # rows without an image are no mistake
+        rows = [times.index(time) for time in images.values()]
+        robot_then = replace(
+            robot,
+            images=tuple(images),
+            base_from_flange=robot.base_from_flange[rows],
+            covariance=None if robot.covariance is None else robot.covariance[rows],
+            places=tuple(robot.places[i] for i in rows),
+            understood=f"{robot.understood}; {len(rows)} of them at the times of images",
+            own=False,
+            timed=False,
+        )
+        if not len(images) < len(times) == len(set(times)):
+            return robot_then
+    stream = Stream.of(times, robot.base_from_flange, robot.file)
+    seconds = stream.after_origin(list(images.values()))
+    clock = {"stream": stream, "seconds": dict(zip(images, seconds.tolist(), strict=True))}
+    if exact:
+        return replace(robot_then, **clock)
+    interpolated, seen = taken_at(stream, seconds, timing.tolerance_s), list(images)
+    if not interpolated.kept.any():
+        raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {seen[0]}: {interpolated.why[0]}")
+    kept = tuple(seen[i] for i in np.flatnonzero(interpolated.kept))
+    note = "" if robot.covariance is None else "; its covariances are of other times and not used"
+    left_out = [(name, why) for name, why in zip(seen, interpolated.why, strict=True) if why]
+    left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
+    return replace(
+        robot,
+        images=kept,
+        base_from_flange=interpolated.base_from_flange,
+        covariance=None,
+        places=tuple(f"time of {name}" for name in kept),
+        understood=f"{robot.understood}{note}; {interpolated.said}",
+        own=False,
+        timed=False,
+        left_out=tuple(left_out),
+        **clock,
+    )
+
+
+def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:
+    """Returns times by image, as the file of times states them, or as the names state them."""
+    if timing.image_times is None:
+        times = stamps_of(names)
+        return None if times is None else dict(zip(names, times, strict=True))
+    table = read_table(timing.image_times, "image times")
+    stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
+    if len(stated) < len(table):
+        raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")
+    time_of_image = {}
+    for name in names:
+        file_name = name.rsplit("/", 1)[-1]
+        text = next((stated[key] for key in (name, file_name, file_name.rsplit(".", 1)[0]) if key in stated), None)
+        if text is None:
+            continue
+        time = time_of(text)
+        if time is None:
+            raise InputError(
+                "E-TABLE-NUMBER", f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed"
+            )
+        time_of_image[name] = time
+    if not time_of_image:
+        raise InputError(
+            "E-POSES-UNMATCHED",
+            f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here",
+        )
+    return time_of_image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """A robot at joint values (m, n) moved by small motions of its axes, as
+    :class:`stcal.handeye.methods.bundle.ArmModel`; X and Z absorb errors of its base and flange."""
+
+    robot: Robot
+    q: np.ndarray
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Boolean array (k,): True for parameters in rad."""
+        return np.array([component < 3 for _, component in chain_parameters(self._chain())])
+
+    def poses(self, parameters: np.ndarray) -> Poses:
+        """Returns base_from_flange, m poses."""
+        return flange_poses(moved_chain(self._chain(), parameters), self.q)
+
+    def slope(self, parameters: np.ndarray) -> np.ndarray:
+        """Returns the derivative (m, 6, k) of :meth:`poses` by a step of the parameters."""
+        chain = moved_chain(self._chain(), parameters)
+        return chain_jacobian(chain, self.q, flange_poses(chain, self.q))
+
+    def __getitem__(self, rows) -> "Arm":
+        """Returns the arm at these joint values alone."""
+        return Arm(self.robot, self.q[rows])
+
+    def identified(self, parameters: np.ndarray) -> Robot:
+        """Returns the robot with these parameters, as D-H rows; base and tools stay as they were."""
+        moved = robot_from_chain(moved_chain(self._chain(), parameters), dict(self.robot.tools), self.robot)
+        return replace(moved, world_from_base=self.robot.world_from_base)
+
+    def names(self) -> tuple[str, ...]:
+        """Returns the names (k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
+        return tuple(f"J{joint + 1} {TWIST[c]}" for joint, c in chain_parameters(self._chain()))
+
+    def _chain(self) -> Chain:
+        return replace(self.robot, world_from_base=Rigid()).chain()
+
+
+def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
+    """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV).
+
+    Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
+    """
+    table = read_table(path, "robot poses", quaternions)
+    arm = Arm(robot, joint_values(table, robot))
+    images, places = tuple(table.text("image")), tuple(f"line {line}" for line in table.lines)
+    require_each_once(images, places, table.where, "image ")
+    understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
+    flange = arm.poses(np.zeros(len(arm.angles)))
+    return RobotPoses(images, flange, None, places, table.where, understood, own=False), arm
+
+
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | ToldPairs
 
@@ -69,7 +337,6 @@ class HandEyeInput:
     notes: tuple[str, ...] = ()
 
     def problem(self, options: HandEyeOptions) -> HandEyeProblem:
-        """Returns what is to be solved."""
         return HandEyeProblem(self.pairs, self.setup or "eye-in-hand", self.views, options)
 
 
@@ -79,25 +346,13 @@ def one_source(
     """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
     tables of the package's own are joined as tables."""
     timing = timing or Timing()
-    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
-    if told is not None:
+    if told := read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset):
         return told, ()
     for path in (first, second):
         require_own(path, quaternions)
     _require_unsaid(statements, f"{first}, {second}")
     joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
-
-
-@contextmanager
-def naming_left_out(left_out: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Adds to the message of an error what was left out before: (image or row, why)."""
-    try:
-        yield
-    except StcalError as error:
-        if left_out:
-            error.append(f"; {len(left_out)} left out before, first {left_out[0][0]}: {left_out[0][1]}")
-        raise
 
 
 @require_arguments
@@ -168,9 +423,7 @@ def read_handeye(
 class Files:
     """Files of poses, or a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``statements`` : the user's statements about what files do not state; ``quaternions`` : ``xyzw`` where their columns
-    hold x, y, z, w in the order in which they stand; ``timing`` : of poses by time; ``robot`` : the robot at whose
-    joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
+    ``statements`` : the user's statements about what files do not state; the others as of :func:`read_handeye`.
     """
 
     source: Source
@@ -204,7 +457,6 @@ class Files:
         return HandEyeInput(where, told.pairs, setup=stated or told.setup, **more)
 
     def _of_images(self) -> dict[str, Path | None]:
-        """Returns the options of images, by name."""
         return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
 
     def _require_no_images(self) -> None:
@@ -252,8 +504,7 @@ def _require_unsaid(statements: Said, where: str) -> None:
         raise InputError(
             "E-OPTION-NEEDS",
             f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
-            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, board_from_camera_x_mm in place "
-            "of camera_from_board_x_mm)",
+            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm)",
         )
 
 
@@ -270,7 +521,6 @@ class _Photographs:
     model: CameraModel
     images: list[ImageFile]
     robot: RobotPoses
-    at_images: AtImages
     arm: Arm | None
     row_of: dict[str, int]
     matching: str
@@ -278,7 +528,6 @@ class _Photographs:
 
     @classmethod
     def of(cls, files: Files, folder: Path) -> "_Photographs":
-        """Returns the images of a folder, matched with the poses in their file."""
         poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
         if poses is None or camera is None or board is None:
             missing = ", ".join(name for name, path in files._of_images().items() if path is None)
@@ -295,8 +544,8 @@ class _Photographs:
             robot, arm = read_arm(poses, files.robot, files.quaternions)
         design, model = load_boards(board), read_camera(camera)
         images, skipped = find_images(folder)
-        at_images = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
-        robot, late = at_images.robot, dict(at_images.left_out)
+        robot = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
+        late = dict(robot.left_out)
         names = [image.name for image in images if image.name not in late]
         row_of, missing, matching = robot.pairing(names)
         if not row_of:
@@ -305,15 +554,13 @@ class _Photographs:
         left_out = [(each.name, each.reason) for each in skipped]
         left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        return cls(files, folder, design, model, images, robot, at_images, arm, row_of, matching, tuple(left_out))
+        return cls(files, folder, design, model, images, robot, arm, row_of, matching, tuple(left_out))
 
     def robot_lines(self) -> tuple[str, ...]:
-        """Returns lines on how the robot's poses were read and matched."""
         matched = (f"images matched {self.matching}",) if self.matching else ()
         return f"robot: {self.robot.understood}", *matched
 
     def lines(self) -> list[str]:
-        """Returns lines on how the files were understood."""
         (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
         camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
         size = f"{width} × {height} px, focal length {focal_px:.6g} px"
@@ -333,53 +580,21 @@ class _Photographs:
         if self.robot.covariance is not None:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
         understood = () if self.robot.own else self.robot_lines()
+        stream, seconds = self.robot.stream, self.robot.seconds
+        stated = ("pitch_mm", "square_mm", "spacing_mm")  # by which boards state their size
+        pitch_mm = next((getattr(self.design, key) for key in stated if hasattr(self.design, key)), None)
         return HandEyeInput(
             f"{self.folder.name}, {self.files.poses.name if self.files.poses else ''}",
             pairs,
             views,
             detections.symmetries,
             camera_prior(refinable(self.model.calibrated(camera.width, camera.height))),
-            next((getattr(self.design, key) for key in PITCHES if hasattr(self.design, key)), None),
+            pitch_mm,
             (*without_board, *self.left_out),
             (*understood, *(f"board: {part}" for part in detections.unused())),
             self.files.statements.setup,
             arm=self.arm and self.arm[rows],
-            timed=self.at_images.timed(tuple(found)),
+            timed=None
+            if stream is None or seconds is None
+            else Timed(stream, np.array([seconds[name] for name in found])),
         )
-
-
-MOST_ROUNDS = 3
-"""Largest number of rounds of solving and tilting; a flip by few degrees stands out when the larger ones are gone."""
-
-
-@require_arguments
-def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) -> tuple[HandEyeInput, str]:
-    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree only so.
-
-    Parameters
-    ----------
-    given : pairs of poses, of :func:`stcal.workflows.read_handeye`
-    options : as for :func:`stcal.workflows.calibrate_handeye`
-
-    Returns
-    -------
-    HandEyeInput, str
-        The input, and a sentence that names the poses.
-
-    Raises InputError: the input consists of images, which determine the poses by themselves.
-    """
-    problem = given.problem(options or HandEyeOptions())
-    if given.views is not None:
-        raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
-    undone = np.zeros(len(problem), bool)
-    for _ in range(MOST_ROUNDS):
-        result, pairs = problem.solved("pose").result, problem.pairs
-        flips = flipped(problem.loop, result.mount_from_camera, result.stand_from_board, result.outliers) & ~undone
-        if not flips.any():
-            break
-        seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
-        turned = Poses(np.where(flips[:, None, None], other.rotation, seen.rotation), seen.translation)
-        problem, undone = replace(problem, pairs=replace(pairs, camera_from_board=turned)), undone | flips
-    shown = ", ".join(name for name, flip in zip(given.pairs.names, undone, strict=True) if flip)
-    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(problem)} poses: {shown or 'none'}"
-    return replace(given, pairs=problem.pairs), said

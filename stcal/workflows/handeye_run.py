@@ -4,7 +4,6 @@ systems."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from functools import partial
 
 import numpy as np
@@ -14,8 +13,9 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pose_pairs import HandEyePoses, rms_of
-from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
+from stcal.handeye.conventions import flipped, tilted
+from stcal.handeye.data.pose_pairs import rms_of
+from stcal.handeye.data.stream import LONGEST_S, Timed
 from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
 from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
@@ -26,8 +26,7 @@ from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye_inputs import HandEyeInput, naming_left_out
-from stcal.workflows.robot_at_images import Arm
+from stcal.workflows.handeye_inputs import Arm, HandEyeInput
 
 ALL = "all"
 """Word in place of a method's name: all methods, compared."""
@@ -78,7 +77,7 @@ def calibrate_handeye(
     choosing = method is None and not (options.names_unknowns or options.camera is not None)
     if time_offset:
         given, options, offset = at_offset(given, options)
-    with naming_left_out(given.left_out):
+    try:
         if options.camera is None:
             options = replace(options, camera=given.prior)
         pairs, rows = given.pairs, np.zeros((0, 0), int)
@@ -108,6 +107,11 @@ def calibrate_handeye(
         outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
         if given.arm is not None:
             outcome = with_arm(outcome, given.arm, mended, given.prior, rows, workers, partial(told, "with the arm"))
+    except StcalError as error:
+        if given.left_out:
+            name, why = given.left_out[0]
+            error.append(f"; {len(given.left_out)} left out before, first {name}: {why}")
+        raise
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
@@ -167,8 +171,6 @@ FALLS = 0.98
 """Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
 HARMFUL = 1.0
 """Change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always."""
-ROW_S = 0.05
-"""Time assumed between smooth rows without times: a scan of ±1 s then covers ±20 rows."""
 SMOOTH, LEAST_ROWS = 0.2, 20
 """Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
 their order counts as that of a motion; and least number of such poses."""
@@ -206,10 +208,9 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
 @one_thread()
 def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> tuple[HandEye, tuple[str, ...]]:
     """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
-    with the lag goes. Without times, the order of smooth rows gives velocities."""
-    pairs, setup, options, stated = problem.pairs, problem.setup, problem.options, timed
-    timed = _moving(pairs, timed)
-    if timed is None or options.four_dof or len(result.outliers) != len(pairs):
+    with the lag goes."""
+    pairs, setup, options = problem.pairs, problem.setup, problem.options
+    if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _is_moving(timed):
         return result, ()
     try:
         if abs(_lag_t(problem, timed, result)) < HINT_T:
@@ -229,35 +230,26 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
     size, sigma, ahead = abs(lag.seconds), lag.sigma_s, lag.seconds > 0
     clock = f"robot's clock is {1e3 * size:.3g} ± {1e3 * sigma:.2g} ms {'ahead of' if ahead else 'behind'} the camera's"
-    remedy = "solve with --time-offset"
-    if stated is None:
-        late = f"{size / ROW_S:.2g} ± {sigma / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
-        clock, remedy = f"board's poses are {late} than the robot's", "give both with times, and --time-offset"
-    said = f"by the motions the {clock}, with which residuals fall from {old} to {new}: {remedy}"
+    said = f"by the motions the {clock}, with which residuals fall from {old} to {new}: solve with --time-offset"
     if not any(isinstance(note, SizeDoubt) for note in after.notes):
         result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
     return result, (Grave(said) if harmful else said,)
 
 
-def _moving(pairs: HandEyePoses, timed: Timed | None) -> Timed | None:
-    """Returns the robot's poses as a stream with velocities at the images, by times or by the order of smooth rows, or
-    None. About one sample for each image must be smooth too."""
-    if timed is not None:
-        samples = timed.stream.seconds
-        after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
-        if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
-            return None
-    if timed is not None and timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
-        return timed
-    if len(pairs) < LEAST_ROWS:
-        return None
-    if timed is None:
-        seconds = ROW_S * np.arange(len(pairs))
-        timed = Timed(Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where), seconds)
+def _is_moving(timed: Timed) -> bool:
+    """Returns whether the robot's poses tell velocities at the images; about one sample for each image must be
+    smooth."""
+    samples = timed.stream.seconds
+    after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
+    if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
+        return False
+    if timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
+        return True
     poses = timed.stream.base_from_flange
     steps = rms_of(poses[1:].difference(poses[:-1]))
-    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
-    return timed if smooth else None
+    return len(timed.seconds) >= LEAST_ROWS and all(
+        own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True)
+    )
 
 
 def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
@@ -341,3 +333,40 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
         raise InputError("E-PLAN-ROBOT", f"{message}, first not {beyond[0]}; {remedy}")
     notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes
+
+
+MOST_ROUNDS = 3
+"""Largest number of rounds of solving and tilting; a flip by few degrees stands out when the larger ones are gone."""
+
+
+@require_arguments
+def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) -> tuple[HandEyeInput, str]:
+    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree only so.
+
+    Parameters
+    ----------
+    given : pairs of poses, of :func:`stcal.workflows.read_handeye`
+    options : as for :func:`stcal.workflows.calibrate_handeye`
+
+    Returns
+    -------
+    HandEyeInput, str
+        The input, and a sentence that names the poses.
+
+    Raises InputError: the input consists of images, which determine the poses by themselves.
+    """
+    problem = given.problem(options or HandEyeOptions())
+    if given.views is not None:
+        raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
+    undone = np.zeros(len(problem), bool)
+    for _ in range(MOST_ROUNDS):
+        result, pairs = problem.solved("pose").result, problem.pairs
+        flips = flipped(problem.loop, result.mount_from_camera, result.stand_from_board, result.outliers) & ~undone
+        if not flips.any():
+            break
+        seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
+        turned = Poses(np.where(flips[:, None, None], other.rotation, seen.rotation), seen.translation)
+        problem, undone = replace(problem, pairs=replace(pairs, camera_from_board=turned)), undone | flips
+    shown = ", ".join(name for name, flip in zip(given.pairs.names, undone, strict=True) if flip)
+    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(problem)} poses: {shown or 'none'}"
+    return replace(given, pairs=problem.pairs), said

@@ -39,26 +39,11 @@ or tool."""
 class RegisteredRobot(Brief):
     """A robot identified in the frame b of a registration, and errors of both on the same held-out rows.
 
-    Parameters
-    ----------
-    robot : Robot
-        The nominal robot.
-    identified : Identified
-        Base and kinematics solved together; ``identified.robot.world_from_base`` is b_from_base, mm.
-    model : str
-        Model of the transform.
-    lines : sequence of int
-        Lines of all rows, for messages.
-    folds : int
-        Number of folds of the cross-validation.
-    rows : (m,) int array
-        Rows held out.
-    transform_mm, kinematics_mm : (m,) arrays
-        Held-out errors by the transform, and by base and kinematics, mm.
-    wild : (m,) bool array
-        Outliers of both.
-    off_mm : float
-        RMS distance of the points a from the nominal robot's positions after a rigid fit, mm.
+    ``robot`` : the nominal robot; ``identified`` : base and kinematics solved together, whose ``robot.world_from_base``
+    is b_from_base, mm; ``model`` : of the transform; ``lines`` : (n,) of all rows, for messages; ``folds`` : number of
+    folds of the cross-validation; ``rows`` : (m,) held out; ``transform_mm``, ``kinematics_mm`` : (m,) held-out errors
+    by the transform, and by base and kinematics; ``wild`` : (m,) bool, outliers of both; ``off_mm`` : RMS distance of
+    the points a from the nominal robot's positions after a rigid fit.
     """
 
     robot: Robot
@@ -111,34 +96,25 @@ def register_with_robot(
 
     Parameters
     ----------
-    pairs : Pairs
-        Points in the frames a and b, of :func:`stcal.register.read_pairs`, mm; b is the instrument that measured them.
-    registration : Registration
-        Result of :func:`stcal.register.register` from these pairs, with ``allow_ambiguous`` where a bent arm looks like
-        two motions.
-    robot : Robot
-        The nominal robot, mm and rad.
-    joints : Measurements, str, Path or Table
-        Joint values at each pair, with targets and loads; or a table with columns ``q1_deg`` …, as the file of the
+    pairs : Points in the frames a and b, of :func:`stcal.register.read_pairs`, mm; b is the instrument that measured
+        them.
+    registration : Result of :func:`stcal.register.register` from these pairs, with ``allow_ambiguous`` where a bent arm
+        looks like two motions.
+    robot : The nominal robot, mm and rad.
+    joints : Joint values at each pair, with targets and loads; or a table with columns ``q1_deg`` …, as the file of the
         pairs may have. The positions are always those of ``pairs`` in b.
-    threshold_mm, liu2017_options : float, Liu2017Options, optional
-        Options of the registration, for the transforms of the cross-validation.
-    folds : int
-        Number of folds of the cross-validation; 0 for none.
+    threshold_mm, liu2017_options : Options of the registration, for the transforms of the cross-validation.
+    folds : Number of folds of the cross-validation; 0 for none.
 
     Returns
     -------
-    RegisteredRobot
-        ``identified`` and the held-out errors of both ways.
+    RegisteredRobot : ``identified`` and the held-out errors of both ways.
 
     Raises
     ------
-    InputError
-        There are no joint values, as many as pairs are needed, or the robot does not fit them.
-    DegenerateError
-        Too few points for the robot's parameters.
-    ConvergenceError
-        The identification reaches no minimum.
+    InputError : There are no joint values, as many as pairs are needed, or the robot does not fit them.
+    DegenerateError : Too few points for the robot's parameters.
+    ConvergenceError : The identification reaches no minimum.
     """
     if not isinstance(registration, Findings):
         registration = findings(pairs, registration)

@@ -13,7 +13,7 @@ from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain
 from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
-from stcal.workflows.robot_at_images import Arm
+from stcal.workflows.handeye_inputs import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import FLANGE_FROM_CAMERA, PER_MM, looks, photographs
 from tests.outcome import INPUT, assert_error, fails_with

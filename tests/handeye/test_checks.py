@@ -13,9 +13,11 @@ from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.conventions import repair
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.handeye_pipeline import handeye
 from stcal.handeye.remarks import Observability
 from stcal.io.rotations import INVERTED
-from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
+from stcal.workflows.handeye_inputs import HandEyeInput
+from stcal.workflows.handeye_run import without_flips
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import (
@@ -25,7 +27,6 @@ from tests.support.handeye import (
     FLANGE_FROM_CAMERA,
     board_corners,
     disturbed,
-    handeye,
     simulated,
     simulated_views,
 )

@@ -23,7 +23,7 @@ from stcal.locate.layout import load_plan
 from stcal.robot.descriptions import is_conf, kinematics_content, load_urdf, robot_of_conf, robot_of_kinematics
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.sfm.budget.combine import statement_of
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import read_robot_poses
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(

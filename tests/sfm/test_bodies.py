@@ -21,8 +21,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import adjusted
-from stcal.sfm.adjust.refine import refine
-from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
+from stcal.sfm.adjust.refine import find_scale, refine, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.budget.combine import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera

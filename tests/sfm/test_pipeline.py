@@ -9,8 +9,7 @@ import pycolmap
 import pytest
 
 from stcal.sfm import run
-from stcal.sfm.adjust.refine import adjust
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.refine import adjust, find_scale
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.pairs import PairOptions, rank_pairs

@@ -5,7 +5,7 @@ import numpy as np
 from stcal.design import reference_target
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.adjust.faces import face_frame
+from stcal.sfm.adjust.chain import face_frame
 
 
 def true_poses(truth: dict) -> dict[str, Rigid]:

@@ -11,10 +11,10 @@ from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.adjust.joint import unmoved
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.scene import Scene

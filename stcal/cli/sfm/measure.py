@@ -238,9 +238,9 @@ def measure(
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import read_table
+    from stcal.sfm.adjust.faces_file import read_target
     from stcal.sfm.measurement import measure_images as work
     from stcal.sfm.measurement import pose_report as output
-    from stcal.sfm.measurement.known_target import read_target
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
 
     for path in (out, json_file, report):

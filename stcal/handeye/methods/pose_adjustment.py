@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from stcal.adjust.components import component_variances
+from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.clusters import ByClusters, by_clusters

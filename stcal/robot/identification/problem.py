@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtr, chdtrc
 from scipy.stats import chi2
 
-from stcal.adjust.components import Components, Equations
+from stcal.adjust.blocks import Components, Equations
 from stcal.geometry.clusters import by_clusters
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.normal_equations import blocks_of

@@ -17,13 +17,18 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
-from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
+from stcal.sfm.adjust.chain import (
+    CalibratedTarget,
+    FaceInGroup,
+    FrameKind,
+    chain_faces,
+    faces_of_group,
+    missing_frame_circles,
+    unlinked_faces,
+)
 from stcal.sfm.adjust.equations import CIRCLES, UNKNOWN_SHAPES
-from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
-from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.adjust.scale import Scale, find_scale
+from stcal.sfm.adjust.refine import Scale, adjust, eccentricity_px, find_scale, free_network
 from stcal.sfm.adjust.uncertainty import calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.group_model import GroupModel, M, MetricModel, WorldModel
 
@@ -60,10 +65,6 @@ class AdjustOptions:
                 "E-OPTION-NEEDS",
                 f"--refine-camera: part of the joint adjustment, the solve is {self.solve}; use --solve joint",
             )
-
-
-JOINT_ROUNDS = 2
-"""Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
 
 
 MIN_REDUNDANCY = 30.0
@@ -111,7 +112,6 @@ class Calibration(Brief):
     circle_sigma_px: float | None = None  # of the target's points in the joint adjustment, RMS per axis
 
     def with_larger_sigma(self, factor: float) -> "Calibration":
-        """Returns the calibration with all σ of the joint adjustment multiplied by a factor."""
         if self.joint is None or factor == 1:
             return self
         return replace(self, target=self.target.with_larger_sigma(factor), joint=self.joint.with_larger_sigma(factor))
@@ -135,7 +135,8 @@ def calibrate(
     """
     published = options.solve == "paper"
     prior = prior if options.refine_camera else None
-    joint_rounds = 0 if options.solve != "joint" else JOINT_ROUNDS + (prior is not None)  # refined intrinsics: one more
+    # Eccentricity changes by nanometres between the first and the second; refined intrinsics take one more.
+    joint_rounds = 0 if options.solve != "joint" else 2 + (prior is not None)
     step = counted(progress or (lambda *_: None), "faces", 1 + joint_rounds + (joint_rounds > 0))
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
@@ -148,7 +149,7 @@ def calibrate(
         for face_id in unlinked
     ]
     try:
-        calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
+        calibrated = chain_faces(faces, target, options.reference_face, published)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factors = image_sigma_factors(models, camera, target.printed_ids())

@@ -1,19 +1,193 @@
-"""Chains the faces of all groups into the target frame, and measures how far the ways to a face disagree."""
+"""Face frames from circle centres, the faces of each group, and their chaining into the target frame."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
-from stcal.design import TargetDesign
-from stcal.errors import MappingError
-from stcal.geometry.arrays import Brief
+from stcal.design import FaceDesign, TargetDesign
+from stcal.errors import DegenerateError, MappingError
+from stcal.geometry.arrays import Brief, freeze
+from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.plane import fit_planes
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.faces import FaceInGroup
+from stcal.sfm.adjust.refine import projection_jacobians
+from stcal.sfm.data.group_model import MetricModel
 
-MAX_CHAIN_STEPS = 4
+FrameKind = Literal["plane", "three-point"]
+MIN_KNOWN = 3  # smallest number of points of a face of known shape that place it
+MIN_PLACING = 4
+"""Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
+shows how good it is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceInGroup:
+    """One face in the metric frame of one group."""
+
+    group: str
+    face: str
+    group_from_face: Rigid
+    labels: tuple[CircleLabel, ...]  # (n,) its mapped circles
+    xyz_face: np.ndarray  # (n, 3) mm
+    information: np.ndarray  # (n, 3, 3) inverse covariances in the face frame, given the cameras
+    images: int  # number of images that show the face
+
+    def __post_init__(self):
+        n = len(self.labels)
+        freeze(self, "xyz_face", (n, 3), "circles")
+        freeze(self, "information", (n, 3, 3), "information")
+
+
+def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
+    """Returns the circles of the face's frame that are not mapped; none for a face of known shape."""
+    if face.sigma_mm is not None:
+        return ()
+    return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
+
+
+def with_unmapped(
+    face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """Returns the circles (3,) by id, unmapped ones of the frame by a rigid fit to the design or ``known`` places."""
+    missing = missing_frame_circles(face, xyz)
+    if not missing:
+        return dict(xyz)
+    known = dict(zip(face.ids, face.places_mm(face.ids), strict=True)) if known is None else known
+    common = [circle for circle in xyz if circle in known]
+    names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+    if len(common) < MIN_PLACING:
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES",
+            f"face {face.id}: frame circle {names} not mapped, and {len(common)} other circles, {MIN_PLACING} needed; "
+            "add views that show it",
+        )
+    try:
+        model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
+    except DegenerateError as error:
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        ) from error
+    return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
+
+
+def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
+    """Returns the in-plane σ per axis of circles (3,) about the design, pooled over rigid fits of the faces."""
+    square, redundancy = 0.0, 0
+    for face in target.faces:
+        centres = {label.circle: place for label, place in xyz.items() if label.face == face.id}
+        if len(centres) < MIN_PLACING:
+            continue
+        mapped, design = np.array(list(centres.values())), face.places_mm(centres)
+        try:
+            away = align_rigid(mapped, design).inverse() @ mapped - design
+        except DegenerateError:
+            continue
+        square += float((away[:, :2] ** 2).sum())
+        redundancy += 2 * len(centres) - 3
+    return float(np.sqrt(square / redundancy)) if redundancy else 0.0
+
+
+def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
+    """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10). ``kind``:
+    ``three-point`` as in the paper; ``plane``: Z from the plane of all circles; ``towards``: direction to the side from
+    which the face is seen."""
+    if missing := missing_frame_circles(face, xyz):
+        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        )
+    return face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)[0]
+
+
+def face_frames(
+    face: FaceDesign, circles: Sequence[str], xyz: np.ndarray, kind: FrameKind, towards: np.ndarray
+) -> Poses:
+    """Returns :func:`face_frame` of k sets of centres, (k, n, 3). The frame of a face of known shape is that of the
+    design, laid over all of its points by least squares."""
+    if face.sigma_mm is not None:
+        return _fitted(face, circles, xyz)
+    corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
+    if kind == "plane":
+        normal, offset, _ = fit_planes(xyz, towards)
+        corners = corners - ((corners * normal).sum(2) - offset)[..., None] * normal
+    origin, along_x, along_y = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+    axis_x = along_x / np.linalg.norm(along_x, axis=1, keepdims=True)
+    across = along_y - (along_y * axis_x).sum(1, keepdims=True) * axis_x
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    if (length[:, 0] < 1e-6 * np.linalg.norm(along_y, axis=1)).any():
+        raise DegenerateError(
+            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped on one line; check their labels"
+        )
+    axis_y = across / length
+    return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)
+
+
+def _fitted(face: FaceDesign, circles: Sequence[str], xyz: np.ndarray) -> Poses:
+    design = face.places_mm(circles)
+    spread = np.linalg.svd(design - design.mean(0), compute_uv=False) if len(design) >= MIN_KNOWN else np.zeros(2)
+    if spread[1] <= 1e-6 * spread[0]:
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES",
+            f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} needed that are not on one "
+            "line; add views that show it",
+        )
+    middle = xyz.mean(1)
+    rotation, _ = best_rotations(np.einsum("kni,nj->kij", xyz - middle[:, None], design - design.mean(0)))
+    return Poses(rotation, middle - rotation @ design.mean(0))
+
+
+def faces_of_group(
+    model: MetricModel,
+    camera: Camera,
+    target: TargetDesign,
+    kind: FrameKind,
+    known: Mapping[str, Mapping[str, np.ndarray] | None] | None = None,
+) -> tuple[list[FaceInGroup], list[str]]:
+    """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles of
+    ``known`` faces may be placed by their other circles."""
+    xyz = model.xyz_model
+    by_point = model.whiten(projection_jacobians(model, camera)[1])
+    information = np.zeros((len(model.labels), 3, 3))  # inverse covariance of each point, given the cameras, mm⁻²
+    np.add.at(information, model.point_index, np.swapaxes(by_point, 1, 2) @ by_point)
+    cameras = np.stack([pose.inverse().translation for pose in model.camera_from_model])
+    faces, notes = [], []
+    for face in target.faces:
+        members = model.points_by_face().get(face.id, np.zeros(0, int))
+        if not len(members):
+            continue
+        place = {model.labels[i].circle: xyz[i] for i in members}
+        observed = np.isin(model.point_index, members)
+        seen_by = np.unique(model.image_index[observed])
+        try:
+            if known is not None and face.id in known:
+                place = with_unmapped(face, place, known[face.id])
+            frame = face_frame(face, place, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
+        except DegenerateError as error:
+            notes.append(f"group {model.group}: {error}")
+            continue
+        r = frame.rotation
+        faces.append(
+            FaceInGroup(
+                model.group,
+                face.id,
+                frame,
+                tuple(model.labels[i] for i in members),
+                frame.inverse() @ xyz[members],
+                r.T @ information[members] @ r,
+                len(seen_by),
+            )
+        )
+    if not faces and not notes:
+        notes.append(
+            f"group {model.group}: no face mapped (two images must see it); add views that show faces and board"
+        )
+    return faces, notes
+
+
 MAX_CHAINS = 12
 Way = tuple[tuple[str, ...], tuple[str, ...]]
 """The faces from the first to the last, and the groups that link them."""
@@ -48,49 +222,26 @@ class CalibratedTarget(Brief):
     position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
     def with_larger_sigma(self, factor: float) -> "CalibratedTarget":
-        """Returns the target with all σ multiplied by a factor."""
-        square = factor**2
+        def times(by: float, values: dict) -> dict:
+            return {key: times(by, own) if isinstance(own, dict) else by * own for key, own in values.items()}
+
         return replace(
             self,
-            face_covariance={k: square * c for k, c in self.face_covariance.items()},
-            circle_covariance={k: square * c for k, c in self.circle_covariance.items()},
-            distance_sigma_mm={k: factor * s for k, s in self.distance_sigma_mm.items()},
+            face_covariance=times(factor**2, self.face_covariance),
+            circle_covariance=times(factor**2, self.circle_covariance),
+            distance_sigma_mm=times(factor, self.distance_sigma_mm),
             scale_sigma=None if self.scale_sigma is None else factor * self.scale_sigma,
-            covariance_mm2=None if self.covariance_mm2 is None else square * self.covariance_mm2,
-            position_sources_mm={
-                face: {kind: factor * s for kind, s in of_kind.items()}
-                for face, of_kind in self.position_sources_mm.items()
-            },
+            covariance_mm2=None if self.covariance_mm2 is None else factor**2 * self.covariance_mm2,
+            position_sources_mm=times(factor, self.position_sources_mm),
         )
 
 
-def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Combines the faces of all groups into the frame of the reference face by weighted least squares."""
-    chains = _ways(faces, target, reference)
-    target_from_face, target_from_group = _adjust(faces, chains, reference)
-    circles = _circles(faces, target_from_face, target)
-    return CalibratedTarget(reference, target_from_face, circles, target_from_group)
-
-
-def chain_singly(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Chains each face by single transforms along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they
-    belong). The circles of a face are those of the last group of its way."""
-    shortest = {face_id: ways[0] for face_id, ways in _ways(faces, target, reference).items()}
-    target_from_face = {face_id: _along(way, faces) for face_id, way in shortest.items()}
-    nearest: dict[str, FaceInGroup] = {}
-    for face in sorted(faces, key=lambda face: len(shortest[face.face][1])):
-        nearest.setdefault(face.group, face)
-    target_from_group = {g: target_from_face[f.face] @ f.group_from_face.inverse() for g, f in nearest.items()}
-    last = {face_id: groups[-1] for face_id, (_, groups) in shortest.items() if groups}
-    last.setdefault(reference, next(face.group for face in faces if face.face == reference))
-    faces_used = [face for face in faces if face.group == last[face.face]]
-    return CalibratedTarget(
-        reference, target_from_face, _circles(faces_used, target_from_face, target), target_from_group
-    )
-
-
-def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> dict[str, list[Way]]:
-    """Returns the ways from the reference face to every face, by face, the shortest first."""
+def chain_faces(
+    faces: Sequence[FaceInGroup], target: TargetDesign, reference: str, singly: bool = False
+) -> CalibratedTarget:
+    """Combines the faces of all groups into the frame of the reference face by weighted least squares; ``singly``: each
+    along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they belong), with the circles of its last group.
+    """
     target.face(reference)
     mapped = {face.face for face in faces}
     if reference not in mapped:
@@ -99,15 +250,24 @@ def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) ->
             f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
             f"{', '.join(sorted(mapped)) or 'none'} with --reference-face",
         )
-    chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(mapped)}
-    unlinked = [face_id for face_id, ways in chains.items() if not ways]
-    if unlinked:
+    shortest = {face_id: next(iter(_chains(faces, reference, face_id)), None) for face_id in sorted(mapped)}
+    ways = {face_id: way for face_id, way in shortest.items() if way}
+    if len(ways) < len(mapped):
         raise MappingError(
             "E-FACE-UNLINKED",
-            f"face {', '.join(unlinked)}: never linked to reference face {reference}; "
+            f"face {', '.join(sorted(shortest.keys() - ways))}: never linked to reference face {reference}; "
             f"add a group that shows it together with {reference} or a face that is linked",
         )
-    return chains
+    from_face, from_group = {face_id: _along(way, faces) for face_id, way in ways.items()}, {}
+    for face in sorted(faces, key=lambda face: len(ways[face.face][1])):
+        from_group.setdefault(face.group, from_face[face.face] @ face.group_from_face.inverse())
+    if singly:
+        last = {face_id: groups[-1] for face_id, (_, groups) in ways.items() if groups}
+        last.setdefault(reference, next(face.group for face in faces if face.face == reference))
+        faces = [face for face in faces if face.group == last[face.face]]
+    else:
+        from_face, from_group = _adjust(faces, from_face, from_group, reference)
+    return CalibratedTarget(reference, from_face, _circles(faces, from_face, target), from_group)
 
 
 def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
@@ -146,7 +306,7 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
             if len(complete) == MAX_CHAINS:
                 break
             continue
-        longest = len(complete[0][0]) if complete else max(MAX_CHAIN_STEPS, len(by_group))
+        longest = len(complete[0][0]) if complete else max(4, len(by_group))
         if len(way) <= longest:
             queue += [
                 ((*way, face_id), (*groups, group))
@@ -167,33 +327,29 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
     return result
 
 
-def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
+def _adjust(
+    faces: Sequence[FaceInGroup], from_face: dict[str, Rigid], from_group: dict[str, Rigid], reference: str
+) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
     """Estimates the poses of faces and groups in the target frame. Poses are perturbed on the right, so that the step
     of a face enters its residual with the factor −1."""
-    start = {face_id: _along(ways[0], faces) for face_id, ways in chains.items()}
-    groups = list(dict.fromkeys(face_in_group.group for face_in_group in faces))
-    start_group = {}
-    for face_in_group in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
-        start_group.setdefault(face_in_group.group, start[face_in_group.face] @ face_in_group.group_from_face.inverse())
-    free = [face_id for face_id in start if face_id != reference]
     roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
-    for each in faces:
-        by_pose = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
-        information = np.einsum("nki,nkl,nlj->ij", by_pose, each.information, by_pose)
+    for own in faces:
+        by_pose = np.concatenate([-skew(own.xyz_face), np.broadcast_to(np.eye(3), (len(own.labels), 3, 3))], axis=2)
+        information = np.einsum("nki,nkl,nlj->ij", by_pose, own.information, by_pose)
         roots.append(np.linalg.cholesky(information + 1e-12 * np.eye(6)).T)
-
-    names = [("face", f) for f in free] + [("group", g) for g in groups]
-    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(names)}
-    initial = {("face", f): start[f] for f in (reference, *free)} | {("group", g): start_group[g] for g in groups}
+    free = [("face", f) for f in from_face if f != reference]
+    free += [("group", g) for g in dict.fromkeys(own.group for own in faces)]
+    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(free)}
+    initial = {("face", f): pose for f, pose in from_face.items()} | {("group", g): p for g, p in from_group.items()}
 
     def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
         jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
-        for k, (face_in_group, root) in enumerate(zip(faces, roots, strict=True)):
-            rows, group, face = slice(6 * k, 6 * k + 6), ("group", face_in_group.group), ("face", face_in_group.face)
-            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ face_in_group.group_from_face).log()
-            r, t = face_in_group.group_from_face.rotation.T, face_in_group.group_from_face.translation
+        for k, (own, root) in enumerate(zip(faces, roots, strict=True)):
+            rows, group, face = slice(6 * k, 6 * k + 6), ("group", own.group), ("face", own.face)
+            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ own.group_from_face).log()
+            r, t = own.group_from_face.rotation.T, own.group_from_face.translation
             jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
-            if face_in_group.face != reference:
+            if face in column:
                 jacobian[rows, column[face]] = -root
         return NormalEquations.of(residual, jacobian)
 
@@ -204,17 +360,15 @@ def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[
     # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
     # iteration ends when they gain nothing.
     poses = solution.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
-    return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
+    return {f: poses["face", f] for f in from_face}, {g: poses["group", g] for g in from_group}
 
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
     """Returns circle centres in the target frame: weighted means over the groups, taken in the face frame."""
     weight: dict[CircleLabel, np.ndarray] = {}
     total: dict[CircleLabel, np.ndarray] = {}
-    for face_in_group in faces:
-        for label, xyz, information in zip(
-            face_in_group.labels, face_in_group.xyz_face, face_in_group.information, strict=True
-        ):
+    for own in faces:
+        for label, xyz, information in zip(own.labels, own.xyz_face, own.information, strict=True):
             weight[label] = weight.get(label, 0) + information
             total[label] = total.get(label, 0) + information @ xyz
     return {

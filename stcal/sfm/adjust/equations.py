@@ -13,15 +13,13 @@ from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.normal_equations import free_motions
+from stcal.geometry.normal_equations import free_motions, generalised_inverse
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.print_modes import AMPLITUDES
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.print_modes import AMPLITUDES, PrintModes, Told
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.faces import Shape
-from stcal.sfm.adjust.refine import placed, projection_jacobians, reproject
-from stcal.sfm.adjust.scale import known_points
+from stcal.sfm.adjust.refine import known_points, placed, projection_jacobians, reproject
 from stcal.sfm.data.group_model import GroupModel, MetricModel
 
 CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
@@ -72,7 +70,6 @@ class RowsOfView:
         return cls(rows, np.linalg.qr(by_pose.reshape(2 * n, 6))[0])
 
     def free(self, values: np.ndarray) -> np.ndarray:
-        """Returns (2n, …) without what the pose takes."""
         return values - self.pose @ (self.pose.T @ values)
 
     def along(self, directions: np.ndarray) -> np.ndarray:
@@ -97,11 +94,9 @@ class Group:
     circle_place: np.ndarray  # of each circle among all
 
     def name(self, block: str) -> str:
-        """Returns the name of a block of its own."""
         return f"{block} of {self.model.group}"
 
     def values(self) -> dict[str, Any]:
-        """Returns its own unknowns at the start."""
         return {
             self.name(POSES): Poses.of(self.model.camera_from_model),
             self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
@@ -109,14 +104,12 @@ class Group:
         }
 
     def at(self, values: Mapping[str, Any]) -> MetricModel:
-        """Returns its model at a state."""
         points = np.empty_like(self.model.xyz_model)
         points[self.circles] = values[CIRCLES].array[self.circle_place]
         points[self.dots] = values[self.name(DOTS)].array
         return placed(self.model, values[self.name(POSES)], Vector(points))
 
     def board_at(self, values: Mapping[str, Any]) -> Rigid:
-        """Returns model_from_board at a state."""
         return values[self.name(BOARD)][0]
 
     def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
@@ -130,7 +123,6 @@ class Group:
         return place[self.model.point_index]
 
     def observations(self, kind: str) -> np.ndarray:
-        """Returns the model's observations of circles or of dots."""
         return np.flatnonzero(np.isin(self.model.point_index, self.circles if kind == CIRCLES else self.dots))
 
 
@@ -164,9 +156,6 @@ class Setting:
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
 
-    def shape_sigma_mm(self) -> float:
-        return self.board.sigma_mm * float(np.sqrt(self.common))
-
     def cells(self) -> np.ndarray:
         """Returns the cells of the board of whose dots the common shape consists."""
         return np.unique(np.concatenate([group.cells for group in self.groups])) if self.common else np.zeros(0, int)
@@ -178,7 +167,6 @@ class Setting:
         return {CIRCLES: Vector(xyz), CAMERA: Vector(away[None]), **own}
 
     def camera(self, values: Mapping[str, Any]) -> Camera:
-        """Returns the camera at a state."""
         return self.camera_at(*(values[CAMERA],) * bool(self.basis.shape[1]))
 
     def camera_at(self, *away: Vector) -> Camera:
@@ -201,7 +189,7 @@ class Setting:
                     a.factor(
                         lambda v: v.array,
                         [(shape, np.arange(len(shape.start)))],
-                        self.shape_sigma_mm(),
+                        self.board.sigma_mm * float(np.sqrt(self.common)),
                         lambda v: [np.broadcast_to(np.eye(3), (len(v), 3, 3))],
                         kind=BOARD,
                     )
@@ -248,6 +236,107 @@ def is_dots_first_cheaper(group: Group) -> bool:
     return 6 * len(group.model.images) < 3 * len(group.dots)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """The n points of a face of known shape against its design, which is laid over them with their weights."""
+
+    members: np.ndarray  # (n,) indices among the circles
+    rotation: np.ndarray  # (3, 3) model_from_face
+    off_mm: np.ndarray  # (n, 3) points minus design, face frame
+    weight: np.ndarray  # (n, 3) 1/σ²
+    # (3n, k) derivative of ``off_mm`` by the pose, the relative size of the print if it is free, and the print's modes
+    by_pose: np.ndarray
+    prior: np.ndarray  # (k,) weights of these unknowns about 0
+    value: np.ndarray  # (k - 6,) size, minus 1, and modes
+    sized: bool  # whether the size is free
+
+    @classmethod
+    def of(
+        cls,
+        members: np.ndarray,
+        design: np.ndarray,
+        xyz: np.ndarray,
+        weight: np.ndarray,
+        size_sigma: float,
+        amplitude: float = AMPLITUDES[0],
+    ) -> "Shape":
+        """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size; ``amplitude`` : of the
+        smooth deviations of its print."""
+        modes = PrintModes.of(design[:, :2])
+        unit = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
+        smooth = -modes.modes.reshape(len(xyz), 3, -1)
+        others = np.concatenate([-design[:, :, None], smooth], axis=2) if size_sigma else smooth
+        prior = np.concatenate(
+            [np.zeros(6), [size_sigma**-2] if size_sigma else [], (amplitude * modes.spread_mm) ** -2.0]
+        )
+        pose, value = align_rigid(xyz, design), np.zeros(len(prior) - 6)
+        for _ in range(20):
+            in_face = (xyz - pose.translation) @ pose.rotation
+            off = in_face - design + others @ value
+            by_pose = np.concatenate([skew(in_face), -unit, others], axis=2).reshape(len(weight) * 3, -1)
+            weighted = weight.reshape(-1, 1) * by_pose
+            normal, right = by_pose.T @ weighted + np.diag(prior), weighted.T @ off.ravel()
+            right[6:] += prior[6:] * value
+            scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            step = -scale * np.linalg.lstsq(normal * scale[:, None] * scale, scale * right, rcond=1e-12)[0]
+            if np.abs(step).max() < 1e-13:  # rad, mm
+                break
+            pose, value = pose @ Rigid.exp(step[:6]), value + step[6:]
+        return cls(members, pose.rotation, off, weight, by_pose, prior, value, bool(size_sigma))
+
+    def cost(self) -> float:
+        return float((self.weight * self.off_mm**2).sum() + self.prior[6:] @ self.value**2)
+
+    def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """The unknowns by the deviations (k, 3n), and their covariance (k, k)."""
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        inverse = generalised_inverse(self.by_pose.T @ weighted + np.diag(self.prior))
+        return inverse @ weighted.T, inverse
+
+    def slope(self) -> np.ndarray:
+        """Returns half the gradient of the cost by the points, (3n,), model frame."""
+        return ((self.weight * self.off_mm) @ self.rotation.T).ravel()
+
+    def normal(self) -> np.ndarray:
+        """Returns the normal matrix (3n, 3n) over the points, model frame, with pose, size and modes eliminated."""
+        n = len(self.members)
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        inner = np.diag(self.weight.ravel()) - weighted @ self._to_pose()[0]
+        blocks = inner.reshape(n, 3, n, 3)
+        return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
+
+    def by_size(self) -> np.ndarray:
+        """Returns the right-hand side (3n,) that a stated size one σ off brings, model frame; 0 for an exact size."""
+        if not self.sized:
+            return np.zeros(self.off_mm.size)
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        force = weighted @ self._to_pose()[1][:, 6] * np.sqrt(self.prior[6])
+        return (force.reshape(-1, 3) @ self.rotation.T).ravel()
+
+    def _in_face(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        n = len(self.members)
+        turned = covariance_mm2.reshape(n, 3, n, 3)
+        turned = np.einsum("ai,manb,bj->minj", self.rotation, turned, self.rotation, optimize=True)
+        return turned.reshape(3 * n, 3 * n)
+
+    def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """Variance of adjusted deviations, by that of the points, over the stated one, (n, 3), at most 1."""
+        turned = self._in_face(covariance_mm2)
+        to_pose, of_pose = self._to_pose()
+        left = np.eye(len(turned)) - self.by_pose @ to_pose
+        variance = np.einsum("ij,jk,ik->i", left, turned, left, optimize=True)
+        variance = variance + np.einsum("ij,jk,ik->i", self.by_pose, of_pose, self.by_pose)
+        return self.weight * variance.reshape(-1, 3)
+
+    def told(self, covariance_mm2: np.ndarray, amplitude: float) -> Told:
+        """Returns what the adjusted points tell about the modes of the print; ``covariance_mm2``: (3n, 3n) of these."""
+        to_pose, of_pose = self._to_pose()
+        of_points = to_pose @ self._in_face(covariance_mm2) @ to_pose.T
+        modes = slice(6 + self.sized, len(self.prior))
+        spread = 1 / np.sqrt(self.prior[modes]) / amplitude
+        return Told(self.value[self.sized :], (of_pose + of_points)[modes, modes], np.zeros_like(spread), spread)
+
+
 @dataclass(slots=True, eq=False)
 class OfTarget:
     """What is known of the circles: flatness of faces, known distances, faces of known shape."""
@@ -264,12 +353,10 @@ class OfTarget:
         return self.last[1:]
 
     def cost(self, values: Mapping[str, Any]) -> float:
-        """Returns squared deviations over σ²."""
         rows, known = self._known(values)
         return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns normal matrix (3c, 3c) and right side (3c,)."""
         size = values[CIRCLES].array.size
         normal, right = np.zeros((size, size)), np.zeros(size)
         rows, known = self._known(values)

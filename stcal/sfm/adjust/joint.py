@@ -36,10 +36,9 @@ from stcal.sfm.adjust.equations import (
     coordinates,
     normalised,
     planes,
-    robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.scale import MIN_DOTS
+from stcal.sfm.adjust.refine import MIN_DOTS
 from stcal.sfm.data.group_model import MetricModel
 
 Values = dict[str, Any]  # unknowns by block
@@ -73,11 +72,9 @@ class JointResult:
     xyz_model: np.ndarray  # (c, 3)
     covariance_mm2: np.ndarray  # (3c, 3c), datum of smallest trace, scaled by ``sigma_scale``²
     sigma0: float  # residuals over the σ of all observations
-    board_residuals_mm: dict[str, np.ndarray]  # by group, (n, 3), board frame
     board_common: float  # share of the board's variance that all groups have in common
     camera: Camera
     camera_covariance: np.ndarray  # (q, q) of the parameters of its COLMAP model, if adjusted
-    weights: dict[str, np.ndarray]  # by group, (n,) Huber's
     redundancy: int  # degrees of freedom
     last_move_px: float  # largest move of a projection by the last whole step
     print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
@@ -98,7 +95,6 @@ class JointResult:
         return self.enlarged * max(1.0, self.sigma0)
 
     def with_larger_sigma(self, factor: float) -> "JointResult":
-        """Returns the result with all σ multiplied by a factor."""
         covariances = {k: factor**2 * getattr(self, k) for k in ("covariance_mm2", "camera_covariance")}
         return replace(self, enlarged=factor * self.enlarged, **covariances)
 
@@ -120,18 +116,41 @@ class Adjusted:
 
     @property
     def models(self) -> list[MetricModel]:
-        """The groups' models."""
         return [group.at(self.solution.values) for group in self.setting.groups]
 
     @property
     def camera(self) -> Camera:
-        """The camera."""
         return self.setting.camera(self.solution.values)
 
     def result(self, sigma0: float | None = None) -> JointResult:
         """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``. ``sigma0``: of
         the residuals if None."""
-        return _result(self.setting, self.solution, self.move_px, sigma0).with_larger_sigma(self.enlarged)
+        setting, solution, values = self.setting, self.solution, self.solution.values
+        groups, xyz = setting.groups, values[CIRCLES].array
+        flat = sum(len(members) - 3 for members, *_ in planes(xyz, setting)) + sum(1 for _ in bars(xyz, setting))
+        for shape in shapes(xyz, setting):
+            flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
+        observations = sum(2 * len(g.model.image_index) + 3 * len(g.dots) for g in groups) + flat
+        unknowns = xyz.size + sum(6 * len(g.model.images) + 3 * len(g.dots) + 6 * bool(len(g.dots)) for g in groups)
+        redundancy = observations - unknowns + FREE_DIRECTIONS
+        if sigma0 is None:
+            sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
+        covariance = max(1.0, sigma0) ** 2 * solution.inverse
+        intrinsics = solution.parts[0].places[CAMERA]
+        return JointResult(
+            tuple(self.models),
+            {g.model.group: g.board_at(values) for g in groups},
+            setting.labels,
+            xyz,
+            covariance[: xyz.size, : xyz.size],
+            sigma0,
+            setting.common,
+            self.camera,
+            covariance[intrinsics, intrinsics],
+            redundancy,
+            self.move_px,
+            *setting.factors,
+        ).with_larger_sigma(self.enlarged)
 
     def extensible(self) -> "Extensible":
         """Returns the covariances of the points; σ₀ is 1."""
@@ -186,8 +205,6 @@ def adjust_part(
     return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
 
 
-SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
-"""Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
 LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but is never exact
@@ -196,10 +213,10 @@ LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but
 def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors) -> tuple[Setting, Values]:
     """Returns the state near its minimum with the σ of faces of known shape that belong to it."""
     setting = replace(setting, factors=factors)
-    for _ in range(SHAPE_ROUNDS):
+    for _ in range(6):
         minimum, before = _descent(setting, values, NEARLY), setting.factors
         values, setting = minimum.state, replace(setting, factors=_shape_factors(setting, minimum.linear))
-        if np.abs(np.log(np.divide(setting.factors, before))).max() < SETTLED_FACTOR:
+        if np.abs(np.log(np.divide(setting.factors, before))).max() < 0.03:
             break
     return setting, values
 
@@ -235,11 +252,6 @@ def unmoved(
     return Adjusted(setting, setting.joined(values).at(values), 0.0)
 
 
-def basis_of(prior: CameraPrior | None) -> np.ndarray:
-    """Returns the derivative (16, q) of a camera's parameters by those that are adjusted."""
-    return intrinsic_basis(prior.colmap_model) if prior else np.zeros((len(PARAMETER_NAMES), 0))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Extensible:
     """The circle covariance of an adjustment, prepared for one more view, for any number of images."""
@@ -270,10 +282,12 @@ def _start(
 ) -> tuple[Setting, Values]:
     """Returns a setting without down-weighting, and the start."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
-    weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
+    basis, weight = np.zeros((len(PARAMETER_NAMES), 0)), np.zeros((0, 0))
+    if prior:
+        basis, weight = intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
     groups = tuple(_group(model, board, labels) for model in models)
     flatness_mm = np.inf if flatness_mm is None else flatness_mm
-    setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis_of(prior), weight, np.inf)
+    setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis, weight, np.inf)
     total, count = np.zeros((len(labels), 3)), np.zeros(len(labels))
     for group in groups:  # circles begin at their means over the groups
         np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
@@ -366,36 +380,3 @@ def _common_share(setting: Setting, values: Values) -> float:
         return 0.0
     share = product / square
     return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
-
-
-def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: float | None = None) -> JointResult:
-    values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
-    models = tuple(group.at(values) for group in groups)
-    xyz = values[CIRCLES].array
-    flat = sum(len(members) - 3 for members, *_ in planes(xyz, setting))
-    for shape in shapes(xyz, setting):
-        flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
-    flat += sum(1 for _ in bars(xyz, setting))
-    observations = sum(2 * len(g.model.image_index) + 3 * len(g.dots) for g in groups) + flat
-    unknowns = xyz.size + sum(6 * len(g.model.images) + 3 * len(g.dots) + 6 * bool(len(g.dots)) for g in groups)
-    redundancy = observations - unknowns + FREE_DIRECTIONS
-    if sigma0 is None:
-        sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
-    covariance = max(1.0, sigma0) ** 2 * solution.inverse
-    intrinsics = solution.parts[0].places[CAMERA]
-    return JointResult(
-        models,
-        {g.model.group: g.board_at(values) for g in groups},
-        setting.labels,
-        xyz,
-        covariance[: xyz.size, : xyz.size],
-        sigma0,
-        {g.model.group: g.board_residual(values) for g in groups},
-        setting.common,
-        camera,
-        covariance[intrinsics, intrinsics],
-        {model.group: robust_weights(model, camera, setting.huber) for model in models},
-        redundancy,
-        move_px,
-        *setting.factors,
-    )

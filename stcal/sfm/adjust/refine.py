@@ -1,23 +1,191 @@
-"""Adjustment of one group: weighted bundle adjustment, alternating with the circles' eccentricity."""
+"""One group: scale, bundle adjustment alternating with the circles' eccentricity, and the free network with its score
+tests (Rao 1948; Baarda 1968)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from stcal.adjust.blocks import Block, Vector
 from stcal.adjust.engine import Adjustment
-from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
-from stcal.errors import ConvergenceError, DegenerateError, MappingError
+from stcal.design import (
+    POINT_RADIUS_MM,
+    BoardDesign,
+    FaceDesign,
+    ScaleReference,
+    TargetDesign,
+    faces_of_known_shape,
+    known_distances,
+)
+from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera
+from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
 from stcal.geometry.plane import circle_image_offset, fit_plane
-from stcal.geometry.rigid import Poses, by_pose
+from stcal.geometry.rigid import Poses, Rigid, Similarity, align_rigid, align_similarity, by_pose
 from stcal.geometry.robust import robust_sigma
-from stcal.labels import Label
-from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
+from stcal.labels import CircleLabel, Label, dot_cells
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, M, Outlier, WorldModel
+
+MIN_DOTS = 4
+EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share
+MIN_CORNERS = 3  # smallest number of corners that determine the scale of a face of known shape
+ScaleSource = Literal["board", "faces", "distances", "drawing"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scale:
+    """The scale of one group."""
+
+    board_from_world: Similarity  # over all dots by least squares, unless by rows; its scale is λ, mm per unit
+    rows_mm_per_unit: float  # λ as in Zhang & Wei (2017): first and last row, all pairs
+    rows: tuple[int, int]
+    labels: tuple[Label, ...]  # (n,) the dots, or the corners of faces of known shape
+    residuals_mm: np.ndarray  # (n, 3) minus design, board frame, of corners face frames
+    sigma_mm_per_unit: float  # from the stated σ of the dots' positions
+    source: ScaleSource = "board"  # what determines λ; ``drawing`` if no size is known
+
+    def __post_init__(self):
+        freeze(self, "residuals_mm", (len(self.labels), 3), "residuals")
+
+    @property
+    def mm_per_unit(self) -> float:
+        """λ, by least squares or by rows, as requested."""
+        return self.board_from_world.scale
+
+    def group_from_world(self) -> Similarity:
+        """Returns the similarity to the group's metric frame, which is the world in mm."""
+        return Similarity(self.mm_per_unit, Rigid())
+
+    def rms_mm(self) -> float:
+        return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
+
+    def mean_mm(self) -> float:
+        """Returns the mean of the residuals' lengths: the first measure of Zhang & Wei's Table 1."""
+        return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
+
+    def spread_mm(self) -> float:
+        """Spread of the residuals' lengths, the second measure of Zhang & Wei's Table 1, there a mean square error."""
+        return float(np.linalg.norm(self.residuals_mm, axis=1).std())
+
+
+def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> Scale:
+    """Returns the scale of a model from the dots of the board; ``by_rows``: λ as in Zhang & Wei (2017)."""
+    members = model.points_by_face().get("board", np.zeros(0, int))
+    where = f"group {model.group}: scale"
+    if len(members) < MIN_DOTS and (own := _of_faces(model, board) or _of_distances(model, board)) is not None:
+        return own
+    if len(members) < MIN_DOTS:
+        raise ScaleError(
+            "E-SCALE-FEW-DOTS",
+            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces; "
+            "check that the camera file belongs to the images and the board file to the board",
+        )
+    labels = [model.labels[i] for i in members]
+    cells = dot_cells(labels)
+    xyz_board = board.places_mm(labels)
+    xyz_world = model.xyz_model[members]
+    try:
+        board_from_world = align_similarity(xyz_board, xyz_world)
+    except DegenerateError as error:
+        raise ScaleError(
+            "E-SCALE-COLLINEAR", f"{where}: the mapped board dots lie in one line; show more rows of the board"
+        ) from error
+    spread = np.sqrt(((xyz_board - xyz_board.mean(0)) ** 2).sum())
+    # λ by Zhang & Wei (2017), eq. 7, with the correct mean over pairs: 2/(n(n−1)), not 1/(n−1)!
+    rows = int(cells[:, 0].min()), int(cells[:, 0].max())
+    chosen = np.isin(cells[:, 0], rows)
+    i, j = np.triu_indices(int(chosen.sum()), 1)
+    apart = [np.linalg.norm(xyz[chosen][i] - xyz[chosen][j], axis=1) for xyz in (xyz_board, xyz_world)]
+    mean_ratio = float((apart[0] / apart[1]).mean())
+    if by_rows:
+        board_from_world = Similarity(mean_ratio, align_rigid(xyz_board, mean_ratio * xyz_world))
+    return Scale(
+        board_from_world,
+        mean_ratio,
+        rows,
+        tuple(labels),
+        board_from_world @ xyz_world - xyz_board,
+        float(board_from_world.scale * board.sigma_mm / spread),
+    )
+
+
+def _of_faces(model: WorldModel, board: BoardDesign) -> Scale | None:
+    """Returns the scale from the corners of faces of known shape, None if there are none."""
+    labels: list[Label] = []
+    scales, weights, parts = [], [], []
+    for face, members in known_points(model.labels, board):
+        design, xyz = face.places_mm(model.labels[i].circle for i in members), model.xyz_model[members]
+        try:
+            scales.append(align_similarity(design, xyz).scale)
+        except DegenerateError:
+            continue
+        weights.append(((design - design.mean(0)) ** 2).sum() / (face.sigma_mm or 1.0) ** 2)
+        parts.append((design, xyz))
+        labels += [model.labels[i] for i in members]
+    if not scales:
+        return None
+    scale = float(np.exp(np.average(np.log(scales), weights=weights)))
+    residuals = [align_rigid(design, scale * xyz) @ (scale * xyz) - design for design, xyz in parts]
+    sigma = scale / float(np.sqrt(np.sum(weights)))
+    whole = Similarity(scale, Rigid())
+    return Scale(whole, scale, (0, 0), tuple(labels), np.concatenate(residuals), sigma, "faces")
+
+
+def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
+    """Returns the scale from known distances, None if there are none."""
+    place = {label: i for i, label in enumerate(model.labels)}
+    known = [d for d in known_distances(board) if d.first in place and d.second in place]
+    if not known:
+        return None
+    units = [np.linalg.norm(model.xyz_model[place[d.first]] - model.xyz_model[place[d.second]]) for d in known]
+    weights = np.array([(d.mm / d.sigma_mm) ** 2 for d in known])
+    ratios = np.array([d.mm for d in known]) / units
+    scale = float(np.average(ratios, weights=weights))
+    away = np.array([[scale * unit - d.mm, 0.0, 0.0] for d, unit in zip(known, units, strict=True)])
+    labels = tuple(d.first for d in known)
+    sigma = scale / float(np.sqrt(weights.sum()))
+    source: ScaleSource = "drawing" if known[0].drawn else "distances"
+    return Scale(Similarity(scale, Rigid()), scale, (0, 0), labels, away, sigma, source)
+
+
+def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations]) -> BoardDesign:
+    """Returns the board with the σ of printed sizes enlarged by that of a common shift of the edges of tags: light, ink
+    and camera make all tags look larger or smaller alike, which no residual shows."""
+    if not isinstance(board, ScaleReference) or not any(face.of_tags for face in board.faces):
+        return board
+    sides: dict[CircleLabel, CircleLabel] = {}
+    for face in board.faces:
+        labels = face.labels()
+        if face.of_tags:
+            sides |= {labels[k]: labels[k + 1] for k in range(0, len(labels), 4)}
+    lengths: dict[str, list[float]] = {}
+    for image in observations:
+        place = dict(zip(image.labels, image.centre_px, strict=True))
+        for first, second in sides.items():
+            if first in place and second in place:
+                length = float(np.linalg.norm(place[first] - place[second]))
+                lengths.setdefault(first.face, []).append(length)
+    faces = []
+    for face in board.faces:
+        moved = 2 * EDGE_SIGMA_PX / float(np.median(lengths[face.id])) if face.id in lengths else 0.0
+        variance = face.size_sigma**2 + moved**2
+        share = moved**2 / variance if variance else 0.0
+        faces.append(replace(face, size_sigma=float(np.sqrt(variance)), edge_share=share))
+    return replace(board, faces=tuple(faces))
+
+
+def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[FaceDesign, np.ndarray]]:
+    """Returns the faces of known shape with three points or more among ``labels``, and the indices of these."""
+    faces = {face.id: face for face in faces_of_known_shape(board)}
+    members: dict[str, list[int]] = {}
+    for i, label in enumerate(labels):
+        if isinstance(label, CircleLabel) and label.face in faces:
+            members.setdefault(label.face, []).append(i)
+    return [(faces[face], np.array(rows)) for face, rows in members.items() if len(rows) >= MIN_CORNERS]
+
 
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
@@ -67,8 +235,8 @@ def reproject(
         return np.full_like(measured_px, np.inf) if behind else camera_at(*lens).project(xyz) - measured_px
 
     def derivatives(points: Vector, poses: Poses, *lens: Vector) -> list[np.ndarray]:
-        xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
-        of_poses, by_point = jacobians(xyz, own.rotation, own.translation, camera)
+        xyz, camera = seen(points, poses), camera_at(*lens)
+        of_poses, by_point = _jacobians(xyz, poses[image], camera)
         return [by_point, of_poses, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
 
     root = model.whiten(np.tile(np.eye(2), (len(image), 1, 1)))
@@ -76,22 +244,18 @@ def reproject(
 
 
 def placed(model: M, poses: Poses, points: Vector) -> M:
-    """Returns the model with these poses and points."""
     return replace(model, camera_from_model=tuple(poses), xyz_model=points.array)
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
-    own = Poses.of(model.camera_from_model)[model.image_index]
-    return jacobians(model.xyz_camera(), own.rotation, own.translation, camera)
+    return _jacobians(model.xyz_camera(), Poses.of(model.camera_from_model)[model.image_index], camera)
 
 
-def jacobians(
-    xyz: np.ndarray, rotation: np.ndarray, translation: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
+def _jacobians(xyz: np.ndarray, poses: Poses, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Returns :func:`projection_jacobians` of points (n, 3) in the frames of n cameras."""
     by_camera = camera.projection_jacobian(xyz)
-    return by_pose(by_camera, xyz - translation), by_camera @ rotation
+    return by_pose(by_camera, xyz - poses.translation), by_camera @ poses.rotation
 
 
 MAX_ROUNDS = 20
@@ -192,3 +356,162 @@ def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outli
             label = model.labels[model.point_index[worst]]
             outliers.append(Outlier(name, label, float(residual[worst]), float(limit[worst])))
     return is_outlier, outliers
+
+
+MIN_SHARE = 1e-6
+"""Smallest share of a parameter's information that poses and points leave to it. Below this share, the parameter cannot
+be separated from them."""
+MIN_CONTROL = 0.1
+"""Smallest redundancy of one coordinate at which the other observations control it: its residual then shows a tenth of
+its error."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """An adjusted group, mm, with n observations, m images, p points."""
+
+    model: GroupModel
+    residual: np.ndarray  # (n, 2) over σ
+    by_pose: np.ndarray  # (n, 2, 6) derivatives of the projections over σ
+    by_point: np.ndarray  # (n, 2, 3)
+    inverse: np.ndarray  # (m, 6, 6) of the poses' normal blocks
+    coupling: np.ndarray  # (m, 6, 3p) between poses and points
+    pose_right: np.ndarray  # (m, 6) right-hand sides after the adjustment, almost zero
+    point_right: np.ndarray  # (3p,)
+    covariance_mm2: np.ndarray  # (3p, 3p) of the points, in the datum of smallest trace
+    residual_cofactor: np.ndarray  # (n, 2, 2) covariance of each residual over σ²
+
+    def __post_init__(self):
+        p = 3 * len(self.model.labels)
+        freeze(self, "covariance_mm2", (p, p), "covariance")
+
+    @property
+    def redundancy(self) -> np.ndarray:
+        """Redundancy of each observation, (n,), between 0 and 2."""
+        return np.trace(self.residual_cofactor, axis1=1, axis2=2)
+
+    def squares_of_observations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the squared residuals over their own covariances, (n,), and the degrees of freedom, 0 to 2: a
+        direction that the other observations hardly control tells nothing."""
+        value, vector = np.linalg.eigh(self.residual_cofactor)
+        held = value > MIN_CONTROL
+        along = (np.swapaxes(vector, 1, 2) @ self.residual[..., None])[..., 0]
+        square = np.where(held, along**2 / np.where(held, value, 1.0), 0.0)
+        return square.sum(1), held.sum(1)
+
+    def noise(self) -> float:
+        """Returns the squared residual per degree of freedom of this group; 1 if that is less, as σ explain it."""
+        return max(float((self.residual**2).sum() / max(self.redundancy.sum(), 1e-9)), 1.0)
+
+    def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns squared residuals over σ² and redundancy of each image, (m,)."""
+        square, redundancy = np.zeros((2, len(self.model.images)))
+        np.add.at(square, self.model.image_index, (self.residual**2).sum(1))
+        np.add.at(redundancy, self.model.image_index, self.redundancy)
+        return square, redundancy
+
+    def covariance_of(self, points: np.ndarray) -> np.ndarray:
+        """Returns the covariance of some of the points, (3k, 3k)."""
+        place = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
+        return self.covariance_mm2[np.ix_(place, place)]
+
+    def pose_covariance(self) -> np.ndarray:
+        """Returns (m, 6, 6) rad and mm, in the datum of the points, rotations perturbed on the left."""
+        to_points = self.inverse @ self.coupling
+        return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
+
+    def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Equations (q, q), (q,) of parameters of the group by the derivatives ``columns`` (n, 2, q) over σ."""
+        normal, right, to_points = self._by_image(columns)
+        coupled = to_points.sum(0)
+        weighted = coupled @ self.covariance_mm2
+        return normal.sum(0) - weighted @ coupled.T, right.sum(0) - weighted @ self.point_right
+
+    def score_by_image(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns :meth:`score` of separate parameters for each image: (m, q, q) and (m, q)."""
+        normal, right, to_points = self._by_image(columns)
+        weighted = to_points @ self.covariance_mm2
+        return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
+
+    def score_of_image(self, image: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns :meth:`score` (2k, 2k), (2k,) of one parameter per coordinate of an image, the first ones first. They
+        explain any residuals of the image, as if the image were left out."""
+        rows = self.model.rows_by_image()[image]
+        k, p = len(rows), len(self.model.labels)
+        by_pose = np.concatenate([self.by_pose[rows, 0], self.by_pose[rows, 1]])
+        to_points = np.zeros((2 * k, p, 3))
+        for axis in range(2):
+            to_points[axis * k + np.arange(k), self.model.point_index[rows]] = self.by_point[rows, axis]
+        eliminated = by_pose @ self.inverse[image]
+        coupled = to_points.reshape(2 * k, 3 * p) - eliminated @ self.coupling[image]
+        weighted = coupled @ self.covariance_mm2
+        right = self.residual[rows].T.ravel() - eliminated @ self.pose_right[image]
+        return np.eye(2 * k) - eliminated @ by_pose.T - weighted @ coupled.T, right - weighted @ self.point_right
+
+    def _by_image(self, e: np.ndarray):
+        """Returns by image, without its pose: normal (m, q, q), right side (m, q), coupling to points (m, q, 3p)."""
+        model = self.model
+        m, q, p = len(model.images), e.shape[2], len(model.labels)
+        normal, by_pose, right = np.empty((m, q, q)), np.empty((m, q, 6)), np.empty((m, q))
+        for i, rows in enumerate(model.rows_by_image()):
+            own = e[rows].reshape(-1, q).T
+            normal[i], by_pose[i] = own @ own.T, own @ self.by_pose[rows].reshape(-1, 6)
+            right[i] = own @ self.residual[rows].ravel()
+        to_points = np.zeros((m, q, p, 3))
+        to_points[model.image_index, :, model.point_index] = np.swapaxes(e, 1, 2) @ self.by_point
+        eliminated = by_pose @ self.inverse
+        return (
+            normal - eliminated @ np.swapaxes(by_pose, 1, 2),
+            right - np.einsum("mqi,mi->mq", eliminated, self.pose_right),
+            to_points.reshape(m, q, 3 * p) - eliminated @ self.coupling,
+        )
+
+
+def free_network(model: GroupModel, camera: Camera) -> Network:
+    by_pose, by_point = projection_jacobians(model, camera)
+    a, b = model.whiten(by_pose), model.whiten(by_point)
+    m, p = len(model.images), len(model.labels)
+    residual = model.whiten(model.residuals_px(camera))
+    coupling = np.zeros((m, p, 6, 3))
+    coupling[model.image_index, model.point_index] = np.swapaxes(a, 1, 2) @ b
+    coupling = coupling.transpose(0, 2, 1, 3).reshape(m, 6, 3 * p)
+    poses, pose_right = blocks_of(a, residual, model.image_index, m)
+    points, point_right = blocks_of(b, residual, model.point_index, p)
+    reduction = reduce(poses, pose_right, coupling)
+    normal = -reduction.normal
+    place = 3 * np.arange(p)[:, None] + np.arange(3)
+    normal[place[:, :, None], place[:, None]] += points
+    covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
+    # cofactors of each adjusted observation, (n, 2, 2)
+    inverse, weighted = reduction.inverse, reduction.from_kept @ covariance
+    pose = inverse + weighted @ np.swapaxes(reduction.from_kept, 1, 2)
+    mixed = weighted.reshape(m, 6, p, 3)[model.image_index, :, model.point_index]
+    blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
+    cross = a @ mixed @ np.swapaxes(b, 1, 2)
+    of_poses = a @ pose[model.image_index] @ np.swapaxes(a, 1, 2)
+    of_points = b @ blocks[model.point_index] @ np.swapaxes(b, 1, 2)
+    cofactor = np.eye(2) - (of_poses - cross - np.swapaxes(cross, 1, 2) + of_points)
+    right = point_right.ravel() - reduction.right
+    return Network(model, residual, a, b, inverse, coupling, pose_right, right, covariance, cofactor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoreTest:
+    """Result of a score test: ``statistic`` follows χ² if no further parameter is needed."""
+
+    estimate: np.ndarray
+    covariance: np.ndarray
+    statistic: float
+    freedom: int
+
+
+def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
+    """Returns the test for the equations of :meth:`Network.score`, without directions that they do not determine."""
+    own = np.diag(normal)
+    scale = np.sqrt(np.where(own > 0, own, np.inf))  # a parameter that rounding alone determines counts for nothing
+    value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
+    held = value > MIN_SHARE
+    half = vector[:, held] / np.sqrt(value[held])
+    half = half / scale[:, None]
+    along = half.T @ right
+    return ScoreTest(half @ along, half @ half.T, float(along @ along), int(held.sum()))

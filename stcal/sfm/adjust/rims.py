@@ -1,14 +1,14 @@
 """Rims in front of luminous circles: radii of circles as each view shows them, and the height of a rim from them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import huber_weights, robust_sigma
 from stcal.labels import DotLabel, Label
-from stcal.sfm.data.group_model import GroupModel, ImageObservations
+from stcal.sfm.data.group_model import CircleRows, GroupModel, ImageObservations
 
 MAX_TAN = 2.75
 """Largest tangent of the tilt (70°) of views that are used for a rim: beyond it, the short axis of the ellipse is a few
@@ -36,10 +36,11 @@ STEPS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RadiusViews:
-    """The radii in n observations of circles of one group."""
+class RadiusViews(CircleRows):
+    """The radii in n observations of circles."""
 
     point_index: np.ndarray
+    image_index: np.ndarray
     design_mm: np.ndarray
     ratio: np.ndarray  # measured over designed radius
     size_px: np.ndarray  # designed radius in the image
@@ -88,6 +89,7 @@ def radius_views(
     narrow = np.divide(blur**2, cosine * size**2, out=np.zeros_like(size), where=blur > 0)
     return RadiusViews(
         point,
+        model.image_index[order],
         radius,
         np.where(is_circle, (measured + lost) / size, np.nan),
         size,
@@ -109,23 +111,17 @@ def find_rims(
     """Returns the height of the rim in front of the faces' ``circles`` and of the board's ``dots``, if views suffice.
     The area common to disc and rim appears h/2 in front of the disc, and its radius is smaller by h tan τ/π."""
     by_name = {image.name: image for image in images}
-    parts: dict[str, list[tuple[np.ndarray, ...]]] = {"circles": [], "dots": []}
-    before = 0
+    parts, dots, before = [], [], 0
     for model in models:
         views = radius_views(model, by_name, design_mm, camera)
-        is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index]
-        short = (views.ratio - 1) * views.design_mm
-        image = before + np.concatenate([np.full(len(own), k) for k, own in enumerate(model.rows_by_image())])
+        parts.append(replace(views, image_index=before + views.image_index))
+        dots.append(np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index])
         before += len(model.images)
-        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
-        for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
-            columns = (short, views.tan_tilt, views.design_mm, views.blur_mm, image, views.by_dome_mm, views.domes)
-            parts[kind].append(tuple(column[own] for column in columns))
-    rims = {}
-    for kind, found in parts.items():
-        short, tangent, *others = (np.concatenate(values) for values in zip(*found, strict=True))
-        if len(short) >= MIN_VIEWS and tangent.std() >= MIN_SPREAD:
-            rims[kind] = _rim(short, tangent, *others)
+    views, is_dot, rims = RadiusViews.concatenate(parts), np.concatenate(dots), {}
+    near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
+    for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
+        if np.count_nonzero(own) >= MIN_VIEWS and views.tan_tilt[own].std() >= MIN_SPREAD:
+            rims[kind] = _rim(views.select(own))
     return rims
 
 
@@ -138,21 +134,15 @@ def common_dome(domes: np.ndarray) -> tuple[float, float]:
     return float(weight @ share / weight.sum()), float(weight @ sigma / weight.sum()) + LEAST_DOME
 
 
-def _rim(
-    short: np.ndarray,
-    tangent: np.ndarray,
-    radius: np.ndarray,
-    blur: np.ndarray,
-    image: np.ndarray,
-    by_dome: np.ndarray,
-    domes: np.ndarray,
-) -> Rim:
-    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius, the share of blur that is
-    left, and the light that falls off towards the rim, of all. Circles of one ``image`` share exposure, focus and tilt:
-    σ is at least that by whole images (Liang & Zeger 1986, Biometrika 73)."""
+def _rim(views: RadiusViews) -> Rim:
+    """Returns the rim from the radii's excess, mm, with an offset of each radius, the share of blur that is left, and
+    the light that falls off towards the rim, of all. Circles of one image share exposure, focus and tilt: σ is at least
+    that by whole images (Liang & Zeger 1986, Biometrika 73)."""
+    tangent, radius, blur, by_dome = views.tan_tilt, views.design_mm, views.blur_mm, views.by_dome_mm
+    short = (views.ratio - 1) * radius
     _, kind = np.unique(radius, return_inverse=True)
     rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -by_dome, -tangent / np.pi])
-    dome, dome_sigma = common_dome(domes)
+    dome, dome_sigma = common_dome(views.domes)
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
     for _ in range(STEPS):
         right = short + lost_radius_mm(height, tangent, radius) - height * tangent / np.pi
@@ -170,7 +160,7 @@ def _rim(
     left = np.hypot(BLUR_SHARE_BY_TILT * blur, DOME_BY_TILT * solution[-2] * by_dome) * tangent
     by_tilt = float((inverse @ ((rows.T * weight) @ left))[-1])
     pull = (rows @ inverse[:, -1]) * weight * (right - rows @ solution)
-    of_image = np.bincount(np.unique(image, return_inverse=True)[1], pull)
+    of_image = np.bincount(np.unique(views.image_index, return_inverse=True)[1], pull)
     by_image = float((of_image**2).sum()) * len(of_image) / max(len(of_image) - 1, 1)
     spread = float(np.sqrt(max(sigma**2 * inverse[-1, -1], by_image)))
     return Rim(height, float(np.sqrt(spread**2 + by_tilt**2 + LEAST_SIGMA_MM**2)), len(short))

@@ -9,7 +9,14 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.chain import (
+    CalibratedTarget,
+    FrameKind,
+    face_frames,
+    missing_frame_circles,
+    placement_sigma_mm,
+    with_unmapped,
+)
 from stcal.sfm.adjust.equations import (
     BOARD,
     CAMERA,
@@ -23,7 +30,6 @@ from stcal.sfm.adjust.equations import (
     robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult
 
 STEP_MM = 1e-3  # step of the central differences, in mm
@@ -83,35 +89,30 @@ def calibrated_target(
     state: Adjusted | None = None,  # without it the contributions to the σ of positions are not computed
 ) -> CalibratedTarget:
     """Returns faces and circles of the adjusted target in the target frame, with their marginal covariances."""
-    target_derivatives = derivatives(result, start, target, kind)
+    own = derivatives(result, start, target, kind)
+    sources: dict[str, dict[str, np.ndarray]] = {}  # by face and kind of observation, part of σ of x, y, z, mm
+    if state:
+        positions = np.concatenate([jacobian[3:] for jacobian in own.faces.values()])
+        variances = {
+            kind: np.maximum(np.diag(matrix), 0.0) for kind, matrix in _parts_of(state, positions.T)[0].items()
+        }
+        for i, face in enumerate(own.faces):
+            of_kind = {
+                kind: result.sigma_scale * np.sqrt(v[3 * i : 3 * i + 3]) for kind, v in variances.items() if v.any()
+            }
+            sources[face] = of_kind
     return CalibratedTarget(
         reference_face=start.reference_face,
-        target_from_face=target_derivatives.target_from_face,
-        circles=dict(zip(result.labels, target_derivatives.xyz_target, strict=True)),
-        target_from_group=dict.fromkeys(start.target_from_group, target_derivatives.target_from_model),
-        face_covariance=target_derivatives.face_covariance(result.covariance_mm2),
-        circle_covariance=dict(
-            zip(result.labels, target_derivatives.circle_covariance(result.covariance_mm2), strict=True)
-        ),
-        distance_sigma_mm=target_derivatives.distance_sigma_mm(result.covariance_mm2),
+        target_from_face=own.target_from_face,
+        circles=dict(zip(result.labels, own.xyz_target, strict=True)),
+        target_from_group=dict.fromkeys(start.target_from_group, own.target_from_model),
+        face_covariance=own.face_covariance(result.covariance_mm2),
+        circle_covariance=dict(zip(result.labels, own.circle_covariance(result.covariance_mm2), strict=True)),
+        distance_sigma_mm=own.distance_sigma_mm(result.covariance_mm2),
         scale_sigma=scale_sigma(result.xyz_model, result.covariance_mm2),
-        covariance_mm2=target_derivatives.all_circles_covariance(result.covariance_mm2),
-        position_sources_mm=_position_sources_mm(state, result.sigma_scale, target_derivatives) if state else {},
+        covariance_mm2=own.all_circles_covariance(result.covariance_mm2),
+        position_sources_mm=sources,
     )
-
-
-def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dict[str, dict[str, np.ndarray]]:
-    """Returns, by face and kind of observation, what the kind contributes to σ of the face's x, y, z, (3,) mm."""
-    positions = np.concatenate([jacobian[3:] for jacobian in own.faces.values()])
-    covariance = _parts_of(state, positions.T)[0]
-    return {
-        face: {
-            kind: scale * np.sqrt(np.maximum(np.diag(matrix)[3 * i : 3 * i + 3], 0.0))
-            for kind, matrix in covariance.items()
-            if matrix.any()
-        }
-        for i, face in enumerate(own.faces)
-    }
 
 
 def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:

@@ -22,12 +22,16 @@ from stcal.parallel import Progress, counted, one_thread, run_in_order, scratch_
 from stcal.sfm.adjust.refine import eccentricity_px, placed
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
+    ProjectionSigma,
     adjust_intrinsics,
     board_views,
     closed_form,
+    image_grid,
     model_of_views,
     model_parameters,
     of_some_views,
+    projection_jacobian,
+    projection_sigma,
     start_camera,
 )
 from stcal.sfm.data.group_model import ImageObservations, by_group
@@ -37,55 +41,7 @@ from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import DetectionResult, detect_files
 
 R = TypeVar("R")
-GRID = (13, 9)
 MIN_REACH = 0.75  # of dots from the middle towards a corner, as advised: beyond it little distortion is extrapolated
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectionSigma:
-    sigma_px: np.ndarray  # (n,) per axis at :func:`image_grid`, up to a rotation of the camera, which poses absorb
-    reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
-    corner_sigma_px: np.ndarray  # (4,)
-
-
-def image_grid(camera: Camera) -> np.ndarray:
-    """Returns a grid of places over the whole image, including the corners, (n, 2) px."""
-    x, y = np.linspace(0, camera.width - 1, GRID[0]), np.linspace(0, camera.height - 1, GRID[1])
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
-def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Returns derivatives (n, 2, q) of projections by the parameters, up to a rotation of the camera."""
-    try:
-        ideal = camera.normalised_from_pixel(image_grid(camera))
-    except ConvergenceError as error:
-        raise DegenerateError(
-            "E-CAMERA-FOLDED",
-            "camera: the distortion folds over in a part of the image without dots; add views that fill the image "
-            "to its corners, or choose a --model with fewer parameters",
-        ) from error
-    jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
-    x, y = ideal.T
-    rotation = np.stack([np.stack([-x * y, 1 + x * x, -y], axis=-1), np.stack([-1 - y * y, x * y, x], axis=-1)], axis=1)
-    by_ideal = camera.pixel_jacobian(ideal)
-    by_rotation = (by_ideal @ rotation).reshape(-1, 3)
-    flat = jacobian.reshape(len(by_rotation), -1)
-    return (flat - by_rotation @ np.linalg.lstsq(by_rotation, flat, rcond=None)[0]).reshape(jacobian.shape)
-
-
-def projection_sigma(result: Intrinsics) -> ProjectionSigma:
-    """Returns σ of projections over the image, and how far dots reach towards its corners."""
-    camera = result.camera
-    xy = image_grid(camera)
-    jacobian = projection_jacobian(camera, result.colmap_model)
-    sigma = np.sqrt(np.einsum("nip,pq,niq->n", jacobian, result.covariance, jacobian) / 2)
-    middle = np.array([camera.width - 1, camera.height - 1]) / 2
-    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    dots = np.concatenate([m.measured_px for m in result.models]) - middle
-    # The smaller of the two coordinates counts: a dot at the side of the image is not in its corner.
-    reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
-    corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
-    return ProjectionSigma(sigma, np.maximum(reach, 0), sigma[corner_index])
 
 
 CELLS = (12, 8)  # number of cells of the image, in x and y, within which residuals are compared
@@ -150,7 +106,6 @@ LIKELY = 2.0
 """Number of standard errors by which a model with fewer parameters may be worse than the best and still be selected;
 after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
 HOPELESS = 3.0  # ratio of residuals to those of the best model from which on a model is not tried further
-POSE_PASSES = 2  # of pose and eccentricity; few suffice, as eccentricity hardly changes with the pose
 CLIP_SIGMAS = 5.0  # limit of residuals: gross errors of dots carry no information about the lens
 
 
@@ -263,17 +218,15 @@ def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
 
 def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
-    camera = result.camera
+    camera, factor = result.camera, result.factors.centres
     ((group, members),) = by_group([view]).items()
     model = model_of_views(group, view.labels, members, board, camera)
     known = [own for own in result.models if own.group == group]
     places = {label: xyz for own in known for label, xyz in zip(own.labels, own.xyz_model, strict=True)}
-    xyz = np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)])
-    model = replace(model, xyz_model=xyz)
-    factor = result.factors.centres
+    points = Vector(np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)]))
+    model = replace(model, xyz_model=points.array)
     radius: dict[Label, float] = {**board.radius_of()}
-    points = Vector(xyz)
-    for _ in range(POSE_PASSES):
+    for _ in range(2):  # eccentricity hardly changes with the pose
         model = replace(model, shift_px=eccentricity_px(model, camera, radius, 1.0))
         begin, poses = model, Poses.of(model.camera_from_model)
 
@@ -281,11 +234,55 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
             moved = placed(begin, poses.moved(step[None]), points)
             return moved.whiten(moved.residuals_px(camera)).ravel() / factor
 
-        depth = float(np.linalg.norm(begin.camera_from_model[0].translation))
+        depth = float(np.linalg.norm(poses.translation[0]))
         solution = least_squares(left, np.zeros(6), loss="huber", f_scale=2.0, x_scale=[1, 1, 1, depth, depth, depth])
         model = placed(begin, poses.moved(solution.x[None]), points)
     residual = model.residuals_px(camera)
     return residual, model.whiten(residual)
+
+
+GROSS_SIGMAS = 10.0  # smallest deviation of a gross error from camera and board; it is above MAX_RESIDUAL_PX, too
+LEAST_CORNERS = 6  # smallest number of corners of a view of which others were left out: they still check one another
+LEAST_SHARE = 0.5  # of the corners of a view that are no gross errors; with fewer of them the view is not used
+
+
+def without_gross_errors(
+    views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
+) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
+    """Returns the views without gross errors, those that consist of them, and a warning about the others."""
+    suspects = {
+        model.images[image]
+        for model in result.models
+        for image in model.image_index[np.linalg.norm(model.residuals_px(result.camera), axis=1) > MAX_RESIDUAL_PX]
+    }
+    limits = f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px"
+    kept, skipped, off = [], [], []
+    for view in views:
+        own = view
+        while view.name in suspects and len(own) > LEAST_CORNERS:  # one by one: each disturbs the pose, and the others
+            length_px, in_sigmas = (np.linalg.norm(each, axis=1) for each in foretold(own, grid, result))
+            in_sigmas /= result.factors.centres
+            worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
+            if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:
+                break
+            own = own.select(np.delete(np.arange(len(own)), worst))
+        if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
+            reason = (
+                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
+                "other views put them"
+            )
+            skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
+            continue
+        kept.append(own)
+        off += [(view.name, label) for label in view.labels if label not in own.labels]
+    if not off:
+        return kept, skipped, []
+    image, label = off[0]
+    warning = (
+        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
+        f"{limits} from where the camera and all views put them; look whether something hides the board there"
+    )
+    return kept, skipped, [warning]
 
 
 MIN_VIEWS = 3
@@ -334,95 +331,115 @@ def calibrate_camera(
 
     Parameters
     ----------
-    images : path
-        Folder of photographs, or of folders of them.
-    target : TargetDesign
-        Target that may also be in view; its circles are then not taken for dots.
-    board : BoardDesign
-        The dot board, mm, with the σ of its dots.
-    colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest model that predicts held-out
-        views as well as the best one.
-    ellipses : EllipseOptions, optional
-        Options of detection; the defaults if None.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, or of folders of them.
+    target : Target that may also be in view; its circles are then not taken for dots.
+    board : The dot board, mm, with the σ of its dots.
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest model that predicts
+        held-out views as well as the best one.
+    ellipses : Options of detection; the defaults if None.
+    workers : Number of processes; one per core if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    CameraCalibration
-        Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; the views used, and warnings.
+    CameraCalibration : Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; the views
+        used, and warnings.
 
     Raises
     ------
-    StcalError
-        A stage failed. The one-line message says what to do.
+    StcalError : A stage failed. The one-line message says what to do.
     """
     ellipses, progress = ellipses or EllipseOptions(), progress or (lambda *_: None)
+    with scratch_folder("camera") as cache:
 
-    def of_model(
-        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
-    ) -> CameraCalibration:
-        before: Intrinsics | None = None
-        settled = of_perspective = False
-        with scratch_folder("camera") as cache:
-            for rounds in range(1, MAX_ROUNDS + 1):
-                step, lens = counted(progress, f"detect {rounds}", len(files)), unsized(camera, colmap_model)
-                inputs = files, lens, target, board, ellipses, Path(cache), workers, step
-                found = files, not_images, detect_files(*inputs, pictures=False)
-                try:
-                    views, skipped, result = _of_one_round(*found, board, camera, colmap_model, before is None)
-                except (DetectionError, DegenerateError):
-                    if before is not None or of_perspective or not camera.fisheye:
-                        raise
-                    # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds
-                    # it.
-                    start = start_camera(camera.width, camera.height, PERSPECTIVE)
-                    rough = of_model(files, not_images, start, PERSPECTIVE)
-                    camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
-                    continue
-                result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
-                camera = result.camera
-                settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
-                if settled:
-                    break
-                before = result
-        return judged(result, views, skipped, rounds, settled, board)
+        def find(files: list[ImageFile], lens: CameraModel, camera: Camera, number: int, first: bool) -> Found:
+            step = counted(progress, f"detect {number}", len(files))
+            inputs = files, lens, target, board, ellipses, Path(cache), workers, step
+            return views_of_dots(detect_files(*inputs, pictures=False), board, camera, first)
 
-    return calibrated(of_model, images, board, colmap_model, workers)
+        return calibrated(find, images, board, colmap_model, workers)
+
+
+Found = tuple[list[ImageObservations], tuple[Skipped, ...]]
+Finder = Callable[[list[ImageFile], CameraModel, Camera, int, bool], Found]
+"""Returns views and what was skipped, from files, the camera without its size, the camera, the number of the round of
+detection, and whether it is the first, in which the camera is rough."""
 
 
 def calibrated(
-    of_model: Callable[[list[ImageFile], list[Skipped], Camera, str], CameraCalibration],
-    images: str | Path,
-    board: BoardDesign,
-    colmap_model: str,
-    workers: int | None,
+    find: Finder, images: str | Path, board: BoardDesign, colmap_model: str, workers: int | None, rounds: int = 0
 ) -> CameraCalibration:
-    """Returns the calibration ``of_model`` by a folder's photographs; with ``auto``, of the best lens model."""
+    """Returns the calibration by the views that ``find`` sees in a folder's photographs; with ``auto``, of the best
+    lens model. ``rounds``: of detection, after which gross errors are removed; 0: until the camera settles."""
     if colmap_model == AUTO:
-        return of_chosen_model(lambda model: calibrated(of_model, images, board, model, workers), board, workers)
+        return of_chosen_model(lambda model: calibrated(find, images, board, model, workers, rounds), board, workers)
     if colmap_model not in COLMAP_MODELS:
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
         )
     files, not_images = find_images(images)
-    return of_model(files, not_images, start_camera(*require_common_size(files)[0], colmap_model), colmap_model)
+    camera = start_camera(*require_common_size(files)[0], colmap_model)
+    before: Intrinsics | None = None
+    settled, of_perspective, warnings = False, False, []
+    for number in range(1, (rounds or MAX_ROUNDS) + 1):
+        try:
+            # Without its size, which then comes from most of the images, and messages say so.
+            lens = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
+            views, skipped = find(files, lens, camera, number, before is None)
+            skipped = (*not_images, *skipped)
+            require_views(views, files, skipped)
+            start = closed_form(views, board, camera) if before is None else camera
+            result = adjust_intrinsics(views, board, start, colmap_model)
+            if not rounds:
+                require_determined(result, views, board)
+        except (DetectionError, DegenerateError):
+            if rounds or before is not None or of_perspective or not camera.fisheye:
+                raise
+            # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
+            found = calibrated(find, images, board, PERSPECTIVE, workers)
+            camera, of_perspective = replace(camera, focal=found.intrinsics.camera.focal), True
+            continue
+        camera = result.camera
+        settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
+        if settled and not rounds:
+            break
+        before = result
+    if rounds:
+        kept, without, warnings = without_gross_errors(views, board, result)
+        if without or warnings:
+            views, skipped = kept, (*skipped, *without)
+            require_views(views, files, skipped)
+            result = adjust_intrinsics(views, board, camera, colmap_model)
+        require_determined(result, views, board)
+    calibration = judged(result, views, skipped, number, settled or rounds > 0, board)
+    return replace(calibration, warnings=(*calibration.warnings, *warnings))
 
 
-def unsized(camera: Camera, colmap_model: str) -> CameraModel:
-    """Returns a camera without its size, which then comes from most of the images, and messages say so."""
-    return CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
+def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera, first: bool) -> Found:
+    """Returns the views of the board in detected images, sharp but in the ``first`` round, in which depths are
+    unknown, and what was skipped."""
+    views = board_views(detection.images, board, camera)
+    if not first:
+        views, _ = correct_defocus(views, camera, pattern_of_board(board))
+    shown, repeated = {view.name for view in views}, "the board is in view more than once"
+    without = (
+        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
+        for each in detection.images
+        if each.file.name not in shown
+    )
+    return views, (*detection.skipped, *without)
 
 
 def camera_of_dots(
     files: Sequence[ImageFile], detection: DetectionResult, board: BoardDesign, start: Camera, colmap_model: str
 ) -> Intrinsics:
     """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``."""
-    return _of_one_round(files, (), detection, board, start, colmap_model, True)[2]
+    views, skipped = views_of_dots(detection, board, start, first=True)
+    require_views(views, files, skipped)
+    result = adjust_intrinsics(views, board, closed_form(views, board, start), colmap_model)
+    require_determined(result, views, board)
+    return result
 
 
 def camera_of_labelled(
@@ -438,32 +455,6 @@ def camera_of_labelled(
     found = adjust_intrinsics(views, board, start, model)
     require_determined(found, views, board)
     return found, adjust_intrinsics(views, board, camera, model, held=True)
-
-
-def _of_one_round(
-    files: Sequence[ImageFile],
-    not_images: Sequence[Skipped],
-    detection: DetectionResult,
-    board: BoardDesign,
-    camera: Camera,
-    colmap_model: str,
-    first: bool,
-) -> tuple[list[ImageObservations], tuple[Skipped, ...], Intrinsics]:
-    """Views of the board, what was skipped, and the intrinsics; in the ``first`` round depths are unknown."""
-    views = board_views(detection.images, board, camera)
-    if not first:
-        views, _ = correct_defocus(views, camera, pattern_of_board(board))
-    shown, repeated = {view.name for view in views}, "the board is in view more than once"
-    without = (
-        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
-        for each in detection.images
-        if each.file.name not in shown
-    )
-    skipped = (*not_images, *detection.skipped, *without)
-    require_views(views, files, skipped)
-    result = adjust_intrinsics(views, board, closed_form(views, board, camera) if first else camera, colmap_model)
-    require_determined(result, views, board)
-    return views, skipped, result
 
 
 def of_chosen_model(
@@ -568,10 +559,6 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
 
 def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
     centres, dots, differ = result.factors.centres, result.factors.dots, result.differ
-    restarted = (
-        "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
-        "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
-    )
     corners = [
         f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, the "
         f"distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
@@ -586,4 +573,4 @@ def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesig
         f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
         "focus and zoom fixed, and the light even": differ,
     }
-    return [restarted] * result.restarted + corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]
+    return corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]

@@ -18,17 +18,14 @@ from stcal.report.text import number
 from stcal.sfm.camera.calibrate import (
     CELLS,
     CORNERS,
-    GRID,
     OUTLIER_WEIGHT,
     CameraCalibration,
     TriedModel,
     mean_residuals,
     residual_rms_px,
 )
-from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
+from stcal.sfm.camera.intrinsics import GRID, Intrinsics, model_parameters
 
-MIN_IN_CELL = 3
-ARROW_SHARE = 0.7  # largest length of a drawn mean residual, as a share of the cell
 ByCorner = Annotated[str, "corner"]
 
 
@@ -262,11 +259,11 @@ def residual_map(result: CameraCalibration) -> Drawing:
     axes = _image_axes(camera)
     mean, weight = mean_residuals(result.intrinsics)
     size, count = np.array([camera.width, camera.height]) / CELLS, weight.sum(0)
-    enough = count >= MIN_IN_CELL
+    enough = count >= 3
     mean = (weight[..., None] * mean).sum(0)[enough] / count[enough, None]
     middle = (np.stack(np.divmod(np.flatnonzero(enough), CELLS[1]), axis=1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
-    times = round_below(ARROW_SHARE * size.min() / longest) if longest else 1.0
+    times = round_below(0.7 * size.min() / longest) if longest else 1.0  # within the cells
     axes.arrows(middle, times * mean, 1.2, INK)
     axes.frame("x, px", "y, px")
     said = f"enlarged {times:g} times; the longest is {longest:.4f} px"

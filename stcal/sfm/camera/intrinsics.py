@@ -1,18 +1,17 @@
 """Intrinsics from views of the dot board: start, and one adjustment over intrinsics, board poses and places of dots."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from stcal.adjust.blocks import Huber, Vector
-from stcal.adjust.components import sigma_factor
+from stcal.adjust.blocks import Huber, Vector, sigma_factor
 from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.design import BoardDesign
-from stcal.errors import ConvergenceError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
 from stcal.geometry.clusters import ByClusters
 from stcal.geometry.least_squares import minimise
@@ -36,35 +35,6 @@ START_DAMPING = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LensState:
-    models: tuple[MetricModel, ...]  # of one folder's board each
-    camera: Camera
-
-    def only(self, names: set[str]) -> "LensState":
-        parts = [_of_images(model, names) for model in self.models]
-        return replace(self, models=tuple(part for part in parts if part.images))
-
-    def cost(self, huber: float) -> float:
-        return sum(image_cost(model, self.camera, huber) for model in self.models)
-
-    def redundancy(self, kept: int) -> int:
-        """Observed coordinates minus unknowns of poses minus ``kept``; dots are observed as often as unknown."""
-        return sum(2 * len(m.image_index) - 6 * len(m.images) for m in self.models) - kept
-
-
-def _of_images(model: MetricModel, names: set[str]) -> MetricModel:
-    """Returns the model with the images of these names alone, and with all its points."""
-    keep = np.array([name in names for name in model.images])
-    seen = model.observed(np.flatnonzero(keep[model.image_index]))
-    return replace(
-        seen,
-        images=tuple(compress(model.images, keep)),
-        camera_from_model=tuple(compress(model.camera_from_model, keep)),
-        image_index=(np.cumsum(keep) - 1)[seen.image_index],
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Board:
     """The board of one folder as drawn: ``places`` (n, 3) of its dots, mm, and how its print may deviate."""
 
@@ -73,67 +43,129 @@ class Board:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LensSetting:
+class Fit:
+    """Camera, board poses and dots at a state of their adjustment, and what is known of them."""
+
+    models: tuple[MetricModel, ...]  # of one folder's board each
+    camera: Camera
+    start: Camera
     basis: np.ndarray  # (16, q)
     weight: np.ndarray  # (q, q) of the vague prior about ``start``
-    start: Camera
     boards: dict[str, Board]
     sigma_mm: float
-    huber: float
+    huber: float = np.inf
 
-    def away(self, camera: Camera) -> np.ndarray:
-        """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
-        return np.linalg.pinv(self.basis) @ (camera.parameters() - self.start.parameters())
+    def of_views(self, names: set[str]) -> "Fit":
+        """Returns the fit with the images of these names alone, and with all of their points."""
+        parts = []
+        for model in self.models:
+            keep = np.array([name in names for name in model.images])
+            if keep.any():
+                seen = model.observed(np.flatnonzero(keep[model.image_index]))
+                images, poses = (tuple(compress(each, keep)) for each in (model.images, model.camera_from_model))
+                index = (np.cumsum(keep) - 1)[seen.image_index]
+                parts.append(replace(seen, images=images, camera_from_model=poses, image_index=index))
+        return replace(self, models=tuple(parts))
 
-    def camera(self, away: Vector) -> Camera:
+    def lengths(self) -> list[np.ndarray]:
+        """Returns by model the lengths (n,) of the residuals over σ."""
+        return [np.linalg.norm(normalised(model, self.camera), axis=1) for model in self.models]
+
+    def cost(self) -> float:
+        return sum(image_cost(model, self.camera, self.huber) for model in self.models)
+
+    def redundancy(self) -> int:
+        """Observed coordinates minus unknowns of poses and camera; dots are observed as often as unknown."""
+        return sum(2 * len(m.image_index) - 6 * len(m.images) for m in self.models) - self.basis.shape[1]
+
+    def camera_at(self, away: Vector) -> Camera:
         """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
         parameters = self.start.parameters() + self.basis @ away.array[0]
         if not ((parameters[:2] > 0).all() and np.isfinite(parameters).all()):  # of no camera: no image agrees with it
             parameters = np.r_[TINY_PX, TINY_PX, np.zeros(len(parameters) - 2)]
         return self.start.with_parameters(parameters)
 
-    @property
-    def kept(self) -> int:
-        return self.basis.shape[1]
+    def at(self, values: Mapping[str, Any]) -> "Fit":
+        """Returns the fit at a state of the unknowns of :meth:`linear`."""
+        moved = (placed(m, values[POSES + m.group], values[DOTS_OF + m.group]) for m in self.models)
+        return replace(self, models=tuple(moved), camera=self.camera_at(values["lens"]))
 
-    def dots_cost(self, state: LensState) -> float:
-        """Returns the χ² of the places of dots by themselves, without the modes of the prints."""
-        off = [(self.boards[model.group], model.xyz_model) for model in state.models]
-        return float(sum(own.modes.costs(xyz - own.places, self.sigma_mm)[0] for own, xyz in off))
+    def linear(self) -> "LinearFit":
+        """Returns the adjustment of all boards linearised about this state."""
+        parts, first = [], 0
+        away = np.linalg.pinv(self.basis) @ (self.camera.parameters() - self.start.parameters())
+        values: dict[str, Any] = {"lens": Vector(away[None])}
+        for model in self.models:
+            a, board = Adjustment(), self.boards[model.group]
+            values[POSES + model.group] = Poses.of(model.camera_from_model)
+            values[DOTS_OF + model.group] = Vector(model.xyz_model)
+            lens = a.block("lens", values["lens"])
+            dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
+            poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
+            cluster, loss = first + model.image_index, Huber(self.huber)
+            reproject(a, model, (dots, poses, lens), self.camera_at, self.basis, cluster=cluster, loss=loss)
+            a.prior(dots, board.places, board.modes.weight(self.sigma_mm))
+            if not parts:
+                a.prior(lens, np.zeros((1, len(self.weight))), self.weight)
+            parts.append(a)
+            first += len(model.images)
+        return LinearFit(Joined(parts, ("lens",)), values, self)
+
+    def robust_minimum(self) -> "Fit":
+        """Returns the fit of least cost, with Huber's limit by its residuals."""
+        begin = self.linear()
+        joined = begin.problem
+        solution = minimise(
+            begin.values,
+            lambda values: LinearFit(joined, values, self),
+            joined.moved,
+            cost=joined.cost,
+            damping=START_DAMPING,
+            settled=EXACTLY,
+            max_steps=MAX_STEPS,
+        )
+        if not solution.converged:  # a direction that hardly changes the images has a large σ
+            move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
+            if not move < CREEPING_PX:
+                raise ConvergenceError(
+                    "E-NO-MINIMUM",
+                    f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
+                    "needed; look at the images, add views that fill the image and are tilted, or choose a simpler "
+                    "--model",
+                )
+        fit = solution.linear.fit
+        return replace(fit, huber=HUBER * max(robust_sigma(np.concatenate(fit.lengths()), 2), LEAST_ROBUST))
 
 
 @dataclass(frozen=True, eq=False)
-class LensNormal:
+class LinearFit(JoinedSolution):
     """The adjustment linearised about a state; only the lens is damped, as dots and poses are optimal for each step."""
 
-    models: tuple[MetricModel, ...]  # at any state
-    setting: LensSetting
-    solution: JoinedSolution
-
-    @classmethod
-    def of(cls, state: LensState, setting: LensSetting) -> "LensNormal":
-        joined, values = _problem(state, setting)
-        return cls(state.models, setting, joined.at(values))
+    begin: Fit  # at any state
 
     @cached_property
-    def state(self) -> LensState:
-        return self._state(self.solution.values)
+    def fit(self) -> Fit:
+        return self.begin.at(self.values)
 
-    @property
-    def cost(self) -> float:
-        return float(self.solution.cost)
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Returns the step of all unknowns, and the predicted gain: none where no projection moves visibly."""
+        step, gain = super().step(damping)
+        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
 
-    def by_photographs(self) -> ByClusters:
-        """Returns the covariance of the lens model's parameters by how the photographs differ."""
-        if not self.setting.kept:
-            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
-        return self.solution.by_clusters(self.solution.problem.parts[0].blocks[LENS])
+    def moved(self, step: np.ndarray) -> Fit:
+        return self.begin.at(self.problem.moved(self.values, step))
+
+    def largest_move(self, step: np.ndarray) -> float:
+        before, after = self.fit, self.moved(step)
+        pairs = zip(before.models, after.models, strict=True)
+        moves = (b.residuals_px(after.camera) - a.residuals_px(before.camera) for a, b in pairs)
+        return max(float(np.abs(move).max()) for move in moves)
 
     def with_found_prints(self) -> tuple[float, dict[str, Board]]:
         """Returns the redundancy of the dots by themselves, and the boards with the amplitudes of their prints."""
-        boards, left, sigma_mm = {}, 0.0, self.setting.sigma_mm
-        for model, part in zip(self.state.models, self.solution.whole, strict=True):
-            board, covariance = self.setting.boards[model.group], part.covariance(part.problem.blocks[DOTS])
+        boards, left, sigma_mm = {}, 0.0, self.begin.sigma_mm
+        for model, part in zip(self.fit.models, self.whole, strict=True):
+            board, covariance = self.begin.boards[model.group], part.covariance(part.problem.blocks[DOTS])
             modes = board.modes.modes
             of_modes = modes.T @ covariance @ modes
             left += len(covariance) - len(of_modes) - float(np.trace(covariance) - np.trace(of_modes)) / sigma_mm**2
@@ -141,79 +173,15 @@ class LensNormal:
             boards[model.group] = replace(board, modes=found)
         return left, boards
 
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of all unknowns, and the predicted gain: none where no projection moves visibly."""
-        step, gain = self.solution.step(damping)
-        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
-
-    def largest_move(self, step: np.ndarray) -> float:
-        new = self.moved(step)
-        pairs = zip(self.state.models, new.models, strict=True)
-        moves = (b.residuals_px(new.camera) - a.residuals_px(self.state.camera) for a, b in pairs)
-        return max(float(np.abs(move).max()) for move in moves)
-
-    def moved(self, step: np.ndarray) -> LensState:
-        return self._state(self.solution.problem.moved(self.solution.values, step))
-
-    def _state(self, values: Mapping[str, Any]) -> LensState:
-        names = [model.group for model in self.models]
-        moved = [placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
-        return LensState(tuple(moved), self.setting.camera(values["lens"]))
-
 
 POSES, DOTS_OF = "poses of ", "dots of "
 LENS, DOTS = 0, 1
-
-
-def _problem(state: LensState, setting: LensSetting) -> tuple[Joined, dict[str, Any]]:
-    """Returns the adjustment of all boards from a state, and its unknowns there."""
-    parts, first = [], 0
-    values: dict[str, Any] = {"lens": Vector(setting.away(state.camera)[None])}
-    for model in state.models:
-        a, board = Adjustment(), setting.boards[model.group]
-        values[POSES + model.group] = Poses.of(model.camera_from_model)
-        values[DOTS_OF + model.group] = Vector(model.xyz_model)
-        lens = a.block("lens", values["lens"])
-        dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
-        poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
-        cluster, loss = first + model.image_index, Huber(setting.huber)
-        reproject(a, model, (dots, poses, lens), setting.camera, setting.basis, cluster=cluster, loss=loss)
-        a.prior(dots, board.places, board.modes.weight(setting.sigma_mm))
-        if not parts:
-            a.prior(lens, np.zeros((1, setting.kept)), setting.weight)
-        parts.append(a)
-        first += len(model.images)
-    return Joined(parts, ("lens",)), values
-
-
-def minimum(state: LensState, setting: LensSetting) -> LensState:
-    joined, values = _problem(state, setting)
-    solution = minimise(
-        values,
-        lambda at: LensNormal(state.models, setting, joined.at(at)),
-        joined.moved,
-        cost=joined.cost,
-        damping=START_DAMPING,
-        settled=EXACTLY,
-        max_steps=MAX_STEPS,
-    )
-    if not solution.converged:  # a direction that hardly changes the images has a large σ
-        move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
-        if not move < CREEPING_PX:
-            raise ConvergenceError(
-                "E-NO-MINIMUM",
-                f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
-                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
-            )
-    return solution.linear.state
-
 
 START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45  # over the longer side: between wide-angle and portrait; equidistant, 127°
 FOCAL_LIMITS = (0.2, 50.0)  # of the focal length over the longer image side; closed forms outside of them are noise
 TRIED_FOCALS, TRIED_VIEWS = tuple(np.geomspace(0.4, 12.8, 11).tolist()), 12
 """Focal lengths over the longer side that are tried where the closed form gives none, a factor of √2 apart, and the
 number of views, those of most dots, by which they are judged."""
-SETTLING_PASSES = 3
 
 
 def start_camera(width: int, height: int, colmap_model: str) -> Camera:
@@ -230,16 +198,16 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
     it."""
     if camera.fisheye:
         return camera
-    coefficients, constants, rows = [], [], []
+    conics = []
     for image in observations:
         h = _homography(image, board, camera)
         first, second = h[:, 0], h[:, 1]
         first, second = np.array([first, second]) / np.sqrt(np.linalg.norm(first[:2]) * np.linalg.norm(second[:2]))
-        coefficients += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
-        constants += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
-        rows += [_conic(first, second), _conic(first, first) - _conic(second, second)]
-    square = float(np.dot(coefficients, coefficients))
-    inverse = float(np.dot(coefficients, constants)) / square if square else 0.0  # (assumed focal / focal)²
+        conics += [_conic(first, second), _conic(first, first) - _conic(second, second)]
+    rows = np.array(conics)
+    equal, constants = rows[:, 0] + rows[:, 1], -rows[:, 4]
+    square = float(equal @ equal)
+    inverse = float(equal @ constants) / square if square else 0.0  # (assumed focal / focal)²
     low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
     largest = sorted(observations, key=len)[-TRIED_VIEWS:]
 
@@ -256,7 +224,7 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
     else:  # the one of several that fits best, by the mean over views of the RMS distance
         longer = max(camera.width, camera.height)
         usual = min((replace(camera, focal=np.full(2, share * longer)) for share in TRIED_FOCALS), key=misfit_px)
-    free = _of_any_pixels(np.array(rows), camera, low, high) if len(observations) >= LEAST_FREE else None
+    free = _of_any_pixels(rows, camera, low, high) if len(observations) >= LEAST_FREE else None
     return free if free is not None and misfit_px(free) < FAR_BETTER * misfit_px(usual) else usual
 
 
@@ -329,7 +297,7 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
     chosen = [0] * len(fields)
     order = sorted(range(len(fields)), key=lambda i: -np.count_nonzero(fields[i][0]))
     total = np.zeros_like(fields[0][0])
-    for turn in range(SETTLING_PASSES):
+    for turn in range(3):
         for i in order:
             if turn:
                 total -= fields[i][chosen[i]]
@@ -339,7 +307,6 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
 
 
 MAX_ROUNDS = 20
-LEAST_ROUNDS = 2
 SETTLED_FACTOR = 0.005  # largest relative change of a variance component in the last round
 SETTLED_SHIFT_PX = 1e-5  # largest change of an eccentricity in the last round, px
 LEAST_ROBUST = 1e-6  # smallest robust σ of normalised residuals, for exact data
@@ -371,8 +338,7 @@ class Intrinsics:
     huber: float  # length of a normalised residual beyond which its weight decreases
     redundancy: int
     settled: bool  # whether σ and eccentricities converged within :data:`MAX_ROUNDS`
-    solution: tuple[LensState, LensSetting]  # from which solutions of some of the views start
-    restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
+    fit: Fit  # from which solutions of some of the views start
 
     def sigma(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
@@ -382,7 +348,7 @@ class Intrinsics:
 
     def prints(self) -> dict[str, tuple[float, float]]:
         """Returns by how much more the board of each folder is stretched along its rows than across, and its shear."""
-        boards = self.solution[1].boards
+        boards = self.fit.boards
         return {m.group: boards[m.group].modes.stretch(m.xyz_model - boards[m.group].places) for m in self.models}
 
     def weights(self) -> list[np.ndarray]:
@@ -420,47 +386,36 @@ def adjust_intrinsics(
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for view in members for label in view.labels}))
         models.append(model_of_views(folder, labels, members, board, start))
-    state = LensState(tuple(models), start)
-    setting = LensSetting(
+    fit = Fit(
+        models=tuple(models),
+        camera=start,
+        start=start,
         basis=basis,
         weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
-        start=start,
         boards={m.group: Board(m.xyz_model, PrintModes.of(m.xyz_model[:, :2])) for m in models},
         sigma_mm=board.sigma_mm,
-        huber=np.inf,
     )
-    try:
-        return _adjusted(state, setting, board, colmap_model)
-    except ConvergenceError:
-        if held:
-            raise
-    # A focal length far off makes the rest of the lens wander: it comes first, alone, and one for both axes.
-    focal, weight = intrinsic_basis("SIMPLE_PINHOLE")[:, :1], np.full((1, 1), start.focal[0] ** -2.0)
-    alone = replace(setting, basis=focal, weight=weight)
-    for _ in range(FOCAL_ROUNDS):
-        state, alone = _robust_minimum(state, alone)
-    return replace(_adjusted(state, setting, board, colmap_model), restarted=True)
+    return _adjusted(fit, board, colmap_model)
 
 
-def _intrinsics(last: LensNormal, colmap_model: str, factors: BoardSigmaFactors, settled: bool) -> Intrinsics:
-    state, setting, by_photographs = last.state, last.setting, last.by_photographs()
+def _intrinsics(last: LinearFit, colmap_model: str, factors: BoardSigmaFactors, settled: bool) -> Intrinsics:
+    fit, spread = last.fit, ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
+    if fit.basis.shape[1]:
+        spread = last.by_clusters(last.problem.parts[0].blocks[LENS])
+    by_photographs = {each.name: getattr(spread, each.name) for each in fields(spread)}
     return Intrinsics(
-        camera=state.camera,
+        camera=fit.camera,
         colmap_model=colmap_model,
-        covariance=by_photographs.covariance,
-        independent=by_photographs.independent,
-        differ=by_photographs.differ,
-        freedom=by_photographs.freedom,
-        models=state.models,
+        **by_photographs,
+        models=fit.models,
         factors=factors,
-        huber=setting.huber,
-        redundancy=state.redundancy(setting.kept),
+        huber=fit.huber,
+        redundancy=fit.redundancy(),
         settled=settled,
-        solution=(state, setting),
+        fit=fit,
     )
 
 
-FOCAL_ROUNDS = 2
 MOST_STEPS, NO_GAIN = 10, 0.1
 """Most steps from the solution of all views to that of some of them, and the predicted decrease of the cost at which
 they end, in σ²: no parameter is then off by more than a third of its σ."""
@@ -469,46 +424,37 @@ they end, in σ²: no parameter is then off by more than a third of its σ."""
 def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
     """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
     and the factors of σ by one step of their own; by :func:`adjust_intrinsics` where the steps do not settle."""
-    whole, setting = result.solution
-    state = whole.only({view.name for view in views})
+    fit = result.fit.of_views({view.name for view in views})
     for _ in range(MOST_STEPS):
-        last = LensNormal.of(state, setting)
+        last = fit.linear()
         step, gain = last.step(0.0)
         if gain < NO_GAIN:
             return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
-        state = last.moved(step)
-        if not np.isfinite(state.cost(setting.huber)):
+        fit = last.moved(step)
+        if not np.isfinite(fit.cost()):
             break
     return adjust_intrinsics(views, board, result.camera, result.colmap_model)
 
 
-def _adjusted(state: LensState, setting: LensSetting, board: BoardDesign, colmap_model: str) -> Intrinsics:
+def _adjusted(fit: Fit, board: BoardDesign, colmap_model: str) -> Intrinsics:
     """Alternates minimisation and estimation of σ, amplitudes of the prints, and eccentricity."""
-    detected_covariance, factors = [m.covariance_px2 for m in state.models], BoardSigmaFactors()
+    detected_covariance, factors = [m.covariance_px2 for m in fit.models], BoardSigmaFactors()
     for round_index in range(MAX_ROUNDS):
-        before = state
-        state = _weighted(state, detected_covariance, factors, board)
-        shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
-        setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
-        state, setting = _robust_minimum(state, setting)
-        last = LensNormal.of(state, setting)
+        before = fit
+        fit = replace(_weighted(fit, detected_covariance, factors, board), sigma_mm=factors.dots * board.sigma_mm)
+        shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(fit.models, before.models, strict=True))
+        fit = fit.robust_minimum()
+        last = fit.linear()
         updated, boards = _updated_factors(last, factors)
         changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
-            boards[folder].modes.amplitude / old.modes.amplitude for folder, old in setting.boards.items()
+            boards[folder].modes.amplitude / old.modes.amplitude for folder, old in fit.boards.items()
         ]
-        factors, setting = updated, replace(setting, boards=boards)
+        factors, fit = updated, replace(fit, boards=boards)
         change = float(np.abs(np.log(changes)).max())
-        settled = bool(round_index >= LEAST_ROUNDS and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        settled = bool(round_index >= 2 and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
             break
     return _intrinsics(last, colmap_model, factors, settled)
-
-
-def _robust_minimum(state: LensState, setting: LensSetting) -> tuple[LensState, LensSetting]:
-    """Returns the state of least cost, and the setting with Huber's limit by its residuals."""
-    state = minimum(state, setting)
-    length = np.linalg.norm(np.concatenate([normalised(model, state.camera) for model in state.models]), axis=1)
-    return state, replace(setting, huber=HUBER * max(robust_sigma(length, 2), LEAST_ROBUST))
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
@@ -531,37 +477,81 @@ def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDe
     )
 
 
-def _weighted(state: LensState, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> LensState:
-    """Returns the state with scaled σ of the centres, larger ones in loud photographs, and updated eccentricity."""
+def _weighted(fit: Fit, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> Fit:
+    """Returns the fit with scaled σ of the centres, larger ones in photographs whose residuals exceed those of most by
+    far, and updated eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
-    equal = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(state.models, own, strict=True)]
-    loud = _loudness(replace(state, models=tuple(equal)))
-    models = tuple(
-        replace(
-            model,
-            shift_px=eccentricity_px(model, state.camera, radius, 1.0),
-            covariance_px2=times[model.image_index, None, None] ** 2 * model.covariance_px2,
-        )
-        for model, times in zip(equal, loud, strict=True)
-    )
-    return replace(state, models=models)
-
-
-def _loudness(state: LensState) -> list[np.ndarray]:
-    """Returns by model the factor on σ of each photograph: above 1 where its residuals exceed those of most by far."""
-    sizes = []
-    for model in state.models:
-        length = np.linalg.norm(normalised(model, state.camera), axis=1)
-        sizes.append(np.array([robust_sigma(length[rows], 2) for rows in model.rows_by_image()]))
+    scaled = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(fit.models, own, strict=True)]
+    lengths = replace(fit, models=tuple(scaled)).lengths()
+    sizes = [
+        np.array([robust_sigma(length[rows], 2) for rows in model.rows_by_image()])
+        for model, length in zip(scaled, lengths, strict=True)
+    ]
     usual = LOUD * max(float(np.median(np.concatenate(sizes))), LEAST_ROBUST)
-    return [np.maximum(own / usual, 1.0) for own in sizes]
+    models = []
+    for model, size in zip(scaled, sizes, strict=True):
+        times, shift = np.maximum(size / usual, 1.0), eccentricity_px(model, fit.camera, radius, 1.0)
+        covariance = times[model.image_index, None, None] ** 2 * model.covariance_px2
+        models.append(replace(model, shift_px=shift, covariance_px2=covariance))
+    return replace(fit, models=tuple(models))
 
 
-def _updated_factors(last: LensNormal, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
+def _updated_factors(last: LinearFit, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
     """Returns variance components of centres and dots (Förstner 1979), and the boards with their amplitudes."""
-    state, setting = last.state, last.setting
-    dots_left, boards = last.with_found_prints()
-    dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left
-    if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(LEAST_DOTS, dots * sigma_factor(setting.dots_cost(state), dots_left))
-    return BoardSigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards
+    fit, (dots_left, boards) = last.fit, last.with_found_prints()
+    dots, image_redundancy = factors.dots, fit.redundancy() - dots_left
+    if dots_left > MIN_BOARD_REDUNDANCY:  # by the χ² of the places of dots by themselves, without the modes of prints
+        off = [(fit.boards[model.group], model.xyz_model) for model in fit.models]
+        square = float(sum(own.modes.costs(xyz - own.places, fit.sigma_mm)[0] for own, xyz in off))
+        dots = max(LEAST_DOTS, dots * sigma_factor(square, dots_left))
+    return BoardSigmaFactors(factors.centres * sigma_factor(fit.cost(), image_redundancy), dots), boards
+
+
+GRID = (13, 9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectionSigma:
+    sigma_px: np.ndarray  # (n,) per axis at :func:`image_grid`, up to a rotation of the camera, which poses absorb
+    reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
+    corner_sigma_px: np.ndarray  # (4,)
+
+
+def image_grid(camera: Camera) -> np.ndarray:
+    """Returns a grid of places over the whole image, including the corners, (n, 2) px."""
+    x, y = np.linspace(0, camera.width - 1, GRID[0]), np.linspace(0, camera.height - 1, GRID[1])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
+    """Returns derivatives (n, 2, q) of projections by the parameters, up to a rotation of the camera."""
+    try:
+        ideal = camera.normalised_from_pixel(image_grid(camera))
+    except ConvergenceError as error:
+        raise DegenerateError(
+            "E-CAMERA-FOLDED",
+            "camera: the distortion folds over in a part of the image without dots; add views that fill the image "
+            "to its corners, or choose a --model with fewer parameters",
+        ) from error
+    jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
+    x, y = ideal.T
+    rotation = np.stack([np.stack([-x * y, 1 + x * x, -y], axis=-1), np.stack([-1 - y * y, x * y, x], axis=-1)], axis=1)
+    by_ideal = camera.pixel_jacobian(ideal)
+    by_rotation = (by_ideal @ rotation).reshape(-1, 3)
+    flat = jacobian.reshape(len(by_rotation), -1)
+    return (flat - by_rotation @ np.linalg.lstsq(by_rotation, flat, rcond=None)[0]).reshape(jacobian.shape)
+
+
+def projection_sigma(result: Intrinsics) -> ProjectionSigma:
+    """Returns σ of projections over the image, and how far dots reach towards its corners."""
+    camera = result.camera
+    xy = image_grid(camera)
+    jacobian = projection_jacobian(camera, result.colmap_model)
+    sigma = np.sqrt(np.einsum("nip,pq,niq->n", jacobian, result.covariance, jacobian) / 2)
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2
+    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+    dots = np.concatenate([m.measured_px for m in result.models]) - middle
+    # The smaller of the two coordinates counts: a dot at the side of the image is not in its corner.
+    reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
+    corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
+    return ProjectionSigma(sigma, np.maximum(reach, 0), sigma[corner_index])

@@ -13,7 +13,7 @@ from stcal.geometry.rigid import align_similarity, skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.network import Network
+from stcal.sfm.adjust.refine import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
 from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
 from stcal.sfm.checks.significance import Trial, assess

@@ -16,7 +16,7 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
+from stcal.sfm.adjust.refine import Network, ScoreTest, solve_score
 from stcal.sfm.checks.image_checks import NO_ELLIPSES, by_eccentricity, by_motion
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, apart
 from stcal.sfm.data.as_drawn import FAR_DEG, turned_faces

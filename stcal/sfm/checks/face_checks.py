@@ -18,7 +18,7 @@ from stcal.parallel import run_in_order
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
-from stcal.sfm.adjust.network import Network
+from stcal.sfm.adjust.refine import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
 from stcal.sfm.checks.significance import Guilt, Trial, assess
 from stcal.sfm.data.group_model import MetricModel

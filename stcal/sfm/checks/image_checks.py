@@ -15,7 +15,7 @@ from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
+from stcal.sfm.adjust.refine import Network, ScoreTest, solve_score
 from stcal.sfm.checks.significance import (
     FREE,
     MOST_SIGMAS,
@@ -87,7 +87,7 @@ def camera_check(
 
 
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns :meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
+    """Returns :meth:`~stcal.sfm.adjust.refine.Network.score` of parameters that all groups have in common."""
     normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
 

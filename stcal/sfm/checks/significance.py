@@ -16,9 +16,7 @@ from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import ratio_limit
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_score
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.refine import Network, ScoreTest, adjust, eccentricity_px, find_scale, free_network, solve_score
 from stcal.sfm.data.group_model import GroupModel, WorldModel
 from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 

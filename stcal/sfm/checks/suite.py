@@ -22,10 +22,8 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, image_sigma_factors, with_sigma
-from stcal.sfm.adjust.network import Network, free_network, solve_score
-from stcal.sfm.adjust.refine import adjust
+from stcal.sfm.adjust.refine import MIN_DOTS, Network, adjust, free_network, known_points, solve_score
 from stcal.sfm.adjust.rims import Rim, find_rims
-from stcal.sfm.adjust.scale import MIN_DOTS, known_points
 from stcal.sfm.checks import board_checks, face_checks, image_checks
 from stcal.sfm.checks.causes import ANOTHER_CAMERA, whole_set_cause
 from stcal.sfm.checks.significance import Trial, assess

@@ -25,8 +25,7 @@ from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, on_luminous_surface, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, write_copy
 from stcal.sfm.mapping.colmap import pycolmap

@@ -38,11 +38,6 @@ except ImportError as error:
     raise InputError("E-EXTRA-MISSING", needed) from error
 
 WIDEST_PX = 1280  # largest width of the picture that is sent
-JPEG_QUALITY = 80
-RATE_OVER = 20  # number of pictures over which the rate is taken
-LOOK_S = 0.01  # interval at which a page's connection looks for a newer picture, s
-CONNECTIONS = 16  # number of connections at a time; each may hold an image of the largest size
-END_S = 2  # time in which pages receive the last picture at the end, s
 OWN_HOST = re.compile(r"(localhost|127\.[\d.]+|\[::1\])(:\d+)?")
 """Host of a request to this machine. Without a token, any other name could be one that a page of another origin has
 pointed to this machine (DNS rebinding)."""
@@ -64,7 +59,7 @@ class LiveService:
 
     def follow(self, frames: Iterable[np.ndarray], tracker: Tracker) -> Iterator[dict]:
         """Measures grey pictures (height, width), uint8, puts each on the page, and yields its content."""
-        times: deque[float] = deque(maxlen=RATE_OVER)
+        times: deque[float] = deque(maxlen=20)
         for number, frame in enumerate(frames, 1):
             began = time.monotonic()
             with self._measuring, one_thread():
@@ -81,7 +76,7 @@ class LiveService:
                 "poses": poses_file(result).content(),
             }
             picture = drawn(frame, centres, pose, tracker)
-            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
             self.newest = content | {"jpeg": b64encode(jpeg).decode()}
             yield content
         self.ended = True
@@ -125,7 +120,7 @@ class LiveService:
                 elif ended:
                     yield "event: ended\ndata: {}\n\n"
                     return
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(0.01)
 
         return StreamingResponse(messages(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
@@ -157,7 +152,8 @@ def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> I
         if not (ip_address(address.partition("%")[0]).is_loopback or service.token):
             raise InputError("E-OPTION-NEEDS", f"--host {host}: other machines reach it; give a --token")
         config = uvicorn.Config(service.app, lifespan="off", ws="none", log_config=None, log_level="error")
-        config.limit_concurrency, config.timeout_graceful_shutdown = CONNECTIONS, END_S
+        config.limit_concurrency = 16  # each connection may hold an image of the largest size
+        config.timeout_graceful_shutdown = 2  # s in which pages receive the last picture
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)  # signals come to this one
         thread.start()

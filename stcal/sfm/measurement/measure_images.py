@@ -3,18 +3,15 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.special import chdtri
 from threadpoolctl import ThreadpoolController
 
 from stcal.boards.finders import why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
-from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -23,27 +20,16 @@ from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fine, require_grey, run_on_images
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
+from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
+from stcal.sfm.detect import predict
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
-from stcal.sfm.detect.predict import (
-    PredictedCircles,
-    common_shift,
-    contradicted_notes,
-    contradictions,
-    measure_near,
-    measure_predicted,
-    missed_notes,
-    predict_circles,
-)
-from stcal.sfm.measurement.known_target import TargetCircles, read_target
 from stcal.sfm.measurement.pose import (
-    FAILED,
-    MIN_CIRCLES,
     PoseOptions,
     TargetPose,
     common_errors,
@@ -71,32 +57,24 @@ class Tracker:
 
     Parameters
     ----------
-    target : TargetCircles
-        Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
-    camera : Camera
-        Camera from :func:`stcal.load_camera`, or of the run: ``result.refined_camera or result.camera``. Its
+    target : Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
+    camera : Camera from :func:`stcal.load_camera`, or of the run: ``result.refined_camera or result.camera``. Its
         covariance, if any, is part of the poses' covariances.
-    board : BoardDesign, optional
-        A dot board that may be in view, so that its dots are not taken for circles of the target.
-    pose : PoseOptions, optional
-        The defaults if None.
-    ellipses : EllipseOptions, optional
-        Options of the search; the defaults if None.
+    board : A dot board that may be in view, so that its dots are not taken for circles of the target.
+    pose : The defaults if None.
+    ellipses : Options of the search; the defaults if None.
 
     Attributes
     ----------
-    notes : tuple of str
-        Circles of the last image that were left out, with reasons.
-    searched : bool
-        Whether the last image was searched as a whole.
-    recent : tuple of Rigid
-        camera_from_target of the last one or two images, from which the next is predicted; empty before the first image
-        and after a cut. Another tracker of the same target continues the sequence if its ``recent`` is set to them.
+    notes : Circles of the last image that were left out, with reasons.
+    searched : Whether the last image was searched as a whole.
+    recent : camera_from_target of the last one or two images, from which the next is predicted; empty before the first
+        image and after a cut. Another tracker of the same target continues the sequence if its ``recent`` is set to
+        them.
 
     Raises
     ------
-    InputError
-        If the target has no design.
+    InputError : If the target has no design.
     """
 
     def __init__(
@@ -133,24 +111,18 @@ class Tracker:
 
         Parameters
         ----------
-        image : (height, width) array, uint8 or uint16
-            Grey values of the unprocessed image.
-        name : str
-            Name of the image, for messages.
+        image : (height, width) grey values of the unprocessed image, uint8 or uint16.
+        name : Name of the image, for messages.
 
         Returns
         -------
-        TargetPose
-            Pose in mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
+        TargetPose : Pose in mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
 
         Raises
         ------
-        InputError
-            If the image is not grey, or not of the camera's size.
-        DetectionError
-            If no face of the target is seen.
-        StcalError
-            If the circles give no pose. The next image is then searched as a whole.
+        InputError : If the image is not grey, or not of the camera's size.
+        DetectionError : If no face of the target is seen.
+        StcalError : If the circles give no pose. The next image is then searched as a whole.
         """
         with self._threads.limit(limits=1):
             labelled, pose = self.observe(image, name)
@@ -194,8 +166,8 @@ class Tracker:
         predicted = self._predicted(expected, camera, (), MAX_TRIED_TILT_RAD)
         if len(predicted.labels) < MIN_FOUND:
             return None
-        predicted = predicted.shifted(common_shift(grey_8bit(image), predicted))
-        labels, centres = measure_near(grey_fine(image), camera, predicted)
+        predicted = predicted.shifted(predict.common_shift(grey_8bit(image), predicted))
+        labels, centres = predict.measure_near(grey_fine(image), camera, predicted)
         if len(labels) < max(MIN_FOUND, MIN_SHARE * len(predicted.labels)):
             return None
         labelled = labelled_image(name, "", labels, centres, ())
@@ -212,46 +184,38 @@ class Tracker:
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
-        wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
-        seen = seen.without(wrong, contradicted_notes(wrong))
+        wrong = predict.contradictions(
+            self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera
+        )
+        seen = seen.without(wrong, predict.contradicted_notes(wrong))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
-        measured = measure_predicted(image, camera, predicted, self.ellipses)
-        missed = missed_notes(measured.missed)
+        measured = predict.measure_predicted(image, camera, predicted, self.ellipses)
+        missed = predict.missed_notes(measured.missed)
         if not measured.labels:
             return replace(seen, notes=(*seen.notes, *missed))
         return seen.plus(measured.labels, measured.centres, missed)
 
-    def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
-        return predict_circles(pose, self._planes, seen, self._patterns, camera, max_tilt_rad)
+    def _predicted(
+        self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float
+    ) -> predict.PredictedCircles:
+        return predict.predict_circles(pose, self._planes, seen, self._patterns, camera, max_tilt_rad)
 
     def _pose(self, seen: ImageObservations, camera: Camera) -> TargetPose | StcalError:
         sharp = correct_defocus([seen], camera, self._patterns)[0][0]
         return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
 
 
-MOST_TRIED = 5  # largest number of images, those of most circles, in which mistakes in the camera file are looked for
-
-
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
     """Options of :func:`measure`.
 
-    Parameters
-    ----------
-    pose : PoseOptions
-        Options of the pose of a single image.
-    previous : bool
-        Whether an ambiguous pose is decided by that of the image before, by name and in the same folder.
-    sequence : bool
-        Whether the images of each folder follow each other, by name. The target is then looked for at its predicted
-        place, and in the whole image only if it is not there; see :class:`stcal.sfm.Tracker`. An
-        ambiguous pose is decided by the one before.
-    ellipses : EllipseOptions
-        Options of detection.
-    workers : int, optional
-        Number of processes; one per core if None.
+    ``pose`` : of the pose of a single image; ``previous`` : whether an ambiguous pose is decided by that of the image
+    before, by name and in the same folder; ``sequence`` : whether the images of each folder follow each other, by name:
+    the target is then looked for at its predicted place, and in the whole image only if it is not there, as by
+    :class:`stcal.sfm.Tracker`, and an ambiguous pose is decided by the one before; ``ellipses`` : options of detection;
+    ``workers`` : number of processes; one per core if None.
     """
 
     pose: PoseOptions = field(default_factory=PoseOptions)
@@ -284,14 +248,9 @@ class MeasureResult(Brief):
     intrinsics_held: bool  # whether the intrinsics were taken as exact
     common: np.ndarray  # (m, 6, r) of the poses, see :func:`stcal.sfm.measurement.pose.common_errors`
     searched: int | None = None  # number of images of a sequence that were searched as a whole
-    mistakes: tuple[str, ...] = ()  # in the camera file, each of which explains why poses do not fit
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
-
-    def remedy(self, otherwise: str) -> str:
-        """Returns what to correct where poses do not fit: the camera file, if that explains it."""
-        return f"{' or '.join(self.mistakes)}; give that of these images" if self.mistakes else otherwise
 
 
 @require_arguments
@@ -312,35 +271,25 @@ def measure(
 
     Parameters
     ----------
-    images : path
-        Folder of photographs, with its subfolders.
-    camera : Camera or path
-        Camera from :func:`stcal.load_camera`, its file, or of the run: ``result.refined_camera or result.camera``. Its
-        covariance, if any, is part of the poses' covariances.
-    target : TargetCircles or path
-        Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
-    design : TargetDesign or path, optional
-        Design with radii and polarity, for detection and labels, or its ``target.toml``; that of the circles, or the
-        reference design, if None.
-    board : BoardDesign, optional
-        A dot board that may be in view, so that its dots are not taken for circles of the target.
-    options : MeasureOptions, optional
-        The defaults if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    images : Folder of photographs, with its subfolders.
+    camera : Camera from :func:`stcal.load_camera`, its file, or of the run: ``result.refined_camera or result.camera``.
+        Its covariance, if any, is part of the poses' covariances.
+    target : Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
+    design : Design with radii and polarity, for detection and labels, or its ``target.toml``; that of the circles, or
+        the reference design, if None.
+    board : A dot board that may be in view, so that its dots are not taken for circles of the target.
+    options : The defaults if None.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    MeasureResult
-        camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left perturbation
-        in the camera frame; and the images left out, with reasons.
+    MeasureResult : camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left
+        perturbation in the camera frame; and the images left out, with reasons.
 
     Raises
     ------
-    InputError
-        If no image is usable, or the camera file does not belong to the images.
-    DetectionError
-        If no image shows a face.
+    InputError : If no image is usable, or the camera file does not belong to the images.
+    DetectionError : If no image shows a face.
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     if design is None and isinstance(target, TargetCircles):
@@ -369,10 +318,10 @@ def measure(
         printed = design.with_faces(printed=True).faces
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
-        remedy = result.remedy("check target.toml (radii, polarity), faces.json and the exposure")
         raise DetectionError(
             "E-MEASURE-NONE",
-            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; {remedy}",
+            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; check "
+            "target.toml (radii, polarity), camera file, faces.json and the exposure",
         )
     return result
 
@@ -396,37 +345,7 @@ def measure_labelled(
                 pose = resolved(pose, before.camera_from_target)
             outcomes.append(_outcome(image.name, pose, notes[image.name]))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    result = _result_of(outcomes, target, options, prior)
-    shown = [image.observations for image in images if len(image.observations) >= MIN_CIRCLES]
-    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) < len(shown):
-        result = replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
-    return result
-
-
-def _mistakes(
-    images: Sequence[ImageObservations], camera: Camera, target: TargetCircles, options: PoseOptions
-) -> tuple[str, ...]:
-    """Returns the mistakes in the camera file without which most of the images pass the test of their fit."""
-
-    def misfit(own: Camera) -> float:
-        poses = [measured_pose(image, own, target, options) for image in images]
-        passed = [p.chi2 / chdtri(p.redundancy, FAILED) if isinstance(p, TargetPose) else np.inf for p in poses]
-        return float(np.median(passed))
-
-    def times(k: float) -> Camera:
-        return replace(camera, focal=k * camera.focal, centre=k * (camera.centre + 0.5) - 0.5)
-
-    middle = np.array([camera.width - 1, camera.height - 1]) / 2
-    whole, other = "the camera file is of whole images, and these are cut out of them", not camera.fisheye
-    kind = "fisheye" if other else "perspective"
-    lens = camera.width, camera.height, camera.focal, camera.centre, camera.distortion
-    candidates = [
-        Candidate(whole, lambda: replace(camera, centre=middle)),
-        Candidate(f"the camera file is of a {kind} lens", lambda: Camera(*lens, other), 1),
-        Candidate("the distortion of the camera file is wrong", lambda: replace(camera, distortion=np.zeros(8)), 1),
-        *(Candidate(f"the camera file is of images {1 / k:g} times as wide", partial(times, k), 2) for k in (0.5, 2.0)),
-    ]
-    return tuple(each.words for each, _ in explain(candidates, misfit, 1.0))
+    return _result_of(outcomes, target, options, prior)
 
 
 def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[MeasureResult, np.ndarray]:
@@ -436,15 +355,15 @@ def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[Measure
 
 
 def _followed(
-    files: Sequence[ImageFile], camera_model: CameraModel, target, board, options, step: Callable[[object], None]
+    files: Sequence[ImageFile], model: CameraModel, target, board, options, step: Callable[[object], None]
 ) -> tuple[list[MeasuredImage | Skipped], int]:
     """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched."""
-    camera, size_from = sized_by(camera_model, list(files))
+    camera, size_from = sized_by(model, list(files))
     folders: dict[str, list[ImageFile]] = {}
     for file in sorted(files, key=lambda each: each.name):
         folders.setdefault(file.group, []).append(file)
-    model = replace(camera_model, width=camera.width, height=camera.height)
-    jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
+    setting = target, replace(model, width=camera.width, height=camera.height), board, options.pose, options.ellipses
+    jobs = [(own, setting, camera, size_from) for own in folders.values()]
     followed: dict[int, tuple[list[MeasuredImage | Skipped], int]] = {}
     for i, found in run_on_images(_follow_folder, jobs, options.workers):
         followed[i] = found
@@ -454,24 +373,21 @@ def _followed(
 
 
 def _follow_folder(
-    files: Sequence[ImageFile], model: CameraModel, camera: Camera, size_from: str, target, board, options
+    files: Sequence[ImageFile], setting: tuple, camera: Camera, size_from: str
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    tracker = Tracker(target, model, board, options.pose, options.ellipses)
+    tracker, searched = Tracker(*setting), 0
     outcomes: list[MeasuredImage | Skipped] = []
     name_of_digest: dict[str, str] = {}
-    searched = 0
     for file in files:
-        loaded = load_image(file, camera, size_from)
-        if isinstance(loaded, Skipped):
-            outcomes.append(loaded)
-            continue
-        data, image = loaded
-        first = name_of_digest.setdefault(hashlib.sha256(data).hexdigest(), file.name)
-        if first != file.name:
-            outcomes.append(copy_of(file, first))
-            continue
-        outcome, _ = _observed(tracker, image, file.name)
-        searched += tracker.searched
+        outcome = load_image(file, camera, size_from)
+        if not isinstance(outcome, Skipped):
+            data, image = outcome
+            first = name_of_digest.setdefault(hashlib.sha256(data).hexdigest(), file.name)
+            if first == file.name:
+                outcome, _ = _observed(tracker, image, file.name)
+                searched += tracker.searched
+            else:
+                outcome = copy_of(file, first)
         outcomes.append(outcome)
     return outcomes, searched
 

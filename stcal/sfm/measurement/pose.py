@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, freeze, frozen, require_fields, rms
-from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import (
     MAX_OUTLIER_SHARE,
@@ -29,9 +29,10 @@ from stcal.geometry.plane import (
 from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, circle_labels, parse_labels
+from stcal.sfm.adjust.equations import coordinates
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
-from stcal.sfm.measurement.known_target import TargetCircles
 
 SETTLED = 1e-4
 """Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two
@@ -66,7 +67,7 @@ class PoseProblem:
     def without(self, bad: np.ndarray, outliers: list[Outlier]) -> "PoseProblem":
         """Returns the problem without the circles of a mask (n,), which are ``outliers``."""
         keep = np.flatnonzero(~bad)
-        rows = (3 * keep[:, None] + np.arange(3)).ravel()
+        rows = coordinates(keep)
         by_circle = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
         return replace(
             self,
@@ -126,27 +127,24 @@ def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple
         )
     reasons = []
     for face in by_size:
-        if len(faces[face]) >= MIN_CIRCLES:
-            try:
-                pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
-            except DegenerateError as error:
-                reasons.append(error)
-                continue
-            return Poses.of([pose]), target.target_from_plane[face]
+        rows, target_from_plane = faces[face], target.target_from_plane[face]
+        if len(rows) < MIN_CIRCLES:
+            break
+        plane_from_target = target_from_plane.inverse()
+        xy = (plane_from_target @ problem.xyz[rows])[:, :2]
+        long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+        if broad < MIN_BREADTH * long:
+            reasons.append(f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line")
+            continue
+        try:
+            pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
+        except DegenerateError as error:
+            reasons.append(str(error))
+            continue
+        if (problem.xyz @ pose.rotation[2] + pose.translation[2] > 0).all():
+            return Poses.of([pose]), target_from_plane
+        reasons.append("its circles would be behind the camera; check their labels")
     raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
-
-
-def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid:
-    plane_from_target = target_from_plane.inverse()
-    xy = (plane_from_target @ problem.xyz[rows])[:, :2]
-    long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
-    if broad < MIN_BREADTH * long:
-        reason = f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
-        raise DegenerateError("E-MEASURE-AMBIGUOUS", reason)
-    pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
-    if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
-        raise DegenerateError("E-MEASURE-AMBIGUOUS", "its circles would be behind the camera; check their labels")
-    return pose
 
 
 def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, where: str) -> tuple[Minima, PoseProblem]:
@@ -214,22 +212,16 @@ def covariance_of_likelihood(
         image_pose = mirrored(pose, plane)
         step_to_mirrored = image_pose.difference(pose)[0]
         square = float(step_to_mirrored @ np.linalg.solve(covariance, step_to_mirrored))
-        delta = _best_of_tilt(problem, image_pose, plane, whiten) - least
+        residual, image = problem.seen(image_pose)
+        free = np.zeros((6, 4))  # all parameters but the tilt of the plane, which are adjusted to first order
+        free[:3, 0] = image_pose.rotation[0] @ plane.rotation[:, 2]
+        free[3:, 1:] = np.eye(3)
+        a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
+        delta = float(((r - a @ np.linalg.lstsq(a, r)[0]) ** 2).sum()) - least
         if delta < min(plausible, square / 2) and square > OTHER_SIDE**2:
             other_side, curved = float(delta), True
             first = covariance + np.outer(step_to_mirrored, step_to_mirrored) / 4
     return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
-
-
-def _best_of_tilt(problem: PoseProblem, pose: Poses, plane: Rigid, whiten: np.ndarray) -> float:
-    """Returns χ² of a pose after all parameters but the tilt of the plane are adjusted, to first order."""
-    residual, image = problem.seen(pose)
-    free = np.zeros((6, 4))
-    free[:3, 0] = pose.rotation[0] @ plane.rotation[:, 2]
-    free[3:, 1:] = np.eye(3)
-    a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
-    residual_after = r - a @ np.linalg.lstsq(a, r)[0]
-    return float(residual_after @ residual_after)
 
 
 def _sampled(excess, least: float, pose: Poses, covariance: np.ndarray, second: Poses | None) -> np.ndarray:
@@ -279,9 +271,6 @@ class PoseOptions:
                 "0 and 1, a margin of at least 1 and a positive factor needed",
             )
 
-    def needed(self, chi2_per_dof: float) -> float:
-        return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TargetPose(ImageFit, Brief):
@@ -314,12 +303,6 @@ class TargetPose(ImageFit, Brief):
             ("weights", (n,)),
         ):
             freeze(self, name, shape, f"pose: {name}")
-
-    def swapped(self) -> "TargetPose":
-        """Returns the second solution as ``resolved``, with this one as its second; this one if there is no second."""
-        if self.second is None:
-            return self
-        return replace(self.second, status="resolved", second=replace(self, second=None))
 
 
 def pose_from_circles(
@@ -386,24 +369,38 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
             f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it",
         )
     place = np.array([target.place[labels[i]] for i in used], int)
-    rows = (3 * place[:, None] + np.arange(3)).ravel()
+    rows = coordinates(place)
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
     ideal = camera.normalised_from_pixel(centre[used])
     px_by_centre = camera.pixel_jacobian(ideal)
     centre_by_px = np.linalg.inv(px_by_centre)
-    by_camera, prior_covariance = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
-    if prior is not None:
-        by_camera = centre_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        prior_covariance = prior.covariance
-    circles = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
-    noise_of_centres = factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2)
-    shape = target.covariance[np.ix_(rows, rows)]
-    names = circle_labels(labels[i] for i in used)
-    return PoseProblem(names, *circles, noise_of_centres, by_camera, prior_covariance, shape)
+    basis = np.zeros((len(PARAMETER_NAMES), 0)) if prior is None else intrinsic_basis(prior.colmap_model)
+    return PoseProblem(
+        labels=circle_labels(labels[i] for i in used),
+        xyz=target.xyz[place],
+        normal=target.normal[place],
+        radius=target.radius[place],
+        centre=ideal,
+        px_by_centre=px_by_centre,
+        noise=factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2),
+        by_camera=centre_by_px @ (camera.parameter_jacobian(ideal) @ basis),
+        prior=np.zeros((0, 0)) if prior is None else prior.covariance,
+        shape=target.covariance[np.ix_(rows, rows)],
+    )
 
 
 def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
-    excess, second = _second_solution(problem, found)
+    excess, second = np.inf, None  # of the second minimum in χ², and its pose
+    if len(found.cost) > 1:
+        excess, second = float(found.cost[1] - found.cost[0]), found.poses[[1]]
+    if second is not None and excess <= HOPELESS * max(1.0, found.cost[0] / (2 * len(problem.labels) - 6)):
+        # Both minima give a circle the same weight, the smaller of the two. Else an outlier of one could decide.
+        residual, image = problem.seen(found.poses)
+        common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
+        weighed = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
+        excess, second = np.inf, None
+        if distinct(weighed.poses, weighed.normal[0]):
+            excess, second = float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
     alone = second is None and len({label.face for label in problem.labels}) == 1
     first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
     first = replace(first, delta_chi2=min(excess, first.delta_chi2))
@@ -414,22 +411,6 @@ def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOpti
     other = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
     other = replace(other, status="ambiguous", delta_chi2=-excess, needed_chi2=first.needed_chi2)
     return replace(first, status="ambiguous", second=other)
-
-
-def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, Poses | None]:
-    """Returns the excess in χ² of the second minimum, and its pose; infinite and None if there is none. Both minima
-    give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide."""
-    if len(found.cost) == 1:
-        return np.inf, None
-    delta = float(found.cost[1] - found.cost[0])
-    if delta > HOPELESS * max(1.0, found.cost[0] / (2 * len(problem.labels) - 6)):  # whatever the weights
-        return delta, found.poses[[1]]
-    residual, image = problem.seen(found.poses)
-    common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
-    weighed = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
-    if not distinct(weighed.poses, weighed.normal[0]):
-        return np.inf, None
-    return float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
 
 
 def _solution(
@@ -456,7 +437,7 @@ def _solution(
     }
     gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
     chi2, redundancy = float(last.chi2[0]), 2 * len(problem.labels) - 6
-    needed = options.needed(chi2 / redundancy)
+    needed = deciding_delta(options.flip_odds, options.sigma_margin, chi2 / redundancy)
     # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
     plausible = needed / options.sigma_margin**2
     covariance, other_side = covariance_of_likelihood(
@@ -515,7 +496,9 @@ def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
     )
     if turn <= NEAR_PREVIOUS * turn_of_second:
         return replace(pose, status="resolved")
-    return pose.swapped() if turn_of_second <= NEAR_PREVIOUS * turn else pose
+    if turn_of_second > NEAR_PREVIOUS * turn:
+        return pose
+    return replace(pose.second, status="resolved", second=replace(pose, second=None))
 
 
 def fit_verdict(pose: TargetPose) -> str:
@@ -541,8 +524,7 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
     circles, intrinsics = _root(target.covariance), np.zeros((0, 0)) if prior is None else _root(prior.covariance)
     effects = []
     for pose in poses:
-        place = np.array([target.place[label] for label in pose.labels])
-        rows = (3 * place[:, None] + np.arange(3)).ravel()
+        rows = coordinates(np.array([target.place[label] for label in pose.labels]))
         effects.append(np.hstack([pose.by_circles @ circles[rows], pose.by_intrinsics @ intrinsics]))
     full = np.array(effects)
     pose_roots = np.linalg.cholesky(np.array([pose.covariance for pose in poses]))

@@ -97,23 +97,18 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
 
     Parameters
     ----------
-    result : MeasureResult
-        Of :func:`~stcal.sfm.measure`.
-    joints : Table, optional
-        Further columns by ``image``, of :func:`stcal.load_table`. Only images of this table are then written.
+    result : Of :func:`~stcal.sfm.measure`.
+    joints : Further columns by ``image``, of :func:`stcal.load_table`. Only images of this table are then written.
 
     Returns
     -------
-    text : str
-        CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
-    notes : tuple of str
-        Images of only one of both.
+    text : CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
+    notes : Images of only one of both.
 
     Raises
     ------
-    InputError
-        The table has no column ``image``, an image twice, a column of the name of a measured one, or no image that was
-        measured.
+    InputError : The table has no column ``image``, an image twice, a column of the name of a measured one, or no image
+        that was measured.
     """
     header = [IMAGE, "faces", "circles", "status", *POSE, *COVARIANCE, "rms_px", "chi2_per_dof"]
     common = common_columns(result.common.shape[2])
@@ -172,31 +167,33 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
 
 
 def poses_file(result: MeasureResult) -> PosesFile:
+    images = []
+    for image in result.images:
+        pose = image.pose
+        circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
+        named = {
+            "image": image.name,
+            "notes": image.notes,
+            "covariance_parts": pose.parts,
+            "alternative": pose.second,
+            "delta_chi2_needed": pose.needed_chi2,
+            "rms_px": pose.rms_px(),
+            "dof": pose.redundancy,
+            "p_value": pose.p_value(),
+            "fit": fit_verdict(pose),
+            "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
+        }
+        alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
+        images.append(ImagePose.model_validate(named | alike))
     return PosesFile(
         format="stcal poses 1",
         unit="mm",
         sigma_factor=result.sigma_factor,
         intrinsics_held=result.intrinsics_held,
         notes=list(result.notes),
-        images=[_image_pose(image.pose, image=image.name, notes=image.notes) for image in result.images],
+        images=images,
         left_out=[NamedReason.model_validate(each) for each in result.left_out],
     )
-
-
-def _image_pose(pose: TargetPose, **named) -> ImagePose:
-    circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
-    named |= {
-        "covariance_parts": pose.parts,
-        "alternative": pose.second,
-        "delta_chi2_needed": pose.needed_chi2,
-        "rms_px": pose.rms_px(),
-        "dof": pose.redundancy,
-        "p_value": pose.p_value(),
-        "fit": fit_verdict(pose),
-        "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
-    }
-    alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
-    return ImagePose.model_validate({name: (named | alike)[name] for name in ImagePose.model_fields})
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -230,16 +227,14 @@ def summary(result: MeasureResult) -> list[str]:
         )
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     if failed:
-        remedy = result.remedy("check that camera file, faces.json and images belong together")
         lines.append(
             f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
-            f"100 000; {remedy}"
+            "100 000; check that camera file, faces.json and images belong together"
         )
     return [*lines, *result.notes]
 
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
-ELLIPSE_SHARE = 0.06  # length with which the largest σ is drawn, as a share of the plot's width
 HEADS = ("<image", "<faces", "circles", "<status", "x mm", "y", "z", "σ µm", "σ mdeg", "RMS px", "χ²/dof", "<fit")
 
 
@@ -248,13 +243,22 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     images, left_out = result.images, [[each.name, each.reason] for each in result.left_out]
     at = np.array([image.pose.camera_from_target.translation for image in images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in images))
-    times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
+    times = round_below(0.06 * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
     statuses = {image.pose.status for image in images}
     counts, *remarks = summary(result)
     every = every or len(images) <= MOST_LISTED
-    doubtful = [image for image in images if not _is_sound(image.pose)]
+    doubtful = [
+        image
+        for image in images
+        if image.pose.status != "certain" or fit_verdict(image.pose) != "passed" or image.pose.outliers
+    ]
     listed = images if every else doubtful[:MOST_LISTED]
-    figures = ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), _figures(images)).lines()
+    values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
+    rows = [
+        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", images[int(v.argmax())].name]
+        for what, v in zip(("σ position µm", "σ rotation mdeg", "residuals RMS px"), values, strict=True)
+    ]
+    figures = ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), rows).lines()
     rest = f"{len(listed)} of them need a look; the table that is written has all, and --verbose prints them"
     outliers = [
         [image.name, outlier.label, number(outlier.residual_px, 3), number(outlier.limit_px, 3)]
@@ -300,23 +304,10 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     )
 
 
-def _figures(images: Sequence[MeasuredImage]) -> list[list[str]]:
-    values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
-    names = "σ position µm", "σ rotation mdeg", "residuals RMS px"
-    return [
-        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", images[int(v.argmax())].name]
-        for what, v in zip(names, values, strict=True)
-    ]
-
-
 def _largest_sigma(pose: TargetPose) -> tuple[float, float]:
     """Returns the largest σ of three axes: position, µm, and rotation, mdeg."""
     sigma = 1e3 * np.sqrt(np.diag(pose.covariance))
     return float(sigma[3:].max()), float(np.degrees(sigma[:3].max()))
-
-
-def _is_sound(pose: TargetPose) -> bool:
-    return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
 
 
 def _row(each: MeasuredImage) -> list[str]:

@@ -20,8 +20,7 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.json import ByFace, Part, read_result
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.report.text import join, number, text_table
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
 from stcal.sfm.adjust.faces_file import FacePoses
 from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians

@@ -31,7 +31,7 @@ from stcal.labels import BOARD, CircleLabel, DotLabel, Label, circle_labels
 from stcal.parallel import one_thread
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.adjust.refine import with_edge_sigma
 from stcal.sfm.data.group_model import ImageObservations, MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.mapping.models import assemble

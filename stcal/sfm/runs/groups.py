@@ -21,8 +21,7 @@ from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_in_order
 from stcal.report.text import significant
-from stcal.sfm.adjust.refine import Refined, refine
-from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
+from stcal.sfm.adjust.refine import Refined, find_scale, refine, with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart

@@ -11,8 +11,7 @@ from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.refine import refine
-from stcal.sfm.adjust.scale import Scale
+from stcal.sfm.adjust.refine import Scale, refine
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.group_model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX

@@ -21,15 +21,13 @@ from stcal.labels import CircleLabel, Label, circle_labels
 from stcal.report.document import html
 from stcal.sfm.adjust.calibration import Calibration, SigmaFactors
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
-from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.adjust.refine import projection_jacobians
-from stcal.sfm.adjust.scale import ScaleSource
+from stcal.sfm.adjust.faces_file import FacesFile, TargetCircles
+from stcal.sfm.adjust.refine import ScaleSource, projection_jacobians
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
-from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.groups import GroupSolution

@@ -36,7 +36,7 @@ from stcal.sfm.adjust.calibration import with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
-from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.adjust.refine import with_edge_sigma
 from stcal.sfm.adjust.uncertainty import with_differences
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions

@@ -7,8 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
-from stcal.workflows.handeye_inputs import Files, one_source
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import Files, one_source, read_robot_poses
 from tests.handeye.test_cli import NOISE, poses_file
 from tests.handeye.written import FORMATS, REFUSED, easy_handeye, matrices
 from tests.outcome import INPUT, assert_error, fails_with

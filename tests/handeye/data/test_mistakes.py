@@ -12,8 +12,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import partners, read_pairs, read_robot, read_two
-from stcal.workflows.handeye_inputs import Files, one_source
-from stcal.workflows.robot_at_images import read_robot_poses
+from stcal.workflows.handeye_inputs import Files, one_source, read_robot_poses
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.adjust.components import Components, Equations
+from stcal.adjust.blocks import Components, Equations
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import problem
 from stcal.robot.identification.adjustment import Weighting, jacobian, moved, observed, residuals

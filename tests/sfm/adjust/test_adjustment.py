@@ -11,6 +11,7 @@ from stcal.geometry.rigid import Rigid, Similarity, align_similarity
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.camera.test_intrinsics import with_a_field
 
 NOISE_PX = 0.005
 
@@ -142,16 +143,6 @@ def test_joint_beats_the_chain(draws, labels_only):
     assert 1.15 < np.sqrt(np.mean(chain) / np.mean(joint)) < 1.4
 
 
-def with_a_field(images, rng, sigma_px: float, length_px: float = 250.0):
-    """The images with errors that neighbouring places of one photograph have in common."""
-    moved = []
-    for image in images:
-        apart = ((image.centre_px[:, None] - image.centre_px) ** 2).sum(2)
-        root = np.linalg.cholesky(np.exp(-apart / 2 / length_px**2) + 1e-9 * np.eye(len(image)))
-        moved.append(replace(image, centre_px=image.centre_px + sigma_px * root @ rng.standard_normal((len(image), 2))))
-    return moved
-
-
 @pytest.mark.slow
 def test_sigma_grow_by_how_much_photographs_differ(scenes, labels_only):
     """With a field of twice the centres' σ, errors are beyond σ of independent pixels, and within those stated."""
@@ -175,20 +166,3 @@ def test_sigma_grow_by_how_much_photographs_differ(scenes, labels_only):
             stated.append(square)
             independent.append(square * found.joint.differ**2)  # but for the board's part
     assert np.mean(stated) < 1.6 < np.mean(independent)  # 1.09 and 1.99
-
-
-def test_circles_carry_covariances_in_the_target_frame(scene, labels_only):
-    target, _ = labels_only.calibrate(scene, NOISE_PX, 0)
-    origin, far = target.circle_covariance["1:1"], target.circle_covariance["3:7"]
-    assert np.trace(origin) < 0.2 * np.trace(far)  # the origin circle defines the frame
-    sigma_um = 1e3 * np.sqrt(np.trace(far))
-    assert 2 < sigma_um < 30
-
-
-def test_eccentricity_of_a_model_uses_the_fitted_planes(scene, labels_only):
-    observed = labels_only.observations(scene, 0.0, np.random.default_rng(0))
-    model = labels_only.models(scene, observed)[0]
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    shift = eccentricity_px(model, scene.camera, radius, 1.0)
-    centre_px = scene.camera.project(model.xyz_camera())
-    assert np.abs(model.measured_px - shift - centre_px).max() < 2e-4  # 5 µm on the board tilts no plane by more

@@ -5,16 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.adjust.blocks import Vector
-from stcal.adjust.engine import Adjustment
 from stcal.design import BoardDesign
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.equations import Group, Setting
-from stcal.sfm.adjust.refine import reproject
 from stcal.synthetic.scene import SceneOptions, make_scene
-from tests.sfm.adjust import dense
 
 
 @pytest.fixture(scope="module")
@@ -24,44 +20,6 @@ def group(labels_only):
     )
     observed = labels_only.observations(scene, 0.01, np.random.default_rng(2))
     return labels_only.models(scene, observed)[0], scene.camera
-
-
-@pytest.mark.parametrize("intrinsics", [0, 2])
-def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group, intrinsics):
-    """Points and the camera's parameters remain; a step of these brings the cameras' own along."""
-    model, camera = group
-    basis = np.eye(16)[:, :intrinsics]
-    a = Adjustment()
-    points = a.block("points", Vector(model.xyz_model))
-    poses = a.block("poses", Poses.of(model.camera_from_model), eliminate=True)
-    lens = a.block("lens", Vector(np.zeros((1, intrinsics))))
-
-    def camera_at(lens: Vector):
-        return camera.with_parameters(camera.parameters() + basis @ lens.array[0])
-
-    reproject(a, model, (points, poses, lens), camera_at, basis)
-    solution = a.at({block.name: block.start for block in a.blocks})
-    normal, right, away = solution.normal, solution.right, solution.reduction
-    jacobian = dense.jacobian(model, camera)
-    if intrinsics:
-        by = [
-            (dense.projections(model, camera.with_parameters(camera.parameters() + 1e-3 * b))
-             - dense.projections(model, camera.with_parameters(camera.parameters() - 1e-3 * b))).ravel() / 2e-3
-            for b in basis.T
-        ]  # fmt: skip
-        jacobian = np.column_stack([jacobian, *by])
-    residual = model.whiten(model.residuals_px(camera)).ravel()
-    k = 6 * len(model.images)
-    full, full_right = jacobian.T @ jacobian, jacobian.T @ residual
-    back = np.linalg.solve(full[:k, :k], full[:k, k:])
-    wanted = full[k:, k:] - full[k:, :k] @ back
-    scale = np.sqrt(np.diag(full)[k:])
-    np.testing.assert_allclose(normal / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-6)
-    np.testing.assert_allclose(right / scale, (full_right[k:] - back.T @ full_right[:k]) / scale, atol=1e-5)
-    step = np.random.default_rng(1).normal(size=len(normal)) / scale
-    cameras = away.back(step).ravel()
-    solved = np.linalg.solve(full[:k, :k], full_right[:k] - full[:k, k:] @ step)
-    np.testing.assert_allclose(cameras, solved, atol=1e-5 * np.abs(solved).max())
 
 
 def test_weights_are_hubers_and_the_cost_is_theirs(group):

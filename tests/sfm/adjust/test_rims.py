@@ -9,7 +9,7 @@ from stcal.boards.board_file import board_toml, load_board
 from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.sfm.adjust.joint import adjusted
-from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
+from stcal.sfm.adjust.rims import RadiusViews, Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board_checks import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -26,8 +26,10 @@ def scene():
     return make_scene(SceneOptions(seed=6, width=1944, height=1296, images_per_group=6, groups=(("1", "2"),)))
 
 
-NO_DOMES = np.zeros(240), np.zeros((240, 2))
-"""Of circles whose light is even: what a dome does to radii, and domes."""
+def rim_of(short, tangent, radius, blur, image) -> Rim:
+    """The rim of 240 circles whose light is even."""
+    none, index = np.zeros(240), np.arange(240)
+    return _rim(RadiusViews(index, image, radius, 1 + short / radius, none, blur, tangent, np.zeros((240, 2)), none))
 
 
 def rims_of(scene, rim_mm, **look):
@@ -122,7 +124,7 @@ def test_a_blur_that_is_corrected_by_too_little_is_no_rim(height_mm):
     blur = 0.02 * distance**2 / radius * 6 * np.sqrt(1 + tangent**2)
     noise = rng.normal(0, 0.003, 240)
     short = noise + 0.2 * blur - lost_radius_mm(height_mm, tangent, radius)
-    rim = _rim(short, tangent, radius, blur, np.arange(240), *NO_DOMES)
+    rim = rim_of(short, tangent, radius, blur, np.arange(240))
     assert rim.height_mm == pytest.approx(height_mm, abs=2.5 * rim.sigma_mm)
     assert 0.003 < rim.sigma_mm < 0.0125  # of 0.05 mm at four σ
 
@@ -134,7 +136,7 @@ def test_errors_that_an_image_has_in_all_its_circles_are_in_sigma():
     for _ in range(100):
         image = np.repeat(np.arange(12), 20)
         tangent, common = rng.uniform(0.1, 2.0, 12)[image], rng.normal(0, 0.003, 12)[image]
-        rim = _rim(common + rng.normal(0, 0.003, 240), tangent, np.full(240, 8.0), np.zeros(240), image, *NO_DOMES)
+        rim = rim_of(common + rng.normal(0, 0.003, 240), tangent, np.full(240, 8.0), np.zeros(240), image)
         normed.append(rim.height_mm / rim.sigma_mm)
     assert 0.5 < np.mean(np.square(normed)) < 2.0
     assert np.mean(np.abs(normed) > 4) <= 0.01

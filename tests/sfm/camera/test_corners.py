@@ -53,7 +53,7 @@ def circles(kind, across, down, stated):
     ("drawn", "count"),
     [
         pytest.param(aprilgrid, 8, marks=pytest.mark.slow),
-        pytest.param(partial(circles, "asymmetric", 2.0, 1.0, 8.0), 8, marks=pytest.mark.slow, id="asymmetric"),
+        pytest.param(partial(circles, "asymmetric", 2.0, 1.0, 8.0), 8, marks=pytest.mark.full, id="asymmetric"),
         pytest.param(
             partial(circles, "hexagonal", 1.5, 1.5 * np.sqrt(0.75), 12.0), 8, marks=pytest.mark.slow, id="hexagonal"
         ),

@@ -12,15 +12,21 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.design import reference_board
-from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.plane import circle_image_offset
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
-from stcal.sfm.camera import intrinsics
-from stcal.sfm.camera.calibrate import image_grid, projection_sigma, require_determined
-from stcal.sfm.camera.intrinsics import adjust_intrinsics, board_views, closed_form, model_parameters, start_camera
+from stcal.sfm.camera.calibrate import require_determined
+from stcal.sfm.camera.intrinsics import (
+    adjust_intrinsics,
+    board_views,
+    closed_form,
+    image_grid,
+    model_parameters,
+    projection_sigma,
+    start_camera,
+)
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
@@ -66,18 +72,23 @@ def error(result, truth=TRUE) -> np.ndarray:
 
 
 @pytest.mark.full
-def test_truth_within_predicted_sigma():
-    # Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1.
+@pytest.mark.parametrize(("field_px", "count", "low", "high"), [(0.0, 12, 0.8, 1.2), (0.04, 14, 0.6, 1.6)])
+def test_truth_within_predicted_sigma(field_px, count, low, high):
+    """Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1. With a
+    field of twice the centres' σ, by σ of independent errors it is above 5; σ of the mean is then 0.2, as σ themselves
+    have 10 degrees of freedom."""
     squares, factors = [], []
     for seed in range(40):
-        result = calibrated(views_of(np.random.default_rng(seed)))
-        e = error(result)
-        squares.append(e @ np.linalg.solve(result.covariance, e) / 8)
+        rng = np.random.default_rng(seed)
+        views = views_of(rng, count)
+        result = calibrated(with_a_field(views, rng, field_px) if field_px else views)
+        squares.append(error(result) @ np.linalg.solve(result.covariance, error(result)) / 8)
         factors.append(result.factors.centres)
-    assert abs(np.mean(squares) - 1) < 0.2
-    assert abs(np.mean(factors) - 1) < 0.02
-    # Of a 24 mm lens on a 22 mm sensor, 1 px is 4e-4: σ of 0.02 px centres must be far below.
-    assert 0.05 < result.sigma()[0] < 0.2
+    assert low < np.mean(squares) < high
+    if not field_px:
+        assert abs(np.mean(factors) - 1) < 0.02
+        # Of a 24 mm lens on a 22 mm sensor, 1 px is 4e-4: σ of 0.02 px centres must be far below.
+        assert 0.05 < result.sigma()[0] < 0.2
 
 
 @pytest.mark.slow
@@ -105,36 +116,7 @@ def test_a_bad_dot_is_weighed_down():
     )
 
 
-def test_a_descent_that_does_not_end_begins_again_and_says_so(monkeypatch):
-    views = views_of(np.random.default_rng(7))
-    plain, own, calls = calibrated(views), intrinsics._adjusted, []
-
-    def endless_first(*given):
-        calls.append(given)
-        if len(calls) == 1:
-            raise ConvergenceError("E-NO-MINIMUM", "projections still move")
-        return own(*given)
-
-    monkeypatch.setattr(intrinsics, "_adjusted", endless_first)
-    again = calibrated(views)
-    assert (plain.restarted, again.restarted, len(calls)) == (False, True, 2)
-    np.testing.assert_allclose(again.camera.parameters(), plain.camera.parameters(), rtol=1e-4)  # the same minimum
-    warned = [
-        any("other minima" in line for line in calibration._warnings(result, projection_sigma(result), BOARD))
-        for result in (plain, again)
-    ]
-    assert warned == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("model", "distortion"),
-    [
-        ("SIMPLE_RADIAL", [-0.1]),
-        ("PINHOLE", []),
-        pytest.param("SIMPLE_PINHOLE", [], marks=pytest.mark.slow),
-        pytest.param("RADIAL", [-0.1, 0.05], marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("model", "distortion"), [("SIMPLE_RADIAL", [-0.1]), ("PINHOLE", [])])
 def test_models(model, distortion):
     camera = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.pad(np.array(distortion), (0, 8 - len(distortion))))
     result = calibrated(views_of(np.random.default_rng(7), camera=camera), model)
@@ -214,17 +196,6 @@ def with_a_field(views, rng, sigma_px: float, length_px: float = 250.0):
     return moved
 
 
-@pytest.mark.full
-def test_sigma_hold_where_errors_of_a_photograph_are_alike():
-    """A field of twice the centres' σ: by σ of independent errors the normalised squared error is above 5."""
-    squares = []
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        result = calibrated(with_a_field(views_of(rng, 14), rng, 0.04))
-        squares.append(error(result) @ np.linalg.solve(result.covariance, error(result)) / 8)
-    assert 0.6 < np.mean(squares) < 1.6  # σ of the mean 0.2, as σ themselves have 10 degrees of freedom
-
-
 @pytest.mark.slow
 def test_a_loud_photograph_hardly_counts():
     """It moves the answer by 2.5 σ where it counts; else by 0.3 to 0.6 σ, and σ by −7 to +26 %, in four draws."""
@@ -258,22 +229,8 @@ def test_a_board_upside_down_is_numbered_like_the_others():
     for i, view in enumerate(views_of(rng, noise_px=0.005)):
         cells = np.array([[int(v) for v in label.split(":")[1:]] for label in view.labels])
         both = np.stack([cells, [BOARD.rows - 1, BOARD.columns - 1] - cells])
-        n = len(view)
-        zeros, ok = np.zeros(n), np.ones(n, bool)
-        centres = Centres(
-            view.centre_px,
-            view.centre,
-            view.shape,
-            view.covariance_px2,
-            zeros,
-            zeros,
-            zeros,
-            zeros,
-            0 * view.centre,
-            np.zeros((n, 3)),
-            ok,
-        )
-        seen = BoardSighting(np.arange(n), both[::-1] if i % 3 == 1 else both)
+        centres = Centres.without_rims(view.centre_px, view.centre, view.shape, view.covariance_px2)
+        seen = BoardSighting(np.arange(len(view)), both[::-1] if i % 3 == 1 else both)
         detection = ImageDetection(centres, (), (seen,))
         images.append(SimpleNamespace(file=SimpleNamespace(name=view.name, group="."), detection=detection))
         truth.append(view.labels)
@@ -295,7 +252,6 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     stated = out.read_text(encoding="utf-8").splitlines()[-1].split()
     assert stated[1] == "OPENCV"
     assert float(stated[6]) == pytest.approx(float(shown) + 0.5, abs=5.1e-5)  # four decimals are shown
-    assert "counts from that pixel's corner, so that cx, cy are 0.5 px larger there" in printed
     camera = read_camera(out).calibrated(truth.width, truth.height)
     prior = camera_prior(camera)
     assert prior.colmap_model == "OPENCV"

@@ -13,8 +13,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
-from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import face_checks
 from stcal.sfm.checks.board_checks import board_checks

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.read import read_camera
-from stcal.sfm.adjust.network import free_network
+from stcal.sfm.adjust.refine import free_network
 from stcal.sfm.checks.image_checks import UNEVEN_BY_CHANCE, evenness_check
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions

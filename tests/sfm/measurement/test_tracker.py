@@ -8,8 +8,8 @@ import pytest
 from stcal.errors import InputError
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, Tracker, measure
+from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.detect.predict import common_shift
-from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -12,7 +12,7 @@ from stcal.errors import InputError, InputNote
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import COVARIANCE as COLUMNS
 from stcal.io.table import POSE, pose_cells
-from stcal.sfm.measurement.known_target import read_target
+from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.report.compare import compare, compare_poses, comparison_table, poses_table
 from stcal.synthetic.dataset import TruthFile
 from tests.outcome import fails_with

@@ -14,9 +14,9 @@ import pytest
 from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run, uncertainty_budget
+from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.measurement.known_target import read_target
 from stcal.sfm.runs.run_options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
