@@ -18,7 +18,8 @@ import numpy as np
 
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
-from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.significance import Evidence
+from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph

@@ -36,8 +36,8 @@ from stcal.parallel import one_thread
 from stcal.report.text import text_table
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import Refined
-from stcal.sfm.checks.significance import MOST_SIGMAS
-from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
+from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files

@@ -25,9 +25,9 @@ from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
-from stcal.sfm.checks.causes import cause_of_drawing, cause_of_size
+from stcal.sfm.checks.board_checks import shows_rim
 from stcal.sfm.checks.significance import MOST_SIGMAS
-from stcal.sfm.checks.suite import run_checks, shows_rim
+from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays

@@ -24,8 +24,8 @@ from stcal.report.text import significant
 from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
-from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
+from stcal.sfm.checks.suite import EXPLAINS, cause_of_file
 from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel, by_group
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint

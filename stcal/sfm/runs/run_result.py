@@ -24,7 +24,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.scale import ScaleSource
-from stcal.sfm.checks.suite import Evidence
+from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage

@@ -11,8 +11,8 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
 from stcal.sfm.checks import suite
-from stcal.sfm.checks.causes import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.checks.significance import moved_apart
+from stcal.sfm.checks.suite import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.report.check import CAUSE, OF_WHOLE_SET, ranked
 from stcal.sfm.runs import groups as solve
 from stcal.sfm.runs.groups import GroupSolution, refine_or_explain
