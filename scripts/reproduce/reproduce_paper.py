@@ -24,7 +24,7 @@ from stcal.labels import dot_cells
 from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.group_model import WorldModel
-from stcal.sfm.runs.paper import AS_PUBLISHED, STEPS, Answer, in_steps
+from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, Answer, in_steps
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene

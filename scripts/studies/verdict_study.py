@@ -44,7 +44,7 @@ from stcal.sfm.detect.detect_files import detect_files
 from stcal.sfm.detect.labelling import label_images
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.report.check import CAUSE, ranked
-from stcal.sfm.runs.groups import LIKELY, explained, refine_or_explain, wrong_file
+from stcal.sfm.runs.stages import LIKELY, explained, refine_or_explain, wrong_file
 from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, make_scene, second_design
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 from tests.support.photograph import read_set

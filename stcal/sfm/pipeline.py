@@ -12,7 +12,7 @@ import numpy as np
 from stcal.boards.board_file import board_of as board_of
 from stcal.boards.on_faces import tags_of_no_face
 from stcal.boards.target_file import target_of
-from stcal.design import BoardDesign, TargetDesign, scale_reference, with_drawn_size
+from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import ConvergenceError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
@@ -20,7 +20,6 @@ from stcal.io.cameras.camera_model import CameraModel, camera_prior, model_of
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import TOP_GROUP, chosen_images
 from stcal.io.video import AUTO, write_frames
-from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
@@ -28,38 +27,27 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.checks.board_checks import shows_rim
 from stcal.sfm.checks.significance import MOST_SIGMAS
 from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
-from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
-from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
+from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.placed import plain_lens
 from stcal.sfm.report.check import Check
+from stcal.sfm.runs.comparisons import Answer, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run
-from stcal.sfm.runs.groups import (
-    Mapped,
-    groups_of,
-    map_groups,
-    start_of,
-    ungrouped,
-    unknown_face_notes,
-    unseen_board,
-    unseen_circles,
-    wrong_file,
-)
-from stcal.sfm.runs.paper import Answer, compare_with_paper, require_comparable
-from stcal.sfm.runs.report_file import unadjusted
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.run_result import RunResult
-from stcal.sfm.runs.task import (
+from stcal.sfm.runs.saved import RunResult
+from stcal.sfm.runs.stages import (
     DetectedImages,
+    Groups,
     Task,
     camera_for_a_look,
     detect,
     detect_with,
-    focal_sigma_px,
-    is_vague,
-    require_dots,
-    require_seen,
+    groups_of,
+    map_groups,
+    scaled_by_drawing,
+    start_of,
     unseen_faces,
+    wrong_file,
 )
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
@@ -139,14 +127,12 @@ def run(
     with begun(images, camera, out, target, board, options, progress) as task:
         seen = detect(task)  # and label
         with overlays_beside(seen, task) as left_out:
-            task = scaled_by_drawing(task, seen, board)
-            mapped = map_groups(task, groups_of(task, seen))
-            mapped, calibration = adjust(task, seen, mapped)  # scale, chain, adjust
-            result = result_of(task, seen, mapped, calibration)
-            left_out.update(unadjusted(result))
-        if task.options.compare and result.target.target_from_face and task.camera is not None:
-            result = replace(result, comparison=compare_with_paper(result, as_published(task, task.camera)))
-        return write_run(checked(result, checks, task.progress), task.folder.stage, task.progress)
+            task = scaled_by_drawing(task, seen, board is not None)
+            groups, calibration = adjust(task, seen, map_groups(task, groups_of(task, seen)))  # scale, chain, adjust
+            result = result_of(task, seen, groups, calibration)
+            left_out.update(result.unadjusted())
+        result = checked(compared(task, result), checks, task.progress)
+        return write_run(result, task.folder.stage, task.progress)
 
 
 def frames_of_video(images: Images, out: str | Path, every: str | int | None) -> Images:
@@ -179,86 +165,40 @@ def begun(
     model = None if camera is None else camera_model(camera)
     design = target_of(target)
     scale = scale_reference(None if board is None and design.has_scale else board_of(board), design)
-    options = read_options(options, model, design, scale) if settle else options
+    options = options.for_run(model, design, scale) if settle else options
     given = {"images": place, "--camera": camera, "--target": target, "--board": board}
     marker = MarkerFile.of(place, options if settle else None)
     with kept_processes(options.workers), run_folder(out, marker, given) as folder:
         yield Task(files, folder, design, scale, options, progress or (lambda *_: None), model, place.absolute())
 
 
-def read_options(
-    options: RunOptions, model: CameraModel | None, target: TargetDesign, board: BoardDesign
-) -> RunOptions:
-    """Returns the options with every default decided; refuses those that the camera file and the designs forbid."""
-    printed = target.with_faces(printed=True).faces
-    if model is None:
-        options = replace(options, refine_camera=True)
-    elif is_vague(model) and not (options.refine_camera or options.compare):
-        options = replace(options, refine_camera=True)
-        known = f"camera file {model.source}: states its focal length to ±{focal_sigma_px(model):.3g} px only"
-        warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
-    of_circles = {
-        "--solve paper": options.solve == "paper",
-        "--compare paper": options.compare is not None,
-        "--board-only": options.board_only,
-    }
-    for name in (name for name, is_given in of_circles.items() if printed and is_given):
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
-        )
-    if model is None and not (board.rows or printed):
-        raise InputError(
-            "E-CAMERA-NEEDED",
-            "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-            "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or tags",
-        )
-    if options.compare:
-        require_dots(board, f"--compare {options.compare}")
-    options = options.settled(target)
-    if options.compare:
-        require_comparable(options.adjustment(target))
-    return options
-
-
-def scaled_by_drawing(task: Task, seen: DetectedImages, board: str | Path | BoardDesign | None) -> Task:
-    """Returns the task, in the unit of the drawing if nothing of known size is seen; refuses unseen printed faces."""
-    labels = [image.observations.labels for image in seen.labelled]
-    if task.options.board_only:
-        return task
-    if not any(image.observations.face_ids() for image in seen.labelled):
-        require_seen(task, seen.labelled)
-    is_assumed = board is None and not task.target.has_scale
-    if not is_assumed or any(isinstance(label, DotLabel) for of_image in labels for label in of_image):
-        return task
-    target = with_drawn_size(task.target, labels)
-    return replace(task, target=target, board=scale_reference(None, target))
-
-
-def adjust(task: Task, seen: DetectedImages, mapped: Mapped) -> tuple[Mapped, Calibration]:
+def adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Calibration]:
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
-    calibration = adjusted(task, mapped)
-    groups = mapped.groups
-    doubted = {s.model.group for s in mapped.solutions if s.outliers and groups.options.refine_camera}
+    calibration = adjusted(task, groups)
+    doubted = {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}
     if doubted:
         with suppress(StcalError):
             again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
-            refined = replace(mapped, solutions=tuple(by_name.get(s.model.group, s) for s in mapped.solutions))
-            calibration, mapped = adjusted(task, refined), refined
+            refined = replace(groups, solutions=tuple(by_name.get(s.model.group, s) for s in groups.solutions))
+            calibration, groups = adjusted(task, refined), refined
     lens = calibration.camera
-    if task.camera is not None or _has_rays(lens):
-        return mapped, calibration
-    warnings.warn(PLAIN, InputNote, stacklevel=2)
-    plain = model_of(plain_lens(lens), PHOTOGRAPHS)
-    groups = replace(groups, camera=start_of(plain, seen, task.options))
-    return adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+    corners = np.array([[x, y] for x in (0, lens.width) for y in (0, lens.height)], float)
+    try:
+        if task.camera is None:
+            lens.normalised_from_pixel(corners)
+    except ConvergenceError:  # a lens that folds its image
+        warnings.warn(PLAIN, InputNote, stacklevel=2)
+        plain = model_of(plain_lens(lens), PHOTOGRAPHS)
+        groups = replace(groups, camera=start_of(plain, seen, task.options))
+        return adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+    return groups, calibration
 
 
-def adjusted(task: Task, mapped: Mapped) -> Calibration:
+def adjusted(task: Task, groups: Groups) -> Calibration:
     """Returns the calibration by the solutions of the groups; of the board alone, its scale."""
-    groups, models = mapped.groups, [solution.model for solution in mapped.solutions]
+    models = [solution.model for solution in groups.solutions]
     camera, board, options = groups.camera, groups.board, groups.options.adjustment(task.target)
     with groups.explained():
         if not groups.board_alone:
@@ -269,20 +209,11 @@ def adjusted(task: Task, mapped: Mapped) -> Calibration:
     return calibration
 
 
-def _has_rays(camera: Camera) -> bool:
-    """Returns whether all corners of a camera's image have rays, as the lens does not fold them."""
-    try:
-        camera.normalised_from_pixel(np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float))
-    except ConvergenceError:
-        return False
-    return True
-
-
-def result_of(task: Task, seen: DetectedImages, mapped: Mapped, calibration: Calibration) -> RunResult:
+def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Calibration) -> RunResult:
     """Returns the result of all stages, with every note on what was left out or is doubtful."""
-    groups, solutions, target, board = mapped.groups, mapped.solutions, task.target, mapped.groups.board
+    solutions, target, board = groups.solutions, task.target, groups.board
     faces, has_board = calibration.target.target_from_face, bool(task.board.rows)
-    observations, notes = groups.observations(), {i.observations.name: i.notes for i in groups.labelled}
+    observations = groups.observations
     printed = target.with_faces(printed=True).faces
     strange = tags_of_no_face(task.files[0], printed, [face for face in printed if face.id not in faces])
     return RunResult(
@@ -301,32 +232,34 @@ def result_of(task: Task, seen: DetectedImages, mapped: Mapped, calibration: Cal
         chains=measure_chains(calibration.faces, calibration.target),
         camera_given=task.camera_given,
         notes=(
-            *(ungrouped(groups.labelled) if has_board else ()),
-            *unknown_face_notes({image.file.group for image in seen.detection.images}, target),
+            *(groups.assumed_notes() if has_board else ()),
             *groups.notes,
-            *mapped.notes,
+            *groups.unsolved,
             *calibration.notes,
             *not_as_drawn(faces, target, has_board and set(groups.names) == {TOP_GROUP}),
             *(misnamed_groups(observations, target) if has_board else ()),
-            *misplaced_images(observations, notes, target),
-            *unseen_board(solutions, board),
-            *unseen_circles(solutions, target),
+            *groups.unseen_notes(target),
             *(Note(tags, NOT_AS_DRAWN, remedy="correct the ids in target.toml", then=": ") for tags in strange),
         ),
     )
 
 
-def as_published(task: Task, model: CameraModel) -> Answer | StcalError:
-    """Returns the answer of the published method on the same photographs, or the error that prevents it."""
-    options = replace(
-        task.options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
-    )
-    task = replace(task.named("{}, as published"), options=options.settled(task.target))
+def compared(task: Task, result: RunResult) -> RunResult:
+    """Returns the result with its comparison with the published method on the same photographs, if it is asked for."""
+    model, published = task.camera, {"solve": "paper", "frame": "three-point", "eccentricity": False}
+    if not task.options.compare or not result.target.target_from_face or model is None:
+        return result
+    options = replace(task.options, **published, refine_camera=False, compare=None).settled(task.target)
+    task = replace(task.named("{}, as published"), options=options)
+    answer: Answer | StcalError
     try:
-        mapped = map_groups(task, groups_of(task, detect_with(task, model)))
-        return Answer.of(mapped.solutions, adjusted(task, mapped))
+        groups = map_groups(task, groups_of(task, detect_with(task, model)))
+        calibration = adjusted(task, groups)
+        models = tuple(solution.model for solution in groups.solutions)
+        answer = Answer(calibration.target, models, calibration.scales)
     except StcalError as error:
-        return error
+        answer = error
+    return replace(result, comparison=compare_with_paper(result, answer))
 
 
 def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> RunResult:
@@ -441,7 +374,7 @@ def detect_images(
             if task.target.with_faces(printed=False).faces:
                 notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
         seen = detect_with(task, model)
-        if unseen := unseen_faces(task, seen.labelled):
+        if unseen := unseen_faces(task, seen):
             notes.append(unseen)
         with overlays_beside(seen, task, page=False):
             return replace(seen, notes=tuple(notes))

@@ -11,7 +11,7 @@ from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
-from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
+from stcal.sfm.data.note import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 from stcal.sfm.mapping.body import Corners, wrong_sizes

@@ -72,7 +72,7 @@ def crosscheck(
     """Map the same database with the native COLMAP, compare faces, circles and cameras, and add this to the report."""
     from stcal.sfm.interop.crosscheck import comparison_text
     from stcal.sfm.interop.crosscheck import crosscheck as checked
-    from stcal.sfm.runs.tolerances import Tolerances
+    from stcal.sfm.runs.comparisons import Tolerances
 
     tolerances = Tolerances(
         tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma

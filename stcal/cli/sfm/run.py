@@ -83,8 +83,8 @@ def run(
 
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
+    from stcal.sfm.runs.folder import found_lines, run_text
     from stcal.sfm.runs.run_options import RunOptions
-    from stcal.sfm.runs.run_text import found_lines, run_text
     from stcal.sfm.runs.transaction import is_finished
 
     options = RunOptions(
@@ -144,8 +144,8 @@ def detect(
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
+    from stcal.sfm.runs.folder import detection_text, found_in_all
     from stcal.sfm.runs.run_options import RunOptions
-    from stcal.sfm.runs.run_text import detection_text, found_in_all
 
     options = RunOptions(
         solve=solve,

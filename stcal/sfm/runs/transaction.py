@@ -30,7 +30,6 @@ from stcal.io.files import (
     save,
 )
 from stcal.io.json import ResultFile, read_result
-from stcal.sfm.runs.run_options import RunOptions
 
 ByFile = Annotated[str, "file"]
 AGAIN = "run it again"
@@ -50,8 +49,8 @@ class MarkerFile(ResultFile):
     )
 
     @classmethod
-    def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
-        """Returns the marker of a run, or of a detection alone, that begins."""
+    def of(cls, images: str | Path, options: Any) -> "MarkerFile":
+        """Returns the marker of a run with these options, or of a detection alone, that begins."""
         return cls(
             program="stcal-sfm",
             version=stcal.__version__,

@@ -15,7 +15,7 @@ from stcal.sfm.checks.significance import moved_apart
 from stcal.sfm.checks.suite import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.report.check import CAUSE, OF_WHOLE_SET, ranked
 from stcal.sfm.runs import groups as solve
-from stcal.sfm.runs.groups import GroupSolution, refine_or_explain
+from stcal.sfm.runs.stages import GroupSolution, refine_or_explain
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.sfm.checks.test_checks import Lab, seen_circles

@@ -11,7 +11,7 @@ from stcal.io.files import RUN_MARKER
 from stcal.report.document import with_code
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
-from stcal.sfm.runs.run_text import run_text
+from stcal.sfm.runs.folder import run_text
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import added_results
 from tests.outcome import INPUT, assert_error

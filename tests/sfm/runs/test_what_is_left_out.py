@@ -18,7 +18,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.report_file import unadjusted
-from stcal.sfm.runs.task import Task, detect_with
+from stcal.sfm.runs.stages import Task, detect_with
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
