@@ -23,8 +23,8 @@ from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.runs.stages import solve_groups
 from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.stages import solve_groups
 from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import simulate_centres
 

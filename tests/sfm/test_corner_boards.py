@@ -13,8 +13,8 @@ from stcal.labels import DotLabel
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.pipeline import require_dots
 from stcal.sfm.report.compare import compare
+from stcal.sfm.runs.run_options import require_dots
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.dataset import image_name, write_dataset
 from stcal.synthetic.render import RenderOptions, render

@@ -22,8 +22,8 @@ from stcal.sfm.mapping.pairs import (
     incidence,
     track_parts,
 )
-from stcal.sfm.runs.stages import solve_groups
 from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.stages import solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 

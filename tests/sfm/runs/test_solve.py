@@ -9,8 +9,8 @@ import pytest
 from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
-from stcal.sfm.runs.stages import LIKELY, explained, require_usable, usable_groups, wrong_file
 from stcal.sfm.runs.folder import run_text
+from stcal.sfm.runs.stages import LIKELY, explained, require_usable, usable_groups, wrong_file
 from tests.outcome import fails_with, refuses
 
 
