@@ -27,7 +27,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.checks.board_checks import shows_rim
 from stcal.sfm.checks.significance import MOST_SIGMAS
 from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
-from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.placed import plain_lens
 from stcal.sfm.report.check import Check

@@ -11,8 +11,7 @@ from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
-from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.data.note import NOT_AS_DRAWN, misnamed_groups, not_as_drawn
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
 from stcal.sfm.planning.session import corners_seen

@@ -30,7 +30,7 @@ from stcal.sfm.checks.significance import (
     by_eccentricity,
     by_motion,
 )
-from stcal.sfm.data.note import FAR_DEG, turned_faces
+from stcal.sfm.data.group_model import FAR_DEG, turned_faces
 from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, TestedValue, impossible
 
 Maker = Callable[[Evidence], Check | Iterable[Check]]

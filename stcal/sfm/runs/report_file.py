@@ -16,8 +16,7 @@ from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points,
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.significance import Check
-from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations
-from stcal.sfm.data.note import Note, lost_groups
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.judgement import Judgement

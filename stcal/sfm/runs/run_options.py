@@ -15,7 +15,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.data.note import faces_in_name
+from stcal.sfm.data.group_model import faces_in_name
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 

@@ -39,8 +39,7 @@ from stcal.sfm.camera.calibrate import camera_of_dots, camera_of_labelled, weigh
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
 from stcal.sfm.checks.suite import EXPLAINS, cause_of_file
-from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel, by_group
-from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
+from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, Outlier, WorldModel, by_group
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once

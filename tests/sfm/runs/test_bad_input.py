@@ -18,7 +18,7 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
-from stcal.sfm.data.note import GROUP_LEFT_OUT
+from stcal.sfm.data.group_model import GROUP_LEFT_OUT
 from stcal.sfm.detect import detect_files as files
 from stcal.synthetic.scene import image_circles
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
