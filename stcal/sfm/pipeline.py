@@ -13,7 +13,7 @@ from stcal.boards.board_file import board_of as board_of
 from stcal.boards.on_faces import tags_of_no_face
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign, scale_reference
-from stcal.errors import ConvergenceError, InputError, InputNote, StcalError
+from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import CameraModel, camera_prior, model_of
@@ -39,10 +39,11 @@ from stcal.sfm.runs.stages import (
     DetectedImages,
     Groups,
     Task,
-    camera_for_a_look,
+    camera_by_dots,
     detect,
     detect_with,
     groups_of,
+    guessed_cameras,
     map_groups,
     scaled_by_drawing,
     start_of,
@@ -370,9 +371,12 @@ def detect_images(
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
         notes, model = [], task.camera
         if model is None:
-            model, told = camera_for_a_look(task)
-            if task.target.with_faces(printed=False).faces:
-                notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
+            model, note = model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
+            with suppress(DetectionError, DegenerateError):
+                if task.board.rows:
+                    model = camera_by_dots(task, None)
+                    note = FOUND_BY_DOTS.format(model.focal[0])
+            notes += [note] if task.target.with_faces(printed=False).faces else []
         seen = detect_with(task, model)
         if unseen := unseen_faces(task, seen):
             notes.append(unseen)

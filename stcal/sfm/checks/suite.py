@@ -71,16 +71,17 @@ MAKERS: tuple[Maker, ...] = (
     board_checks.rim_of_run,
     face_checks.flatness_check,
     image_checks.control_check,
-    lambda evidence: [board_checks.scales_check(evidence)] if isinstance(evidence.board, ScaleReference) else [],
+    board_checks.scales_check,
 )
-"""Makers of the checks in the order of the report; the scales are compared where the target tells its size itself."""
+"""Makers of the checks in the order of the report; the last one where the target tells its size itself."""
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
     """Returns all checks in the order of the report, the cause of the whole set before them if one failed."""
-    step = counted(progress or (lambda *_: None), "check", len(MAKERS))
+    makers = MAKERS if isinstance(evidence.board, ScaleReference) else MAKERS[:-1]
+    step = counted(progress or (lambda *_: None), "check", len(makers))
     checks: list[Check] = []
-    for make in MAKERS:
+    for make in makers:
         made = make(evidence)
         checks += [made] if isinstance(made, Check) else made
         step(None)

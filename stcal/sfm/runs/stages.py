@@ -127,48 +127,47 @@ class DetectedImages(Brief):
 
 def detect(task: Task) -> DetectedImages:
     """Detects and labels with the camera given, or with the one that printed faces, or the board's dots, determine."""
-    if task.camera is None and (printed := task.target.with_faces(printed=True)).faces:
-        return _detect_by_faces(task, printed)
-    camera = task.camera
-    if camera is None or (task.board.rows and not task.camera_given):
+    camera, printed = task.camera, task.target.with_faces(printed=True)
+    if camera is None and printed.faces:
+        faces_alone = replace(task, target=printed, board=scale_reference(None, printed))
+        guesses = guessed_cameras(task.files[0])
+        seen = detect_with(faces_alone, model_of(guesses[0], PHOTOGRAPHS))
+        if not any(image.face_ids() for image in seen.observations):
+            return seen  # :func:`scaled_by_drawing` refuses it
+        found = place_and_find_camera(seen.observations, printed.faces, guesses).camera
+        if not task.board.rows and len(printed.faces) == len(task.target.faces):  # all was measured already
+            return _labelled(task, seen_by(seen.detection, found, task.target), model_of(found, PHOTOGRAPHS))
+        camera = model_of(found, PHOTOGRAPHS)
+    elif camera is None or (task.board.rows and not task.camera_given):
         camera = camera_by_dots(task, camera)
     return detect_with(task, camera)
 
 
 def detect_with(task: Task, camera: CameraModel) -> DetectedImages:
     """Detects and labels the images by the rules that the options ask for."""
-    (chosen, skipped), target, options, cache = task.files, task.target, task.options, task.folder.cache
+    (chosen, skipped), target, options = task.files, task.target, task.options
     step = counted(task.progress, "detect", len(chosen))
     dots, detector = task.board if task.board.rows else None, None
     if options.solve == "paper":
         require_dots(dots, "--solve paper")
         PublishedPattern.of(target)
         detector = detect_published
-    detection = detect_files(chosen, camera, target, dots, options.ellipses, cache, options.workers, step, detector)
+    how = options.ellipses, task.folder.cache, options.workers
+    detection = detect_files(chosen, camera, target, dots, *how, step, detector)
     detection = replace(detection, skipped=(*skipped, *detection.skipped))
     require_upright(detection.images, task.board)
+    return _labelled(task, detection, camera)
+
+
+def _labelled(task: Task, detection: DetectionResult, camera: CameraModel) -> DetectedImages:
+    target, options, dots = task.target, task.options, task.board if task.board.rows else None
     if dots is not None and (options.board_only or is_board_alone(detection)):
         labelled = label_boards(detection, target, dots)
-    elif detector is not None:
+    elif options.solve == "paper":
         labelled = label_once(detection, target, dots)
     else:
-        labelled = label_images(detection, target, dots, options.ellipses, cache, options.workers)
+        labelled = label_images(detection, target, dots, options.ellipses, task.folder.cache, options.workers)
     return DetectedImages(detection, tuple(labelled), camera)
-
-
-def _detect_by_faces(task: Task, printed: TargetDesign) -> DetectedImages:
-    """Finds the camera by the printed faces of the target, and labels the images with it."""
-    target, options, guesses = task.target, task.options, guessed_cameras(task.files[0])
-    faces_alone = replace(task, target=printed, board=scale_reference(None, printed))
-    seen = detect_with(faces_alone, model_of(guesses[0], PHOTOGRAPHS))
-    if unseen := unseen_faces(task, seen):
-        raise DetectionError("E-TARGET-UNSEEN", unseen)
-    camera = place_and_find_camera(seen.observations, printed.faces, guesses).camera
-    if task.board.rows or len(printed.faces) < len(target.faces):
-        return detect_with(task, model_of(camera, PHOTOGRAPHS))
-    detection = seen_by(seen.detection, camera, target)
-    labelled = label_images(detection, target, None, options.ellipses, task.folder.cache, options.workers)
-    return DetectedImages(detection, tuple(labelled), model_of(camera, PHOTOGRAPHS))
 
 
 def camera_by_dots(task: Task, rough: CameraModel | None) -> CameraModel:
@@ -177,14 +176,6 @@ def camera_by_dots(task: Task, rough: CameraModel | None) -> CameraModel:
     start = guessed_cameras(files)[0] if rough is None else rough.calibrated(*require_common_size(files)[0])
     seen = detect_with(task.named("{} for the camera"), model_of(start, PHOTOGRAPHS))
     return model_of(unknown_lens(camera_of_dots(files, seen.detection, task.board, start, LENS).camera), PHOTOGRAPHS)
-
-
-def camera_for_a_look(task: Task) -> tuple[CameraModel, bool]:
-    """Returns the camera for a detection without one, and whether dots told it; else it has a medium focal length."""
-    if task.board.rows:
-        with suppress(DetectionError, DegenerateError):
-            return camera_by_dots(task, None), True
-    return model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), False
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
@@ -359,7 +350,7 @@ def usable_groups(
         if len(group) < 2:
             count = f"1 usable image ({group[0].name})" if group else "0 usable images"
             why = f", not {lost[name].name}: {lost[name].reason}" if name in lost else ""
-            remedy = "add photographs from other places, or move the image into the folder of its group"
+            remedy = "add photographs from other places"
             raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
         require_usable(group, board_alone, needs_board)
         return group
