@@ -1,6 +1,5 @@
 """The main job: calibrates a target from a folder of images. Each call of :func:`run` is a stage."""
 
-import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -23,9 +22,9 @@ from stcal.io.video import AUTO, write_frames
 from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
-from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
+from stcal.sfm.adjust.rims import MIN_VIEWS
 from stcal.sfm.checks.board_checks import shows_rim
-from stcal.sfm.checks.significance import MOST_SIGMAS
+from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
 from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
@@ -212,9 +211,7 @@ def adjusted(task: Task, groups: Groups) -> Calibration:
 
 def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Calibration) -> RunResult:
     """Returns the result of all stages, with every note on what was left out or is doubtful."""
-    solutions, target, board = groups.solutions, task.target, groups.board
-    faces, has_board = calibration.target.target_from_face, bool(task.board.rows)
-    observations = groups.observations
+    target, faces, has_board = task.target, calibration.target.target_from_face, bool(task.board.rows)
     printed = target.with_faces(printed=True).faces
     strange = tags_of_no_face(task.files[0], printed, [face for face in printed if face.id not in faces])
     return RunResult(
@@ -222,13 +219,13 @@ def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Cal
         photographs=task.photographs,
         camera=groups.camera,
         target_design=target,
-        board_design=board,
+        board_design=groups.board,
         options=groups.options,
         detection=seen.detection,
         labelled=groups.labelled,
-        observations=tuple(observations),
+        observations=tuple(groups.observations),
         graph=groups.graph,
-        solutions=solutions,
+        solutions=groups.solutions,
         calibration=calibration,
         chains=measure_chains(calibration.faces, calibration.target),
         camera_given=task.camera_given,
@@ -238,7 +235,7 @@ def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Cal
             *groups.unsolved,
             *calibration.notes,
             *not_as_drawn(faces, target, has_board and set(groups.names) == {TOP_GROUP}),
-            *(misnamed_groups(observations, target) if has_board else ()),
+            *(misnamed_groups(groups.observations, target) if has_board else ()),
             *groups.unseen_notes(target),
             *(Note(tags, NOT_AS_DRAWN, remedy="correct the ids in target.toml", then=": ") for tags in strange),
         ),
@@ -265,12 +262,12 @@ def compared(task: Task, result: RunResult) -> RunResult:
 
 def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> RunResult:
     """Returns the result with its checks, the caller's ``own`` last, σ that cover their findings, and rims."""
-    evidence = result.evidence(camera_prior(result.camera))
-    if result.options.rim is None:
-        evidence = replace(evidence, rim=shows_rim(evidence))
-    made = run_checks(replace(evidence, cause=_cause(result)), progress)
+    evidence = replace(result.evidence(), cause=_cause(result))
+    if result.options.rim is None and shows_rim(evidence):
+        evidence = replace(evidence, rim=True)
+    made = run_checks(evidence, progress)
     factor = max(check.enlarges for check in made)
-    calibration = on_surface(result, result.calibration.with_larger_sigma(factor), evidence.rim)
+    calibration = on_surface(result, result.calibration.with_larger_sigma(factor), evidence)
     result = replace(result, checks=made, calibration=calibration)
     further = own_checks(result, own)
     more = max([factor, *(check.enlarges for check in further)]) / factor
@@ -303,21 +300,19 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
             fault = f"raised {type(error).__name__}: {error}"
         if fault:
             name = getattr(make, "__name__", repr(make))
-            keys = (f"{name}_{number}" if number else name for number in itertools.count())
-            key = next(key for key in keys if key not in known)
+            key = name if name not in known else f"{name}_{len(known)}"
             remedy = "mend this check; the result does not depend on it"
             check = Check(key, f"Check {name}", "suspicious", f"it {fault}", (), 0, (), remedy)
         checks.append(check)
     return checks
 
 
-def on_surface(result: RunResult, calibration: Calibration, rim: bool) -> Calibration:
-    """Returns the calibration, of the luminous surface if rims are stated, or to be estimated (``rim``)."""
+def on_surface(result: RunResult, calibration: Calibration, evidence: Evidence) -> Calibration:
+    """Returns the calibration, of the luminous surface if rims are stated, or to be estimated."""
     design = result.target_design
     heights, sigma_mm = design.rim_of(), 0.0
-    if rim:
-        radius = design.radius_of() | result.board_design.radius_of()
-        found = find_rims(calibration.models, result.observations, radius, calibration.camera).get("circles")
+    if evidence.rim:
+        found = evidence.rims.get("circles")
         if found is None:
             raise InputError(
                 "E-RIM-UNKNOWN",

@@ -57,18 +57,9 @@ def radius_checks(evidence: Evidence) -> list[Check]:
                 away = value - usual
                 off_um = MICRO * away * float(design_mm[label])
                 single.append(Trial(label, off_um, "µm", (away / sigma) ** 2, 1, freedom))
-    single_remedy = (
-        "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "
-        "correct target.toml"
-    )
-    kind_remedy = (
-        "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: check that "
-        "both files are of this body, measure a circle, correct the file; a wrong radius makes a wrong eccentricity"
-    )
-    return [
-        assess("radius", single, "circles", single_remedy),
-        assess("radius-design", whole, "kinds of circle", kind_remedy),
-    ]
+    remedy = "a damaged or dirty circle, a wrong label or another radius: look at the overlays, correct target.toml"
+    of_kind = "images are over-exposed, or target.toml or board.toml is wrong: measure a circle, correct the file"
+    return [assess("radius", single, "circles", remedy), assess("radius-design", whole, "kinds of circle", of_kind)]
 
 
 RIM_SIGMAS = 4.0
@@ -112,10 +103,7 @@ def rim_check(
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check("rim", title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
-    remedy = (
-        "faces are where their circles appear; for the luminous surface, run without --no-rim, or state rim_mm in "
-        "target.toml, of dots in board.toml"
-    )
+    remedy = "faces are where circles appear; for the luminous surface, leave --no-rim out, or state rim_mm"
     return Check("rim", title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 
 
@@ -229,17 +217,9 @@ def pitch_check(evidence: Evidence) -> Check:
         return impossible("pitch", f"no face with {MIN_DOTS} circles", "add views of the faces" if circled else "")
     size = weighted / weight
     variance = square / freedom / weight + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
-    what, remedy = (
-        "size of the circles' faces",
-        "printed sizes or known distances in target.toml do not fit the circles there, and may be wrong with all "
-        "distances of the result: measure a side of each print with a calliper",
-    )
-    if evidence.board.rows:
-        what, remedy = (
-            "board pitch",
-            "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and so are all "
-            "distances of the result: measure the board over its full length with a calliper",
-        )
+    what, remedy = "board pitch", "pitch_mm, or the target's size, is wrong, and all lengths with it: measure the board"
+    if not evidence.board.rows:
+        what, remedy = "size of the circles' faces", "sizes in target.toml do not fit it: measure a side of each print"
     return assess("pitch", [Trial(what, 1e6 * size, "ppm", size**2 / variance, 1, freedom)], "boards", remedy)
 
 
@@ -256,10 +236,7 @@ def scales_check(evidence: Evidence) -> Check:
     networks, board, joint = evidence.networks, evidence.board, evidence.joint
     key, (title, _) = "scales", CHECKS["scales"]
     print_factor = 1.0 if joint is None else joint.print_factor
-    remedy = (
-        "one print, distance or board has another size than stated: measure a side of each print and correct "
-        "target.toml, or state size_sigma_mm"
-    )
+    remedy = "another size than stated: measure a side of each print, and correct target.toml or state size_sigma_mm"
     name, times = _alone(networks, board) or ("", 1.0)
     fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
     if print_factor > MOST_PRINT_FACTOR:

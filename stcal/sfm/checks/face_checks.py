@@ -106,10 +106,7 @@ def halves_check(evidence: Evidence, joint: JointResult) -> Check:
         )
         for face in faces[1:]
     ]
-    remedy = (
-        "images of one group contradict one another more than their residuals show: look for images in which something "
-        "moved, or that are blurred; trust no σ below this difference"
-    )
+    remedy = "images of one group contradict one another: look for one that is blurred, or in which something moved"
     return assess("halves", trials, "faces", remedy, covered=True)
 
 
@@ -157,10 +154,7 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
     if len(curing) == 1:
         remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
         return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
-    remedy = (
-        "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
-        "the faces in further groups, which show which one is wrong"
-    )
+    remedy = "something moved in one of the groups, or the focus changed: further groups will show which one is wrong"
     words = Guilt("groups", rivals=tuple(curing)).words()
     return replace(check, reason=f"{check.reason}; {words}", names=(), remedy=remedy)
 

@@ -62,10 +62,7 @@ def camera_check(evidence: Evidence) -> Check:
     if not evidence.camera_given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
         return impossible("camera", reason, "")
-    remedy = (
-        "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
-        "--refine-camera, or calibrate the camera again"
-    )
+    remedy = "not the camera of these images (focus, zoom, lens, size), or too coarse: use --refine-camera"
     networks, camera, found = evidence.networks, evidence.camera, evidence.calibration.camera
     if evidence.prior is not None and evidence.joint is not None:  # the options of a run ensure the latter
         model, stated = evidence.prior.colmap_model, evidence.prior.covariance
@@ -132,10 +129,7 @@ def field_check(evidence: Evidence) -> Check:
     value = float(sigma * np.sqrt(max(test.statistic, 0) / count))
     allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(test.freedom, 1)
     trial = Trial("camera", value, "px RMS", test.statistic / allowed, test.freedom, redundancy)
-    remedy = (
-        "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
-        "(FULL_OPENCV), and keep focus and aperture as they were then"
-    )
+    remedy = "the camera model cannot follow the distortion: calibrate with FULL_OPENCV, at this focus and aperture"
     return assess("residual-field", [trial], "residual fields", remedy)
 
 
@@ -220,10 +214,7 @@ def evenness_check(evidence: Evidence) -> Check:
         count = sum(shift > 0 for shift in shifts)
         chance = float(bdtrc(count - 1, len(shifts), UNEVEN_BY_CHANCE)) if count else 1.0
         trials.append(Trial(label, float(np.mean(shifts)), "µm", float(chdtri(1, chance)), 1))
-    remedy = (
-        "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, check "
-        "their light; their centres are measured by a wider model, with a larger σ"
-    )
+    remedy = "one side of them is darker in most views: clean them, shade them from glare, check their light"
     return assess("evenness", trials, "circles", remedy, "suspicious")
 
 
@@ -262,12 +253,10 @@ def moved_check(evidence: Evidence) -> Check:
     ]
     names, open_ones = [name for own in guilt for name in own.culprits], [w for own in guilt if (w := own.words())]
     names = sorted(names, key=check.names.index) if set(names) <= set(check.names) else names
-    remedies = [
-        "in these images the target stood at another place relative to the board than in the others of the group: sort "
-        "the images into groups in which nothing moved, or take the group again; leave out a single image: "
-        f"{without_image(name)}"
-        for name in names[:1]
-    ] + ["target or board moved between these images, or zoom or focus changed: take the group again"] * bool(open_ones)
+    where = "the target stood elsewhere relative to the board: sort images into groups, or leave a single one out"
+    remedies = [f"{where}: {without_image(name)}" for name in names[:1]] + [
+        "target or board moved between these images, or zoom or focus changed: take the group again"
+    ] * bool(open_ones)
     reason = "; ".join([check.reason, *open_ones])
     return replace(check, reason=reason, names=tuple(names), remedy="; ".join(remedies))
 
@@ -292,10 +281,7 @@ def _take_out(check: Check, remedy: str) -> Check:
 def labels_check(evidence: Evidence) -> Check:
     """Tests every observation against all others by its own covariance (Baarda's data snooping), and names those left
     out. Labels at each other's places are a fault: others may be exchanged without being noticed."""
-    remedy = (
-        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
-        "that was left out does no harm where other images show it"
-    )
+    remedy = "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label"
     trials = []
     for network in evidence.networks:
         model, total = network.model, float(network.redundancy.sum())
@@ -318,12 +304,11 @@ def labels_check(evidence: Evidence) -> Check:
         verdict = "failed"
         words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
         reason = f"{len(outliers)} left out, {'; '.join(words)}"
-        remedy = (
-            "in these images the target stood at another place relative to the board, or they belong to another group: "
-            f"leave them out, the first with {without_image(lost[0])}"
-            if lost
-            else "target or board moved between the images of a group, or zoom or focus changed: take it again"
-        )
+        remedy = "target or board moved between the images of a group, or zoom or focus changed: take it again"
+        if lost:
+            remedy = (
+                f"the target stood elsewhere, or they are of another group: leave them out: {without_image(lost[0])}"
+            )
     if swapped:
         verdict, reason = "failed", f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"

@@ -278,8 +278,7 @@ def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
 
 
 NO_ELLIPSES = (
-    "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
-    "values or of contours need another correction"
+    "centres do not move as those of ellipses: check radii, polarity and exposure; centroids need another method"
 )
 
 

@@ -90,38 +90,25 @@ def compare_with_paper(result: "RunResult", published: Answer | StcalError) -> C
 
 
 def in_steps(result: "RunResult") -> dict[str, Answer | StcalError]:
-    """Answers, or errors, from the run's own circles by the step added last, without the joint adjustment."""
+    """Answers, or errors, from the run's own circles by the step added last, with λ by rows, three-point frames and
+    single transforms, without the joint adjustment."""
+    camera, designs = result.camera, (result.target_design, result.board_design)
     weighted = [solution.model for solution in result.solutions]
-    equal = [_alike(model) for model in weighted]
+    equal = [
+        replace(m, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (len(m.measured_px), 1, 1))) for m in weighted
+    ]
+    # The models hold the corrections already; the calibration itself works without eccentricity.
+    plain: dict[str, Any] = {"solve": "paper", "frame": "three-point", "eccentricity": False, "refine_camera": False}
+    options = replace(result.options.adjustment(result.target_design), **plain)
     answers: dict[str, Answer | StcalError] = {}
     for step, models, eccentricity in zip(STEPS[:-1], (equal, equal, weighted), (False, True, True), strict=True):
         try:
-            answers[f"+ {step}"] = _chained(result, models, eccentricity)
+            refined = tuple(refine(model, camera, *designs, eccentricity).model for model in models)
+            calibration = calibrate(refined, camera, *designs, options)
+            answers[f"+ {step}"] = Answer(calibration.target, refined, calibration.scales)
         except StcalError as error:
             answers[f"+ {step}"] = error
     return answers
-
-
-def _alike(model: WorldModel) -> WorldModel:
-    """Returns the model with the same σ for all centres."""
-    n = len(model.measured_px)
-    return replace(model, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (n, 1, 1)))
-
-
-def _chained(result: "RunResult", models: Sequence[WorldModel], eccentricity: bool) -> Answer:
-    """Returns the answer with λ by rows, three-point frames, and single transforms."""
-    designs = result.target_design, result.board_design
-    models = tuple(refine(model, result.camera, *designs, eccentricity).model for model in models)
-    # The models hold the corrections already; the calibration itself works without eccentricity.
-    options = replace(
-        result.options.adjustment(result.target_design),
-        solve="paper",
-        frame="three-point",
-        eccentricity=False,
-        refine_camera=False,
-    )
-    calibration = calibrate(models, result.camera, *designs, options)
-    return Answer(calibration.target, models, calibration.scales)
 
 
 def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera: Camera) -> ComparedRow:

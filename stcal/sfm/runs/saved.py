@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import Field
 
 from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
@@ -34,7 +33,7 @@ from stcal.io.files import (
     require_unchanged,
 )
 from stcal.io.images import name_fault
-from stcal.io.json import Part, checked, read_json, read_result
+from stcal.io.json import Part, checked, read_json
 from stcal.io.table import csv_rows
 from stcal.labels import CircleLabel, Label, circle_labels
 from stcal.report.document import html
@@ -164,11 +163,6 @@ class SavedRun(Brief):
         if self.faces_file is None:
             raise no_faces(self.folder)
         return self.faces_file
-
-    @property
-    def sha256(self) -> dict[str, str]:
-        """Hashes of the folder's files at the end of the run, by path below the folder."""
-        return read_result(self.folder / RUN_MARKER, MarkerFile, "run", AGAIN).sha256 or {}
 
     @property
     def target(self) -> CalibratedTarget:
@@ -405,8 +399,8 @@ class RunResult(SavedRun):
             return None
         return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
-    def evidence(self, prior: CameraPrior) -> Evidence:
-        """Returns the input of the checks; ``prior`` : of the intrinsics, used if they were refined."""
+    def evidence(self) -> Evidence:
+        """Returns the input of the checks."""
         blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
         return Evidence(
             models=tuple(s.model for s in self.solutions),
@@ -417,7 +411,7 @@ class RunResult(SavedRun):
             board=self.board_design,
             options=self.options.adjustment(self.target_design),
             calibration=self.calibration,
-            prior=prior if self.options.refine_camera else None,
+            prior=camera_prior(self.camera) if self.options.refine_camera else None,
             rim=bool(self.options.rim),
             camera_given=self.camera_given,
             blur_px={name: float(np.median(edge_blur)) for name, edge_blur in blur.items() if len(edge_blur)},
@@ -438,37 +432,25 @@ class ImageRow(Part):
     circles: int
 
 
-class InitialPair(Part):
-    first: str
-    second: str
-
-
-class GroupRead(Part):
-    name: str
-    pairs: list[InitialPair] = Field(min_length=1)
-
-
-class SummaryRead(Part):
-    residual_rms_px: float
-
-
 class ReportRead(Part):
     """Content of ``report.json`` that every command on a run needs, of whatever version."""
 
     format: Literal["stcal report 1"] = "stcal report 1"
     images: list[ImageRow]
-    groups: list[GroupRead]
-    summary: SummaryRead
+    groups: list[dict[str, Any]]
+    summary: dict[str, Any]
 
     def names(self) -> list[tuple[str, str, int]]:
-        """Returns (name, group, circles) of the images in the database's order."""
-        pairs = {entry.name: entry.pairs[0] for entry in self.groups}
+        """Returns (name, group, circles) of the images in the database's order; an error if something is missing."""
+        pairs = {row["name"]: row["pairs"][0] for row in self.groups}
         group_of = {entry.name: entry.group for entry in self.images}
         for name, group in group_of.items():
             if fault := name_fault(name):
                 raise ValueError(f"image {name!r}: its name {fault}")
-            if not all(group_of.get(each) == group for each in (pairs[group].first, pairs[group].second)):
+            if not all(group_of.get(pairs[group][which]) == group for which in ("first", "second")):
                 raise ValueError(f"group {group}: its initial pair is not of its images")
+        if not np.isfinite(self.summary["residual_rms_px"]):
+            raise ValueError("residual_rms_px: a number needed")
         return [(entry.name, entry.group, entry.circles) for entry in self.images]
 
 

@@ -40,7 +40,6 @@ from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
 from stcal.sfm.checks.suite import EXPLAINS, cause_of_file
 from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, Outlier, WorldModel, by_group
-from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
@@ -313,9 +312,8 @@ def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None)
             solutions, unsolved = _solve_body(task, groups)
         else:
             folders = task.folder.stage / "scratch", task.folder.cache
-            arguments = groups.camera, task.target, groups.board, groups.options, task.progress, names or groups.names
-            solutions, unsolved = solve_groups(groups.observations, groups.graph, *folders, *arguments)
-    return replace(groups, solutions=tuple(solutions), unsolved=tuple(unsolved))
+            solutions, unsolved = solve_groups(groups, task.target, *folders, task.progress, names or groups.names)
+    return replace(groups, solutions=tuple(solutions.values()), unsolved=tuple(unsolved))
 
 
 def _each_group(names: Iterable[str], solve: Callable[[str], S]) -> tuple[dict[str, S], list[str]]:
@@ -416,40 +414,34 @@ class _Group:
 
 
 def solve_groups(
-    observations: Sequence[ImageObservations],
-    graph: ImageGraph,
+    groups: Groups,
+    target: TargetDesign,
     scratch: Path,  # a folder that is made and removed again
     cache: Path,  # folder for what later runs take up
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
     progress: Progress,
     names: Collection[str] | None = None,  # groups to solve, all if None
-) -> tuple[list[GroupSolution], list[str]]:
+) -> tuple[dict[str, GroupSolution], list[str]]:
     """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
     solution, the error of the first group is raised."""
-    common = camera, target, board, options.pairs, options.eccentricity
-    groups = {
-        name: _Group(
-            images,
-            [observations[i].name for i in graph.skeleton[name]],
-            _pairs_within(name, observations, graph),
-            *common,
-        )
-        for name, images in by_group(observations).items()
-        if names is None or name in names
-    }
-    paths = {name: cache / f"group-{group.key()}.npz" for name, group in groups.items()}
+    images, options = groups.observations, groups.options
+    inputs = {}
+    for name, of_group in by_group(images).items():
+        if names is None or name in names:
+            within = np.array([image.group == name for image in images])
+            pairs = (np.cumsum(within) - 1)[groups.graph.pairs[within[groups.graph.pairs].all(1)]]
+            skeleton = [images[i].name for i in groups.graph.skeleton[name]]
+            how = groups.camera, target, groups.board, options.pairs, options.eccentricity
+            inputs[name] = _Group(of_group, skeleton, pairs, *how)
+    paths = {name: cache / f"group-{group.key()}.npz" for name, group in inputs.items()}
     found: dict[str, GroupSolution | StcalError | None] = {name: kept(path, _stored) for name, path in paths.items()}
     pending = [name for name, solution in found.items() if solution is None]
-    step = counted(progress, "map", len(groups))
-    for _ in range(len(groups) - len(pending)):
+    step = counted(progress, "map", len(inputs))
+    for _ in range(len(inputs) - len(pending)):
         step(None)
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
-        jobs = [(groups[name], scratch / str(k)) for k, name in enumerate(pending)]
+        jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
         for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[name] = solution
             if isinstance(solution, GroupSolution):
@@ -459,24 +451,12 @@ def solve_groups(
 
     def scaled(name: str) -> GroupSolution:
         solution = found[name]
-        try:
-            if not isinstance(solution, GroupSolution):
-                raise solution or KeyError(name)
-            find_scale(solution.model, board)
-        except UNSOLVED as error:
-            error.append(pitch_hint(groups[name].images, board))
-            raise
+        if not isinstance(solution, GroupSolution):
+            raise solution or KeyError(name)
+        find_scale(solution.model, groups.board)
         return solution
 
-    solutions, notes = _each_group(groups, scaled)
-    return list(solutions.values()), notes
-
-
-def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
-    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
-    within = np.array([image.group == group for image in observations])
-    pairs = graph.pairs[within[graph.pairs].all(1)]
-    return (np.cumsum(within) - 1)[pairs]
+    return _each_group(inputs, scaled)
 
 
 def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
@@ -516,7 +496,7 @@ def _stored(stored, meta) -> GroupSolution:
     return GroupSolution(model=WorldModel(group, tuple(images), poses, parse_labels(labels), **arrays), **plain)
 
 
-def _solve_body(task: Task, groups: Groups) -> tuple[list[GroupSolution], list[str]]:
+def _solve_body(task: Task, groups: Groups) -> tuple[dict[str, GroupSolution], list[str]]:
     """Places the body by its faces, and maps and refines its groups; returns solutions, and notes on others."""
     camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
     circles = [face for face in task.target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
@@ -539,7 +519,7 @@ def _solve_body(task: Task, groups: Groups) -> tuple[list[GroupSolution], list[s
         return GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers)
 
     solutions, notes = _each_group(images, solved)
-    return list(solutions.values()), notes + body.unlinked_notes()
+    return solutions, notes + body.unlinked_notes()
 
 
 def refine_or_explain(

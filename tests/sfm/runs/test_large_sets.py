@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.incremental import complete
 from stcal.sfm.mapping.pairs import (
     MIN_SHARED,
@@ -23,7 +24,7 @@ from stcal.sfm.mapping.pairs import (
     track_parts,
 )
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.stages import solve_groups
+from stcal.sfm.runs.stages import Groups, solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 
@@ -46,8 +47,10 @@ def solve(scene, observations, kind, out):
     options = RunOptions().settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
     (out / ".stcal/cache").mkdir(parents=True)
-    folders, designs = (out / "scratch", out / ".stcal/cache"), (scene.target, scene.board)
-    solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
+    labelled = tuple(LabelledImage(image, ()) for image in observations)
+    groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
+    solved, _ = solve_groups(groups, scene.target, out / "scratch", out / ".stcal/cache", lambda *_: None)
+    solutions = list(solved.values())
     return (
         graph,
         solutions,
