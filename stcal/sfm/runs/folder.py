@@ -224,25 +224,15 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         require_pdf()
     complete_interrupted(run)
     notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
-    if out is not None:
-        return ReportAgain(*_page_and_pdf(run, pdf, out), notes)
-    with added_results(run) as stage:
-        files, gone = _page_and_pdf(run, pdf, stage / "report.html")
-    return ReportAgain(tuple(run / path.name for path in files), gone, notes)
-
-
-def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
-    """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
-    report = read_json(run / "report.json", "run", AGAIN)
-    with as_written(run / "report.json"):
-        checked(report, ReportFile)
-        page, gone = _report_page(run, report)
-    contents: dict[Path, str | bytes] = {out: page}
-    if pdf:
-        contents[out.with_suffix(".pdf")] = pdf_of(page)
-    for file, content in contents.items():
-        save(file, content)
-    return tuple(contents), gone
+    with contextlib.nullcontext(run) if out else added_results(run) as stage:
+        file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
+        with as_written(run / "report.json"):
+            checked(report, ReportFile)
+            page, gone = _report_page(run, report)
+        contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
+        for place, content in contents.items():
+            save(place, content)
+    return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), gone, notes)
 
 
 def _report_page(run: Path, report: dict) -> tuple[str, int]:

@@ -350,7 +350,18 @@ def usable_groups(
             why = f", not {lost[name].name}: {lost[name].reason}" if name in lost else ""
             remedy = "add photographs from other places"
             raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
-        require_usable(group, board_alone, needs_board)
+        if not board_alone and not any(image.face_ids() for image in group):
+            raise MappingError(
+                "E-GROUP-NO-FACE",
+                f"group {name}: no face of the target recognised in {len(group)} images; look at the overlays, check "
+                "target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
+            )
+        if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
+            raise MappingError(
+                "E-GROUP-NO-BOARD",
+                f"group {name}: no board recognised in {len(group)} images; keep the whole board in view, check "
+                "board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
+            )
         return group
 
     try:
@@ -358,23 +369,6 @@ def usable_groups(
     except MappingError as error:
         error.append("".join([f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason][:1]))
         raise
-
-
-def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
-    """Refuses a group that cannot be solved: without a needed board, or without a face."""
-    where = f"group {group[0].group}"
-    if not board_alone and not any(image.face_ids() for image in group):
-        raise MappingError(
-            "E-GROUP-NO-FACE",
-            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
-            "check target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
-        )
-    if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
-        raise MappingError(
-            "E-GROUP-NO-BOARD",
-            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
-            "check board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
-        )
 
 
 def _listed(names: Sequence[str], most: int = 6) -> str:
