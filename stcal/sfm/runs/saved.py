@@ -58,7 +58,15 @@ from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.comparisons import Comparison
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import GroupSolution
-from stcal.sfm.runs.transaction import AGAIN, RESULTS, MarkerFile, as_written, complete_interrupted, files_below
+from stcal.sfm.runs.transaction import (
+    AGAIN,
+    RESULTS,
+    MarkerFile,
+    as_written,
+    complete_interrupted,
+    files_below,
+    read_marker,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -163,6 +171,11 @@ class SavedRun(Brief):
         if self.faces_file is None:
             raise no_faces(self.folder)
         return self.faces_file
+
+    @property
+    def sha256(self) -> dict[str, str]:
+        """Hashes of the folder's files at the end of the run, by path below the folder."""
+        return read_marker(self.folder).sha256 or {}
 
     @property
     def target(self) -> CalibratedTarget:
@@ -449,8 +462,7 @@ class ReportRead(Part):
                 raise ValueError(f"image {name!r}: its name {fault}")
             if not all(group_of.get(pairs[group][which]) == group for which in ("first", "second")):
                 raise ValueError(f"group {group}: its initial pair is not of its images")
-        if not np.isfinite(self.summary["residual_rms_px"]):
-            raise ValueError("residual_rms_px: a number needed")
+        float(self.summary["residual_rms_px"])
         return [(entry.name, entry.group, entry.circles) for entry in self.images]
 
 

