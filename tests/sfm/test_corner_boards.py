@@ -168,14 +168,6 @@ def test_a_chessboard_that_looks_the_same_turned_has_both_numberings():
     assert len(CornerBoard.of(ChessboardDesign(4, 5, 10.0)).numberings(np.array([0]))) == 1
 
 
-def test_an_image_without_the_board_says_why():
-    scene = scene_with(BOARDS["charuco"], seed=5, width=864, height=576, images_per_group=2, groups=(("top", "left"),))
-    empty = np.full((576, 864), 90, np.uint8)
-    assert detect_image(empty, scene.camera, scene.target, scene.board, EllipseOptions()).notes == (
-        "board: no tag of DICT_4X4_50",
-    )
-
-
 @pytest.mark.parametrize("option", ["--solve paper", "--compare paper"])
 def test_the_published_method_needs_dots(option):
     with fails_with(f"E-OPTION-CONFLICT … {option} … squares or tags"):

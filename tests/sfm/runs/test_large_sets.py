@@ -133,12 +133,6 @@ def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
         assert away.max() < 16
 
 
-def test_small_groups_are_mapped_as_they_are(crowd):
-    scene, observations = crowd
-    few = observations[:SKELETON]
-    assert image_graph(few, scene.board, "sparse").skeleton["12"].tolist() == list(range(SKELETON))
-
-
 @pytest.mark.slow
 def test_sparse_gives_the_same_faces_as_all_pairs(crowd, tmp_path):
     """Both end in the minimum of the same adjustment: the difference is what stopping leaves, 1e-8 px in 2592."""

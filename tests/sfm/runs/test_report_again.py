@@ -33,15 +33,6 @@ def test_the_same_files_make_the_same_page(own_run, small_run, stcal_sfm, monkey
     assert verify(own_run).notes() == []
 
 
-def test_files_that_the_run_did_not_leave_so_are_said(own_run, stcal_sfm):
-    """Fewer lines of the table of centres, of which the page draws residuals."""
-    lines = (own_run / "labels.csv").read_text().splitlines(keepends=True)
-    (own_run / "labels.csv").write_text("".join(lines[: len(lines) // 2]))
-    code, out, _ = stcal_sfm("report", own_run)
-    assert code == 0
-    assert out.startswith("note: the run's folder is not as the run left it: 1 changed (labels.csv)\n")
-
-
 @pytest.mark.slow
 def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm):
     before = (own_run / RUN_MARKER).read_bytes()
