@@ -32,7 +32,7 @@ from stcal.sfm.data.group_model import ImageObservations, WorldModel
 from stcal.sfm.pipeline import run
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.run_result import RunResult
+from stcal.sfm.runs.saved import RunResult
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.shared import Once, without_rights

@@ -24,7 +24,7 @@ from stcal.labels import dot_cells
 from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.group_model import WorldModel
-from stcal.sfm.runs.paper import AS_PUBLISHED, STEPS, Answer, in_steps
+from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, Answer, in_steps
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
@@ -94,7 +94,10 @@ def trial(seed: int, width: int, folder: Path) -> dict[str, Errors]:
     published = run(*given, folder / "paper", *designs, RunOptions(solve="paper"))
     ours = run(*given, folder / "run", *designs)
     sigma = {f: 1e3 * float(np.sqrt(np.trace(c[3:, 3:]))) for f, c in ours.target.face_covariance.items()}
-    paper, own = (Answer.of(each.solutions, each.calibration) for each in (published, ours))
+    paper, own = (
+        Answer(each.target, tuple(solution.model for solution in each.solutions), each.calibration.scales)
+        for each in (published, ours)
+    )
     found = {PAPER: paper, **in_steps(ours), OURS: own}
     failed = {name: str(each) for name, each in found.items() if isinstance(each, StcalError)}
     if failed:

@@ -36,7 +36,7 @@ from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.labels import BOARD
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.run_result import RunResult
+from stcal.sfm.runs.saved import RunResult
 from tests.support import degrade
 from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
 

@@ -17,7 +17,7 @@ from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.sfm import pipeline
-from stcal.sfm.runs.run_result import RunResult
+from stcal.sfm.runs.saved import RunResult
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 SAME_PLANE_DEG = 45.0

@@ -18,12 +18,14 @@ import numpy as np
 
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
-from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.significance import Evidence
+from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.runs.groups import solve_groups
 from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.stages import Groups, solve_groups
 from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import simulate_centres
 
@@ -95,8 +97,10 @@ def measure(count: int, kind: str) -> dict:
         (out / "cache").mkdir()
         graph = image_graph(observations, scene.board, kind)
         marks.append(("graph", time.perf_counter()))
-        arguments = (scene.camera, scene.target, scene.board, options)
-        solutions, _ = solve_groups(observations, graph, out / "scratch", out / "cache", *arguments, lambda *_: None)
+        labelled = tuple(LabelledImage(image, ()) for image in observations)
+        groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
+        solved, _ = solve_groups(groups, scene.target, out / "scratch", out / "cache", lambda *_: None)
+        solutions = list(solved.values())
         marks.append(("map", time.perf_counter()))
         adjustment = options.adjustment(scene.target)
         result = calibrate([s.model for s in solutions], scene.camera, scene.target, scene.board, adjustment)

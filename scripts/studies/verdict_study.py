@@ -36,15 +36,15 @@ from stcal.parallel import one_thread
 from stcal.report.text import text_table
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import Refined
-from stcal.sfm.checks.significance import MOST_SIGMAS
-from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
+from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files
 from stcal.sfm.detect.labelling import label_images
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.report.check import CAUSE, ranked
-from stcal.sfm.runs.groups import LIKELY, explained, refine_or_explain, wrong_file
+from stcal.sfm.runs.stages import LIKELY, explained, refine_or_explain, wrong_file
 from stcal.synthetic.designs import second_design
 from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic

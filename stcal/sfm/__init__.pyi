@@ -27,9 +27,9 @@ from .planning.session import plan as plan
 from .report.check import Check as Check
 from .report.compare import compare as compare
 from .report.compare import compare_poses as compare_poses
+from .runs.comparisons import Tolerances as Tolerances
 from .runs.folder import report_again as report_again
 from .runs.run_options import RunOptions as RunOptions
-from .runs.run_result import ImageResult as ImageResult
-from .runs.run_result import RunResult as RunResult
+from .runs.saved import ImageResult as ImageResult
+from .runs.saved import RunResult as RunResult
 from .runs.saved import load_run as load_run
-from .runs.tolerances import Tolerances as Tolerances

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -74,23 +73,7 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
 
 def faces_of(text: str) -> tuple[str, ...]:
     """Parses ``front,right,top`` into the names of sides; all of them if the text is empty."""
-    return require_sides(tuple(name.strip().lower() for name in text.split(",")) if text else NAMES, text)
-
-
-def require_sides(names: tuple[str, ...], text: str) -> tuple[str, ...]:
-    """Returns names of sides; refuses those that are unknown, occur twice, or have no neighbour."""
-    for name in names:
-        if name not in NAMES:
-            raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}")
-        if names.count(name) > 1:
-            raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
-    if len(names) < 2 or set(names) in ({"front", "back"}, {"left", "right"}):
-        raise InputError(
-            "E-OPTION-VALUE",
-            f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; "
-            "use such as front,right,top",
-        )
-    return names
+    return tuple(name.strip().lower() for name in text.split(",")) if text else NAMES
 
 
 def size_of(text: str) -> tuple[float, float, float]:
@@ -99,14 +82,15 @@ def size_of(text: str) -> tuple[float, float, float]:
         width, height, depth = map(float, re.split("[,x×]", text))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"--size {text}: W,H,D in mm needed, such as 120,120,100") from error
-    require_size((width, height, depth), text)
+    require_size((width, height, depth))
     return width, height, depth
 
 
-def require_size(size_mm: Sequence[float], text: str) -> None:
-    """Refuses sides outside 1 mm to 100 m; ``text`` : the size in the message."""
+def require_size(size_mm: Sequence[float]) -> None:
+    """Refuses sides outside 1 mm to 100 m."""
     if not all(1 <= side <= 1e5 for side in size_mm):
-        raise InputError("E-OPTION-RANGE", f"--size {text}: sides of 1 mm to 100 m needed")
+        size = ",".join(f"{side:g}" for side in size_mm)
+        raise InputError("E-OPTION-RANGE", f"--size {size}: sides of 1 mm to 100 m needed")
 
 
 HIDDEN = 3
@@ -150,10 +134,8 @@ def make_pattern(
         for _ in range(TRIES):
             if (face := _strewn(side, circles, radius_mm, rng)) is not None:
                 # With itself turned or mirrored, or another one or its mirror image.
-                pairs = [(other, mirrored) for other in (face, *faces) for mirrored in (False, True)]
-                least, best = min(
-                    (least, best), (max(in_common(face, *pair) for pair in pairs), face), key=itemgetter(0)
-                )
+                alike = max(in_common(face, other, mirrored) for other in (face, *faces) for mirrored in (False, True))
+                least, best = (alike, face) if alike < least else (least, best)
             if least == 0:
                 break
         if best is None:
@@ -303,8 +285,20 @@ class DesignOptions(Brief):
 
     def __post_init__(self):
         require_fields(self, "design", circles=1, radius_mm=0, distance_mm=0, width=1, seed=0)
-        require_size(self.size_mm, ",".join(f"{side:g}" for side in self.size_mm))
-        require_sides(self.faces, ",".join(self.faces))
+        require_size(self.size_mm)
+        text = ",".join(self.faces)
+        for name in self.faces:
+            if name not in NAMES:
+                sides = ", ".join(NAMES)
+                raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {sides}")
+            if self.faces.count(name) > 1:
+                raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
+        if len(self.faces) < 2 or set(self.faces) in ({"front", "back"}, {"left", "right"}):
+            raise InputError(
+                "E-OPTION-VALUE",
+                f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; use such as "
+                "front,right,top",
+            )
 
     def ideal_camera(self) -> Camera:
         """Returns the camera without its distortion, or a default camera if none is given."""
@@ -458,13 +452,8 @@ def design_target(
     same = {name: getattr(options, name) for name in ("distance_mm", "width", "camera", "seed")}
     session = PlanOptions(images=images, noise=noise, **same)
     forecast = plan(session, target, board or made.board, target.rough_poses())
-    files: list[Path] = []
-    if folder is not None:
-        files = [folder / "target.toml", *([] if kept else [folder / "board.toml"])]
-        save_target(files[0], target)
-        for path in files[1:]:
-            save_board(path, made.board)
-    return DesignedTarget(target, board or made.board, forecast, "", source, made, tuple(files))
+    files = _saved(folder, target, None if kept else made.board)
+    return DesignedTarget(target, board or made.board, forecast, "", source, made, files)
 
 
 @require_arguments
@@ -508,7 +497,7 @@ def design_tag_body(
         The size is not within 1 mm and 100 m, a tag or a face does not exist, ``target.toml`` exists, or the body does
         not fit into the image.
     """
-    require_size([size_mm], f"{size_mm:g}")
+    require_size([size_mm])
     folder = _free(out)
     target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id, faces), expected_noise(of_corners=True)
     forecast, reason = None, ""
@@ -518,10 +507,7 @@ def design_tag_body(
         if error.code != "E-PLAN-UNLINKED":
             raise
         reason = str(error)
-    files = [] if folder is None else [folder / "target.toml"]
-    for path in files:
-        save_target(path, target)
-    return DesignedTarget(target, None, forecast, reason, source, None, tuple(files))
+    return DesignedTarget(target, None, forecast, reason, source, None, _saved(folder, target, None))
 
 
 def _free(out: str | Path | None) -> Path | None:
@@ -531,3 +517,14 @@ def _free(out: str | Path | None) -> Path | None:
             "E-OUTPUT-EXISTS", f"{Path(out) / 'target.toml'}: exists; move it away, or give another folder"
         )
     return None if out is None else Path(out)
+
+
+def _saved(folder: Path | None, target: TargetDesign, board: BoardDesign | None) -> tuple[Path, ...]:
+    """Writes the designs into a folder; returns the files."""
+    if folder is None:
+        return ()
+    save_target(folder / "target.toml", target)
+    if board is None:
+        return (folder / "target.toml",)
+    save_board(folder / "board.toml", board)
+    return folder / "target.toml", folder / "board.toml"

@@ -1,6 +1,5 @@
 """The main job: calibrates a target from a folder of images. Each call of :func:`run` is a stage."""
 
-import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -12,54 +11,43 @@ import numpy as np
 from stcal.boards.board_file import board_of as board_of
 from stcal.boards.finders import tags_of_no_face
 from stcal.boards.target_file import target_of
-from stcal.design import BoardDesign, TargetDesign, scale_reference, with_drawn_size
-from stcal.errors import ConvergenceError, InputError, InputNote, StcalError
+from stcal.design import BoardDesign, TargetDesign, scale_reference
+from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import CameraModel, camera_prior, model_of
 from stcal.io.cameras.read import camera_model
 from stcal.io.device import AUTO, write_frames
 from stcal.io.images import TOP_GROUP, chosen_images
-from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
-from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
-from stcal.sfm.checks.causes import cause_of_drawing, cause_of_size
-from stcal.sfm.checks.significance import MOST_SIGMAS
-from stcal.sfm.checks.suite import run_checks, shows_rim
-from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
-from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
+from stcal.sfm.adjust.rims import MIN_VIEWS
+from stcal.sfm.checks.board_checks import shows_rim
+from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
+from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.placed import plain_lens
 from stcal.sfm.report.check import Check
+from stcal.sfm.runs.comparisons import Answer, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run
-from stcal.sfm.runs.groups import (
-    Mapped,
-    groups_of,
-    map_groups,
-    start_of,
-    ungrouped,
-    unknown_face_notes,
-    unseen_board,
-    unseen_circles,
-    wrong_file,
-)
-from stcal.sfm.runs.paper import Answer, compare_with_paper, require_comparable
-from stcal.sfm.runs.report_file import unadjusted
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.run_result import RunResult
-from stcal.sfm.runs.task import (
+from stcal.sfm.runs.saved import RunResult
+from stcal.sfm.runs.stages import (
     DetectedImages,
+    Groups,
     Task,
-    camera_for_a_look,
+    camera_by_dots,
     detect,
     detect_with,
-    focal_sigma_px,
-    is_vague,
-    require_dots,
-    require_seen,
+    groups_of,
+    guessed_cameras,
+    map_groups,
+    scaled_by_drawing,
+    start_of,
     unseen_faces,
+    wrong_file,
 )
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
@@ -139,14 +127,12 @@ def run(
     with begun(images, camera, out, target, board, options, progress) as task:
         seen = detect(task)  # and label
         with overlays_beside(seen, task) as left_out:
-            task = scaled_by_drawing(task, seen, board)
-            mapped = map_groups(task, groups_of(task, seen))
-            mapped, calibration = adjust(task, seen, mapped)  # scale, chain, adjust
-            result = result_of(task, seen, mapped, calibration)
-            left_out.update(unadjusted(result))
-        if task.options.compare and result.target.target_from_face and task.camera is not None:
-            result = replace(result, comparison=compare_with_paper(result, as_published(task, task.camera)))
-        return write_run(checked(result, checks, task.progress), task.folder.stage, task.progress)
+            task = scaled_by_drawing(task, seen, board is not None)
+            groups, calibration = adjust(task, seen, map_groups(task, groups_of(task, seen)))  # scale, chain, adjust
+            result = result_of(task, seen, groups, calibration)
+            left_out.update(result.unadjusted())
+        result = checked(compared(task, result), checks, task.progress)
+        return write_run(result, task.folder.stage, task.progress)
 
 
 def frames_of_video(images: Images, out: str | Path, every: str | int | None) -> Images:
@@ -179,86 +165,40 @@ def begun(
     model = None if camera is None else camera_model(camera)
     design = target_of(target)
     scale = scale_reference(None if board is None and design.has_scale else board_of(board), design)
-    options = read_options(options, model, design, scale) if settle else options
+    options = options.for_run(model, design, scale) if settle else options
     given = {"images": place, "--camera": camera, "--target": target, "--board": board}
     marker = MarkerFile.of(place, options if settle else None)
     with kept_processes(options.workers), run_folder(out, marker, given) as folder:
         yield Task(files, folder, design, scale, options, progress or (lambda *_: None), model, place.absolute())
 
 
-def read_options(
-    options: RunOptions, model: CameraModel | None, target: TargetDesign, board: BoardDesign
-) -> RunOptions:
-    """Returns the options with every default decided; refuses those that the camera file and the designs forbid."""
-    printed = target.with_faces(printed=True).faces
-    if model is None:
-        options = replace(options, refine_camera=True)
-    elif is_vague(model) and not (options.refine_camera or options.compare):
-        options = replace(options, refine_camera=True)
-        known = f"camera file {model.source}: states its focal length to ±{focal_sigma_px(model):.3g} px only"
-        warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
-    of_circles = {
-        "--solve paper": options.solve == "paper",
-        "--compare paper": options.compare is not None,
-        "--board-only": options.board_only,
-    }
-    for name in (name for name, is_given in of_circles.items() if printed and is_given):
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
-        )
-    if model is None and not (board.rows or printed):
-        raise InputError(
-            "E-CAMERA-NEEDED",
-            "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-            "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or tags",
-        )
-    if options.compare:
-        require_dots(board, f"--compare {options.compare}")
-    options = options.settled(target)
-    if options.compare:
-        require_comparable(options.adjustment(target))
-    return options
-
-
-def scaled_by_drawing(task: Task, seen: DetectedImages, board: str | Path | BoardDesign | None) -> Task:
-    """Returns the task, in the unit of the drawing if nothing of known size is seen; refuses unseen printed faces."""
-    labels = [image.observations.labels for image in seen.labelled]
-    if task.options.board_only:
-        return task
-    if not any(image.observations.face_ids() for image in seen.labelled):
-        require_seen(task, seen.labelled)
-    is_assumed = board is None and not task.target.has_scale
-    if not is_assumed or any(isinstance(label, DotLabel) for of_image in labels for label in of_image):
-        return task
-    target = with_drawn_size(task.target, labels)
-    return replace(task, target=target, board=scale_reference(None, target))
-
-
-def adjust(task: Task, seen: DetectedImages, mapped: Mapped) -> tuple[Mapped, Calibration]:
+def adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Calibration]:
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
-    calibration = adjusted(task, mapped)
-    groups = mapped.groups
-    doubted = {s.model.group for s in mapped.solutions if s.outliers and groups.options.refine_camera}
+    calibration = adjusted(task, groups)
+    doubted = {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}
     if doubted:
         with suppress(StcalError):
             again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
-            refined = replace(mapped, solutions=tuple(by_name.get(s.model.group, s) for s in mapped.solutions))
-            calibration, mapped = adjusted(task, refined), refined
+            refined = replace(groups, solutions=tuple(by_name.get(s.model.group, s) for s in groups.solutions))
+            calibration, groups = adjusted(task, refined), refined
     lens = calibration.camera
-    if task.camera is not None or _has_rays(lens):
-        return mapped, calibration
-    warnings.warn(PLAIN, InputNote, stacklevel=2)
-    plain = model_of(plain_lens(lens), PHOTOGRAPHS)
-    groups = replace(groups, camera=start_of(plain, seen, task.options))
-    return adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+    corners = np.array([[x, y] for x in (0, lens.width) for y in (0, lens.height)], float)
+    try:
+        if task.camera is None:
+            lens.normalised_from_pixel(corners)
+    except ConvergenceError:  # a lens that folds its image
+        warnings.warn(PLAIN, InputNote, stacklevel=2)
+        plain = model_of(plain_lens(lens), PHOTOGRAPHS)
+        groups = replace(groups, camera=start_of(plain, seen, task.options))
+        return adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+    return groups, calibration
 
 
-def adjusted(task: Task, mapped: Mapped) -> Calibration:
+def adjusted(task: Task, groups: Groups) -> Calibration:
     """Returns the calibration by the solutions of the groups; of the board alone, its scale."""
-    groups, models = mapped.groups, [solution.model for solution in mapped.solutions]
+    models = [solution.model for solution in groups.solutions]
     camera, board, options = groups.camera, groups.board, groups.options.adjustment(task.target)
     with groups.explained():
         if not groups.board_alone:
@@ -269,20 +209,9 @@ def adjusted(task: Task, mapped: Mapped) -> Calibration:
     return calibration
 
 
-def _has_rays(camera: Camera) -> bool:
-    """Returns whether all corners of a camera's image have rays, as the lens does not fold them."""
-    try:
-        camera.normalised_from_pixel(np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float))
-    except ConvergenceError:
-        return False
-    return True
-
-
-def result_of(task: Task, seen: DetectedImages, mapped: Mapped, calibration: Calibration) -> RunResult:
+def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Calibration) -> RunResult:
     """Returns the result of all stages, with every note on what was left out or is doubtful."""
-    groups, solutions, target, board = mapped.groups, mapped.solutions, task.target, mapped.groups.board
-    faces, has_board = calibration.target.target_from_face, bool(task.board.rows)
-    observations, notes = groups.observations(), {i.observations.name: i.notes for i in groups.labelled}
+    target, faces, has_board = task.target, calibration.target.target_from_face, bool(task.board.rows)
     printed = target.with_faces(printed=True).faces
     strange = tags_of_no_face(task.files[0], printed, [face for face in printed if face.id not in faces])
     return RunResult(
@@ -290,53 +219,55 @@ def result_of(task: Task, seen: DetectedImages, mapped: Mapped, calibration: Cal
         photographs=task.photographs,
         camera=groups.camera,
         target_design=target,
-        board_design=board,
+        board_design=groups.board,
         options=groups.options,
         detection=seen.detection,
         labelled=groups.labelled,
-        observations=tuple(observations),
+        observations=tuple(groups.observations),
         graph=groups.graph,
-        solutions=solutions,
+        solutions=groups.solutions,
         calibration=calibration,
         chains=measure_chains(calibration.faces, calibration.target),
         camera_given=task.camera_given,
         notes=(
-            *(ungrouped(groups.labelled) if has_board else ()),
-            *unknown_face_notes({image.file.group for image in seen.detection.images}, target),
+            *(groups.assumed_notes() if has_board else ()),
             *groups.notes,
-            *mapped.notes,
+            *groups.unsolved,
             *calibration.notes,
             *not_as_drawn(faces, target, has_board and set(groups.names) == {TOP_GROUP}),
-            *(misnamed_groups(observations, target) if has_board else ()),
-            *misplaced_images(observations, notes, target),
-            *unseen_board(solutions, board),
-            *unseen_circles(solutions, target),
+            *(misnamed_groups(groups.observations, target) if has_board else ()),
+            *groups.unseen_notes(target),
             *(Note(tags, NOT_AS_DRAWN, remedy="correct the ids in target.toml", then=": ") for tags in strange),
         ),
     )
 
 
-def as_published(task: Task, model: CameraModel) -> Answer | StcalError:
-    """Returns the answer of the published method on the same photographs, or the error that prevents it."""
-    options = replace(
-        task.options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
-    )
-    task = replace(task.named("{}, as published"), options=options.settled(task.target))
+def compared(task: Task, result: RunResult) -> RunResult:
+    """Returns the result with its comparison with the published method on the same photographs, if it is asked for."""
+    model, published = task.camera, {"solve": "paper", "frame": "three-point", "eccentricity": False}
+    if not task.options.compare or not result.target.target_from_face or model is None:
+        return result
+    options = replace(task.options, **published, refine_camera=False, compare=None).settled(task.target)
+    task = replace(task.named("{}, as published"), options=options)
+    answer: Answer | StcalError
     try:
-        mapped = map_groups(task, groups_of(task, detect_with(task, model)))
-        return Answer.of(mapped.solutions, adjusted(task, mapped))
+        groups = map_groups(task, groups_of(task, detect_with(task, model)))
+        calibration = adjusted(task, groups)
+        models = tuple(solution.model for solution in groups.solutions)
+        answer = Answer(calibration.target, models, calibration.scales)
     except StcalError as error:
-        return error
+        answer = error
+    return replace(result, comparison=compare_with_paper(result, answer))
 
 
 def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> RunResult:
     """Returns the result with its checks, the caller's ``own`` last, σ that cover their findings, and rims."""
-    evidence = result.evidence(camera_prior(result.camera))
-    if result.options.rim is None:
-        evidence = replace(evidence, rim=shows_rim(evidence))
-    made = run_checks(replace(evidence, cause=_cause(result)), progress)
+    evidence = replace(result.evidence(), cause=_cause(result))
+    if result.options.rim is None and shows_rim(evidence):
+        evidence = replace(evidence, rim=True)
+    made = run_checks(evidence, progress)
     factor = max(check.enlarges for check in made)
-    calibration = on_surface(result, result.calibration.with_larger_sigma(factor), evidence.rim)
+    calibration = on_surface(result, result.calibration.with_larger_sigma(factor), evidence)
     result = replace(result, checks=made, calibration=calibration)
     further = own_checks(result, own)
     more = max([factor, *(check.enlarges for check in further)]) / factor
@@ -369,21 +300,19 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
             fault = f"raised {type(error).__name__}: {error}"
         if fault:
             name = getattr(make, "__name__", repr(make))
-            keys = (f"{name}_{number}" if number else name for number in itertools.count())
-            key = next(key for key in keys if key not in known)
+            key = name if name not in known else f"{name}_{len(known)}"
             remedy = "mend this check; the result does not depend on it"
             check = Check(key, f"Check {name}", "suspicious", f"it {fault}", (), 0, (), remedy)
         checks.append(check)
     return checks
 
 
-def on_surface(result: RunResult, calibration: Calibration, rim: bool) -> Calibration:
-    """Returns the calibration, of the luminous surface if rims are stated, or to be estimated (``rim``)."""
+def on_surface(result: RunResult, calibration: Calibration, evidence: Evidence) -> Calibration:
+    """Returns the calibration, of the luminous surface if rims are stated, or to be estimated."""
     design = result.target_design
     heights, sigma_mm = design.rim_of(), 0.0
-    if rim:
-        radius = design.radius_of() | result.board_design.radius_of()
-        found = find_rims(calibration.models, result.observations, radius, calibration.camera).get("circles")
+    if evidence.rim:
+        found = evidence.rims.get("circles")
         if found is None:
             raise InputError(
                 "E-RIM-UNKNOWN",
@@ -437,11 +366,14 @@ def detect_images(
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
         notes, model = [], task.camera
         if model is None:
-            model, told = camera_for_a_look(task)
-            if task.target.with_faces(printed=False).faces:
-                notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
+            model, note = model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
+            with suppress(DetectionError, DegenerateError):
+                if task.board.rows:
+                    model = camera_by_dots(task, None)
+                    note = FOUND_BY_DOTS.format(model.focal[0])
+            notes += [note] if task.target.with_faces(printed=False).faces else []
         seen = detect_with(task, model)
-        if unseen := unseen_faces(task, seen.labelled):
+        if unseen := unseen_faces(task, seen):
             notes.append(unseen)
         with overlays_beside(seen, task, page=False):
             return replace(seen, notes=tuple(notes))

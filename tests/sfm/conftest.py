@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from stcal.cli.main import main_sfm
-from stcal.sfm.runs.run_result import SavedRun
-from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.saved import SavedRun, load_run
 from tests.fuzzing.stock import make_stock
 from tests.outcome import Outcome, ended
 from tests.shared import own_copy

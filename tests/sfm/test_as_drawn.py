@@ -10,10 +10,8 @@ from stcal.boards.target_file import target_toml
 from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
-from stcal.sfm.checks.causes import cause_of_drawing
-from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
-from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
+from stcal.sfm.checks.suite import cause_of_drawing
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
 from stcal.sfm.planning.session import corners_seen
@@ -84,7 +82,7 @@ def test_groups_that_show_other_faces_than_their_names_say():
     assert len(misnamed_groups(aside, target)) == 1
     assert misnamed_groups([*seen("12", "1", "2", "3"), *seen("12", "1", "3")], target) == []
     [note] = misnamed_groups([*seen("12", "1", "3"), *seen("14", "1", "4")], target)
-    assert note.startswith("not as drawn: group 12 is named after faces 1 and 2 and shows faces 1 and 3: correct")
+    assert note.startswith("not as drawn: group 12 is named after faces 1 and 2, and shows 1 and 3: correct")
 
 
 @pytest.mark.parametrize("what", sampled(["size", "id"]))
@@ -143,20 +141,6 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(face
     assert list(found.values()) == pytest.approx([factor] * len(faces), rel=0.05)
     with fails_with(f"E-BODY-SIZES … face {CUBE.faces[faces[0]].id}"):
         place_with_camera(noisy, drawn, rough)
-
-
-def test_photographs_that_belong_to_another_group_are_named():
-    """By the faces that were read in them, also where these were left out."""
-    target = reference_target()
-    right, wrong = seen("12", "1", "2"), seen("14", "1", "4")
-    stray = seen("12")[0]
-    notes = {stray.name: (Note("left out", ELSEWHERE, "1"), Note("left out", ELSEWHERE, "4"))}
-    images = [stray, *right[1:], *wrong]
-    [note] = misplaced_images(images, notes, target)
-    assert note == "12/0 shows faces 1 and 4, as group 14 does: move it there if it was taken with these"
-    both = {stray.name: (*notes[stray.name], Note("left out", ELSEWHERE, "2"))}
-    assert misplaced_images(images, both, target) == []
-    assert misplaced_images([*right, *wrong], {}, target) == []
 
 
 def test_of_two_faces_none_is_blamed_for_its_size():

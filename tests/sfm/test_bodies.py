@@ -267,14 +267,6 @@ def size_row(found, board) -> tuple[str, str]:
     return row.origin, row.words
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_few_photographs_show_each_face_twice(seed):
-    """At random a face of a cube is in one of ten images or in none in every third set."""
-    scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=10, distance_mm=300, seed=seed))
-    shown = [face.id for image in range(10) for face in scene.faces_in_view(image)]
-    assert all(shown.count(face.id) >= 2 for face in scene.target.faces)
-
-
 @pytest.mark.parametrize(
     ("target", "images", "seed"), [(tag_cube(60), 20, 0), (tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)]
 )
@@ -321,18 +313,6 @@ def test_the_distance_that_a_body_needs_is_named():
     with fails_with("E-SIMULATE-BODY … 60 mm … 182 mm"):
         make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 60.0))
     make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 182.5))
-
-
-@pytest.mark.slow
-def test_photographs_from_the_shortest_distance_of_a_design_can_be_simulated(tmp_path, stcal_sfm):
-    size, distance = 12, 50
-    camera = ("--distance", distance, "--images", 2)
-    words = ("design", tmp_path / "cube", "--tags", "cube", "--size", size, "--width", 640, *camera)
-    assert stcal_sfm(*words)[0] == 0
-    words = ("simulate", tmp_path / "data", "--target", tmp_path / "cube/target.toml", "--width", 320, *camera)
-    assert stcal_sfm(*words)[0] == 0
-    poses = json.loads((tmp_path / "data/truth.json").read_text())["camera_from_target"].values()
-    assert all(40 < np.linalg.norm(np.array(pose)[:3, 3]) < 75 for pose in poses)
 
 
 def test_more_images_and_a_known_distance_help_a_planned_body():

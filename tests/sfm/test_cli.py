@@ -36,15 +36,6 @@ def test_init_writes_the_reference_design_and_overwrites_nothing(command, tmp_pa
     assert "exists" in err
 
 
-def test_the_umbrella_command_is_the_same_thing(command, tmp_path):
-    code, out, _ = command("sfm", "init", tmp_path / "a", entry=main)
-    assert code == 0
-    assert "board.toml" in out
-    code, out, _ = command("--version", entry=main)
-    assert code == 0
-    assert out.strip().count(".") == 2
-
-
 @pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "Part: ")])
 def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(command, small_set, no_page, faces, word):
     """Face 3 is not in the photographs."""

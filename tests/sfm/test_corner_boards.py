@@ -14,8 +14,8 @@ from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.report.compare import compare
+from stcal.sfm.runs.run_options import require_dots
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.task import require_dots
 from stcal.synthetic.dataset import image_name, write_dataset
 from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
@@ -167,14 +167,6 @@ def test_a_chessboard_that_looks_the_same_turned_has_both_numberings():
     both = CornerBoard.of(ChessboardDesign(3, 5, 10.0)).numberings(np.array([0, 1]))
     assert both.tolist() == [[[0, 0], [0, 1]], [[2, 4], [2, 3]]]
     assert len(CornerBoard.of(ChessboardDesign(4, 5, 10.0)).numberings(np.array([0]))) == 1
-
-
-def test_an_image_without_the_board_says_why():
-    scene = scene_with(BOARDS["charuco"], seed=5, width=864, height=576, images_per_group=2, groups=(("top", "left"),))
-    empty = np.full((576, 864), 90, np.uint8)
-    assert detect_image(empty, scene.camera, scene.target, scene.board, EllipseOptions()).notes == (
-        "board: no tag of DICT_4X4_50",
-    )
 
 
 @pytest.mark.parametrize("option", ["--solve paper", "--compare paper"])

@@ -105,13 +105,6 @@ def test_crosscheck_names_what_is_missing(stcal_sfm, small_run, tmp_path):
     refuses("E-FIELD-TYPE … tolerances … Tolerances", sfm.crosscheck, small_run, program, 0.5)
 
 
-def test_report_again(stcal_sfm, small_run, tmp_path):
-    one, two = tmp_path / "one.html", tmp_path / "two.html"
-    assert stcal_sfm("report", small_run, "--out", one)[0] == 0
-    assert sfm.report_again(small_run, out=two).files == (two,)
-    assert one.read_bytes() == two.read_bytes()
-
-
 @pytest.mark.parametrize(
     "call", [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise], ids=lambda call: call.__name__
 )

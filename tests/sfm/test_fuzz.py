@@ -1,6 +1,5 @@
 """Cases of `scripts/studies/fuzz_study.py`: spoiled inputs of every command, and mistakes that must be told."""
 
-import json
 import os
 
 import numpy as np
@@ -12,7 +11,7 @@ from stcal.io.files import require_written
 from tests.commands import CALLS, COMMANDS
 from tests.fuzzing import kept
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
-from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.judged import OUT, Outcome, failures, hashes, lay_out
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, perform, went_through
@@ -159,11 +158,6 @@ def kinds(schedule, *outcome, refused=False) -> set[str]:
 ERROR = "error: pairs.csv: no rows\n"
 
 
-def test_an_error_of_one_line_is_in_order(schedule):
-    assert kinds(schedule, 2, "", ERROR, 1.0) == set()
-    assert kinds(schedule, 2, "", "detect: 1 of 4\n" + ERROR, 1.0) == set()
-
-
 @pytest.mark.parametrize(
     ("kind", "outcome"),
     [
@@ -192,13 +186,3 @@ def test_files_are_watched(schedule):
     (written / "page.html").unlink()
     assert (folder / OUT).is_dir()
     assert kinds(schedule, 2, "", ERROR, 1.0) == {"input changed", "broken result", "earlier result lost"}
-
-
-def test_a_call_in_this_process(stock, case):
-    call = call_of("sfm compare", "run/faces.json")
-    lay_out(stock, case, call, earlier=True)
-    outcome = in_process(call, "stcal-sfm", case)
-    assert outcome.code == 0, outcome.err
-    assert "as JSON" in outcome.out
-    assert (case / OUT / "errors.json").read_text() != EARLIER
-    assert json.loads((case / OUT / "errors.json").read_text())["faces"]

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.run_text import run_text
+from stcal.sfm.runs.folder import run_text
 from tests.sfm.truth import true_poses
 from tests.support.image_poses import pose_error
 

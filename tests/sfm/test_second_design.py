@@ -1,10 +1,7 @@
 """Another maker's target is a file and not a code change: the second design through its TOML files alone."""
 
-import numpy as np
 import pytest
 
-from stcal.boards.board_file import load_board
-from stcal.boards.target_file import load_target
 from stcal.sfm import run
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
@@ -24,33 +21,11 @@ def calibrated(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_design_differs_in_everything(calibrated):
-    _, data, _, _ = calibrated
-    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
-    assert target.polarity == board.polarity == "dark"
-    assert len(target.faces) == 3
-    assert board.corner is not None
-    assert not {"1", "2", "3"} & {face.id for face in target.faces}
-
-
-@pytest.mark.slow
-def test_every_label_is_right(calibrated):
-    from stcal.synthetic.scene import image_circles
-
-    scene, _, _, result = calibrated
-    for image in result.observations:
-        number = int(image.name.split("_")[-1].split(".")[0]) - 1000
-        seen = image_circles(scene, image.group, number)
-        truth = dict(zip(seen.labels, seen.centre_px, strict=True))
-        for label, centre in zip(image.labels, image.centre_px, strict=True):
-            assert np.linalg.norm(centre - truth[label]) < 1.5, f"{image.name} {label}"
-
-
-@pytest.mark.slow
 def test_faces_are_right_within_their_own_sigma(calibrated):
     _, data, out, result = calibrated
     comparison = compare(out, data / "truth.json").content()
     assert not comparison["missing"]
+    assert comparison["labels"]["wrong"] == 0
     for face_id, row in comparison["faces"].items():
         if face_id == comparison["reference_face"]:
             continue

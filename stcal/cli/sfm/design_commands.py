@@ -237,8 +237,8 @@ def demo(
     """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
     from stcal.sfm.pipeline import run
     from stcal.sfm.report.compare import compare, comparison_table
+    from stcal.sfm.runs.folder import run_text
     from stcal.sfm.runs.run_options import RunOptions
-    from stcal.sfm.runs.run_text import run_text
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.scene import SceneOptions, make_scene
 

@@ -80,8 +80,8 @@ def run(
 
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
+    from stcal.sfm.runs.folder import found_lines, run_text
     from stcal.sfm.runs.run_options import RunOptions
-    from stcal.sfm.runs.run_text import found_lines, run_text
     from stcal.sfm.runs.transaction import is_finished
 
     options = RunOptions(
@@ -141,8 +141,8 @@ def detect(
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
+    from stcal.sfm.runs.folder import detection_text, found_in_all
     from stcal.sfm.runs.run_options import RunOptions
-    from stcal.sfm.runs.run_text import detection_text, found_in_all
 
     options = RunOptions(
         solve=solve,
@@ -285,7 +285,7 @@ def crosscheck(
     """Map the same database with the native COLMAP, compare faces, circles and cameras, and add this to the report."""
     from stcal.sfm.interop.crosscheck import comparison_text
     from stcal.sfm.interop.crosscheck import crosscheck as checked
-    from stcal.sfm.runs.tolerances import Tolerances
+    from stcal.sfm.runs.comparisons import Tolerances
 
     tolerances = Tolerances(
         tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma

@@ -35,8 +35,7 @@ from stcal.sfm.budget.combine import (
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, judgement_of
-from stcal.sfm.runs.run_result import SavedRun
-from stcal.sfm.runs.saved import Verified
+from stcal.sfm.runs.saved import SavedRun, Verified
 
 BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
 """Probability that one length that agrees is beyond U by chance, and that any length of a test is beyond the limit."""

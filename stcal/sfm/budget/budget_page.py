@@ -30,8 +30,7 @@ from stcal.sfm.budget.budget_file import (
     refusals,
 )
 from stcal.sfm.budget.combine import Budget, budget_of_run, statement_of
-from stcal.sfm.runs.run_result import AnyRun
-from stcal.sfm.runs.saved import saved_run, verify
+from stcal.sfm.runs.saved import AnyRun, saved_run, verify
 
 RELATES = (
     "The results relate only to the item named above, in the state in which it was photographed. The certificate may "

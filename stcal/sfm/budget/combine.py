@@ -36,8 +36,7 @@ from stcal.sfm.adjust.uncertainty import (
     derivatives,
 )
 from stcal.sfm.data.group_model import MetricModel
-from stcal.sfm.runs.run_result import SavedRun
-from stcal.sfm.runs.saved import adjusted_run
+from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
 FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, after those that are given, and empty if they are not."""

@@ -1,121 +1,64 @@
-"""Checks of the board and its scale, and of the measured radius of every circle."""
+"""Checks of the board, the radii of circles and the scale."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtrc
 
-from stcal.design import BoardDesign, TargetDesign
-from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.design import BoardDesign, known_distances
+from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_similarity, skew
 from stcal.geometry.robust import robust_sigma
-from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.refine import Network
+from stcal.labels import DotLabel, Label, dot_cells
+from stcal.sfm.adjust.refine import MIN_DOTS, Network, known_points
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
 from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
-from stcal.sfm.checks.significance import Trial, assess
-from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
+from stcal.sfm.checks.significance import MICRO, Evidence, Trial, assess
+from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05
 """σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
-EDGE_DIFFERENCE_PX = 0.01
-"""σ of the difference of this bias between large and small circles."""
 RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
 """Smallest number of circles of one design radius that are compared with each other."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Radii:
-    """Radii of the target's circles and the board's dots: medians over all images and groups."""
-
-    labels: tuple[Label, ...]
-    design_mm: np.ndarray  # (c,)
-    ratio: np.ndarray  # (c,) measured over designed
-    size_px: np.ndarray  # (c,) designed radius in the images, geometric mean of the ellipse's axes
-
-    def __post_init__(self):
-        for name in ("design_mm", "ratio", "size_px"):
-            object.__setattr__(self, name, frozen(getattr(self, name), (len(self.labels),), name))
-
-    def classes(self) -> dict[str, np.ndarray]:
-        """Returns the indices of the circles of each kind and radius, by the name of the class."""
-        indices: dict[str, list[int]] = {}
-        for i, (label, radius) in enumerate(zip(self.labels, self.design_mm, strict=True)):
-            kind = "dots" if isinstance(label, DotLabel) else "circles"
-            indices.setdefault(f"{kind} of radius {radius:g} mm", []).append(i)
-        return {name: np.array(members) for name, members in indices.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Size:
-    """Size of the target over that of its design, minus 1, with its σ and the degrees of freedom of σ."""
-
-    name: str
-    size: float
-    sigma: float
-    freedom: int
-
-
-def measure_radii(
-    networks: Sequence[Network],
-    images: Sequence[ImageObservations],
-    design_mm: dict[Label, float],
-    camera: Camera,
-    rim_mm: Mapping[Label, float],  # heights of the rims that the result allows for, which hide a part of the circles
-) -> Radii:
-    """Computes radii from the areas of the ellipses and the positions and planes of the circles."""
-    by_name = {image.name: image for image in images}
-    ratio: dict[Label, list[np.ndarray]] = {}
-    size: dict[Label, list[np.ndarray]] = {}
-    for network in networks:
-        views = radius_views(network.model, by_name, design_mm, camera)
+def radius_checks(evidence: Evidence) -> list[Check]:
+    """Tests every circle against those of its kind and radius, and each such kind against its design. Radii follow from
+    the areas of the ellipses and the positions and planes of the circles: medians over all images and groups."""
+    design_mm, before_mm = evidence.radius_mm, _before_circles_mm(evidence)
+    by_name = {image.name: image for image in evidence.images}
+    found: dict[Label, list[np.ndarray]] = {}  # (2, v) of a group: measured over designed radius, designed radius in px
+    for network in evidence.networks:
+        views = radius_views(network.model, by_name, design_mm, evidence.calibration.camera)
         for k, label in enumerate(network.model.labels):
-            if label not in design_mm:  # a corner
-                continue
-            own = views.point_index == k
-            hidden = lost_radius_mm(rim_mm.get(label, 0.0), views.tan_tilt[own], design_mm[label]) / design_mm[label]
-            faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / design_mm[label]
-            ratio.setdefault(label, []).append(views.ratio[own] + hidden + faded)
-            size.setdefault(label, []).append(views.size_px[own])
-    medians = (np.array([np.median(np.concatenate(v)) for v in each.values()]) for each in (ratio, size))
-    return Radii(tuple(ratio), np.array([design_mm[label] for label in ratio]), *medians)
-
-
-def radius_checks(radii: Radii) -> list[Check]:
-    """Tests every circle against those of its kind and radius, and each such class against its design."""
+            if label in design_mm:  # no corner
+                own, radius = views.point_index == k, design_mm[label]
+                hidden = lost_radius_mm(before_mm[label], views.tan_tilt[own], radius) / radius
+                faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / radius
+                found.setdefault(label, []).append(np.stack([views.ratio[own] + hidden + faded, views.size_px[own]]))
+    kinds: dict[str, dict[Label, np.ndarray]] = {}
+    for label, parts in found.items():
+        kind = f"{'dots' if isinstance(label, DotLabel) else 'circles'} of radius {design_mm[label]:g} mm"
+        kinds.setdefault(kind, {})[label] = np.median(np.concatenate(parts, axis=1), axis=1)
     single, whole = [], []
-    for name, members in radii.classes().items():
-        ratio = radii.ratio[members]
+    for kind, members in kinds.items():
+        ratio, size_px = np.array(list(members.values())).T
         usual = float(np.median(ratio))
-        bias_px = (usual - 1) * float(np.median(radii.size_px[members]))
-        whole.append(Trial(name, bias_px, "px", (bias_px / EDGE_BIAS_PX) ** 2, 1))
-        if len(members) < MIN_PEERS:
-            continue
-        sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
-        freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
-        for i in members:
-            away = float(radii.ratio[i]) - usual
-            single.append(
-                Trial(radii.labels[i], 1e3 * away * float(radii.design_mm[i]), "µm", (away / sigma) ** 2, 1, freedom)
-            )
-    single_remedy = (
-        "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "
-        "correct target.toml"
-    )
-    class_remedy = (
-        "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: check that "
-        "both files are of this body, measure a circle, correct the file; a wrong radius makes a wrong eccentricity"
-    )
-    return [
-        assess("radius", single, "circles", single_remedy),
-        assess("radius-design", whole, "kinds of circle", class_remedy),
-    ]
+        bias_px = (usual - 1) * float(np.median(size_px))
+        whole.append(Trial(kind, bias_px, "px", (bias_px / EDGE_BIAS_PX) ** 2, 1))
+        if len(members) >= MIN_PEERS:
+            sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
+            freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
+            for label, value in zip(members, ratio.tolist(), strict=True):
+                away = value - usual
+                off_um = MICRO * away * float(design_mm[label])
+                single.append(Trial(label, off_um, "µm", (away / sigma) ** 2, 1, freedom))
+    remedy = "a damaged or dirty circle, a wrong label or another radius: look at the overlays, correct target.toml"
+    of_kind = "images are over-exposed, or target.toml or board.toml is wrong: measure a circle, correct the file"
+    return [assess("radius", single, "circles", remedy), assess("radius-design", whole, "kinds of circle", of_kind)]
 
 
 RIM_SIGMAS = 4.0
@@ -159,57 +102,54 @@ def rim_check(
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check("rim", title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
-    remedy = (
-        "faces are where their circles appear; for the luminous surface, run without --no-rim, or state rim_mm in "
-        "target.toml, of dots in board.toml"
-    )
+    remedy = "faces are where circles appear; for the luminous surface, leave --no-rim out, or state rim_mm"
     return Check("rim", title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 
 
-def size_by_radii(radii: Radii) -> Size | None:
-    """Slope of measured over designed radii of the target's circles, minus 1; None if it is not determined."""
-    is_circle = np.array([isinstance(label, CircleLabel) for label in radii.labels], bool)
-    size = radii.size_px[is_circle]
-    design = radii.design_mm[is_circle]
-    if len(size) < MIN_PEERS or np.ptp(design) == 0:
-        return None
-    design_matrix = np.column_stack([np.ones(len(size)), size])
-    excess = (radii.ratio[is_circle] - 1) * size
-    fit, *_ = np.linalg.lstsq(design_matrix, excess, rcond=None)
-    freedom = len(size) - 2
-    variance = float(((excess - design_matrix @ fit) ** 2).sum()) / freedom
-    slope_variance = variance * np.linalg.inv(design_matrix.T @ design_matrix)[1, 1]
-    reach = np.median(size[design == design.max()]) - np.median(size[design == design.min()])
-    sigma = np.hypot(np.sqrt(slope_variance), EDGE_DIFFERENCE_PX / reach)
-    return Size("by radii of circles", float(fit[1]), float(sigma), freedom)
+def rim_of_run(evidence: Evidence) -> Check:
+    """Returns :func:`rim_check` of a run."""
+    return rim_check(evidence.rims, evidence.face_sigma_mm, evidence.allowed_mm, bool(evidence.radius_mm))
+
+
+def shows_rim(evidence: Evidence) -> bool:
+    """Returns whether the radii of the faces' circles show for certain that they lie behind a rim that none stated."""
+    if evidence.joint is None or evidence.target.rim_of() or "circles" not in evidence.rims:
+        return False
+    rim = evidence.rims["circles"]
+    return rim.height_mm > rim_limit_mm(rim, evidence.face_sigma_mm)
+
+
+def _before_circles_mm(evidence: Evidence) -> dict[Label, float]:
+    """Heights of the rims in front of circles and dots: estimated if allowed for or found, else as stated."""
+    stated = {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
+    names = rim_of_run(evidence).names
+    found = {k: rim.height_mm for k, rim in evidence.rims.items() if evidence.rim or KINDS[k][0] in names}
+    return {
+        label: found.get("dots" if isinstance(label, DotLabel) else "circles", stated.get(label, 0.0))
+        for label in evidence.radius_mm
+    }
 
 
 DESIGN_SCALE = 1e-4
 """Relative σ of the target's size against its design: the effect of 4 K on aluminium, or of a printer on a film."""
-MIN_DOTS = 4
 
 
-def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]:
+def board_checks(evidence: Evidence) -> list[Check]:
     """Tests the dots of every group against the grid, and the scale of each row and column against the rest."""
     whole, lines = [], []
-    for network in networks:
+    for network in evidence.networks:
         dots = np.array([i for i, label in enumerate(network.model.labels) if isinstance(label, DotLabel)])
         if len(dots) < MIN_DOTS:
             continue
-        gap, weight, cells = _board_gap(network, dots, board)
-        redundancy = network.redundancy.sum()
-        freedom = 3 * len(dots) - 7
-        square = float(gap @ weight @ gap)
-        rms = 1e3 * float(np.sqrt((gap**2).mean()))
+        gap, weight, cells = _board_gap(network, dots, evidence.board)
+        redundancy, freedom, square = network.redundancy.sum(), 3 * len(dots) - 7, float(gap @ weight @ gap)
         name = f"group {network.model.group}"
-        whole.append(Trial(name, rms, "µm RMS", square, freedom, redundancy))
-        lines += _lines(name, gap, weight, cells, board, max(1.0, square / freedom), redundancy)
+        rms_um = MICRO * float(np.sqrt((gap**2).mean()))
+        whole.append(Trial(name, rms_um, "µm RMS", square, freedom, redundancy))
+        lines += _lines(name, gap, weight, cells, evidence.board, max(1.0, square / freedom), redundancy)
     remedy = "a bent, swollen or badly printed board, or a stated σ too small: measure it, state its σ in board.toml"
     of_line = "check this line of the board for damage, and rows, columns and pitch in board.toml"
-    return [
-        assess("board", whole, "groups", remedy),
-        assess("board-lines", lines, "rows and columns", of_line),
-    ]
+    return [assess("board", whole, "groups", remedy), assess("board-lines", lines, "rows and columns", of_line)]
 
 
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
@@ -253,45 +193,15 @@ def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redun
     return trials
 
 
-def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii, has_board: bool = True) -> Check:
-    """Tests the measured size of the target, by positions and by radii of circles, against its design, with its own σ
-    of 100 ppm: no residual shows a wrong pitch. Radii that contradict the positions are left out."""
+def pitch_check(evidence: Evidence) -> Check:
+    """Tests the size of the target, by the positions of its circles, against its design, with its own σ of 100 ppm: no
+    residual shows a wrong pitch."""
+    calibrated, target = evidence.calibration.target, evidence.target
     if target.up_to_scale:
         return impossible("pitch", "the drawing defines the size", "state a known distance with scale")
-    positions, of_radii = _size_by_positions(calibrated, target), size_by_radii(radii)
-    measures = [m for m in (positions, of_radii) if m is not None]
-    if not measures:
-        reason = f"no face with {MIN_DOTS} circles, and no circles of two sizes"
-        has_circles = any(face.printed is None for face in target.faces)
-        return impossible("pitch", reason, "add views of the faces" if has_circles else "")
-    shown = measures
-    if positions and of_radii:
-        square = (positions.size - of_radii.size) ** 2 / (positions.sigma**2 + of_radii.sigma**2)
-        if fdtrc(1, min(positions.freedom, of_radii.freedom), square) < SUSPICIOUS:  # they contradict each other
-            measures = [positions]
-    weight = np.array([1 / m.sigma**2 for m in measures])
-    size = float(weight @ [m.size for m in measures] / weight.sum())
-    variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
-    freedom = sum(m.freedom for m in measures)
-    remedy = (
-        "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and so are all "
-        "distances of the result: measure the board over its full length with a calliper"
-        if has_board
-        else "printed sizes or known distances in target.toml do not fit the circles there, and all distances of the "
-        "result may be wrong with them: measure a side of each print with a calliper"
-    )
-    trial = Trial(
-        "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
-    )
-    check = assess("pitch", [trial], "boards", remedy)
-    single = tuple(TestedValue(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
-    reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
-    return replace(check, reason=reason, measured=check.measured + single)
-
-
-def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:
     weighted, weight, square, freedom = 0.0, 0.0, 0.0, 0
-    for face in target.with_faces(printed=False).faces:  # the others have told the scale
+    circled = target.with_faces(printed=False).faces  # the others have told the scale
+    for face in circled:
         indices = [i for i, label in enumerate(face.labels()) if label in calibrated.circles]
         if len(indices) < MIN_DOTS:
             continue
@@ -303,5 +213,114 @@ def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Si
         residuals = fit.inverse() @ xyz - design
         square, freedom = square + float((residuals[:, :2] ** 2).sum()), freedom + 2 * len(indices) - 4
     if not freedom:
+        return impossible("pitch", f"no face with {MIN_DOTS} circles", "add views of the faces" if circled else "")
+    size = weighted / weight
+    variance = square / freedom / weight + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
+    what, remedy = "board pitch", "pitch_mm, or the target's size, is wrong, and all lengths with it: measure the board"
+    if not evidence.board.rows:
+        what, remedy = "size of the circles' faces", "sizes in target.toml do not fit it: measure a side of each print"
+    return assess("pitch", [Trial(what, 1e6 * size, "ppm", size**2 / variance, 1, freedom)], "boards", remedy)
+
+
+PPM = 1e6
+ALONE, FAR, LEAST_AGREEING = 0.005, 3.0, 2
+"""Relative error of size from which one source is named, how many times as far off as the others it must be, and how
+many others must agree."""
+MOST_PRINT_FACTOR = 10.0
+"""Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
+
+
+def scales_check(evidence: Evidence) -> Check:
+    """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
+    networks, board, joint = evidence.networks, evidence.board, evidence.joint
+    key, (title, _) = "scales", CHECKS["scales"]
+    print_factor = 1.0 if joint is None else joint.print_factor
+    remedy = "another size than stated: measure a side of each print, and correct target.toml or state size_sigma_mm"
+    name, times = _alone(networks, board) or ("", 1.0)
+    fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
+    if print_factor > MOST_PRINT_FACTOR:
+        # σ that have grown so much would hide the contradiction that made them grow.
+        grown = TestedValue("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        if name:
+            size = TestedValue(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
+            return Check(key, title, "failed", fits, (size, grown), 1, (name,), f"correct the size of {name}")
+        why = "the size or drawing of the print is another one, or its σ too small"
+        reason = f"{grown.name} at {grown.words()}: {why}"
+        return Check(key, title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
+    trials: list[Trial] = []
+    for network in networks:
+        names, log_scale, gradient, variance = _sources(network, board, print_factor)
+        if len(names) < 2:
+            continue
+        covariance = gradient @ network.covariance_mm2 @ gradient.T + np.diag(variance)
+        weight = np.linalg.inv(covariance)
+        away = log_scale - float(weight.sum(0) @ log_scale / weight.sum())
+        spread = np.diag(covariance) - 1 / weight.sum()
+        freedom = float(network.redundancy.sum())
+        trials += [
+            Trial(source, PPM * off, "ppm", off**2 / own, 1, freedom)
+            for source, off, own in zip(names, away.tolist(), spread.tolist(), strict=True)
+            if own > 0
+        ]
+    if not trials:
+        return impossible(key, "only one source of the scale", "state a known distance with scale")
+    check = assess(key, trials, "sources of the scale", remedy)
+    if check.names and name:
+        reason = f"{fits}; {check.reason}"
+        check = replace(check, reason=reason, names=(name,), remedy=f"correct the size of {name}")
+    return check
+
+
+def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float] | None:
+    """Returns the one source that contradicts all others, which agree, and its size over the stated one."""
+    off: dict[str, list[float]] = {}
+    for network in networks:
+        names, log_scale, *_ = _sources(network, board, 1.0)
+        for name, value in zip(names, (log_scale - np.median(log_scale)).tolist() if names else (), strict=True):
+            off.setdefault(name, []).append(value)
+    ratio = {name: float(np.median(values)) for name, values in off.items()}
+    if len(ratio) < LEAST_AGREEING + 1:
         return None
-    return Size("by positions of circles", weighted / weight, float(np.sqrt(square / freedom / weight)), freedom)
+    name = max(ratio, key=lambda each: abs(ratio[each]))
+    others = max(abs(value) for each, value in ratio.items() if each != name)
+    return (name, float(np.exp(ratio[name]))) if abs(ratio[name]) > max(ALONE, FAR * others) else None
+
+
+def _sources(
+    network: Network, board: BoardDesign, print_factor: float
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the s sources of the scale: their names, the logarithm of the model's scale over the known size (s,), its
+    gradient by the points (s, 3p), and the variance of the known size (s,)."""
+    model = network.model
+    parts = [
+        (f"face {face.id}", members, face.places_mm(model.labels[i].circle for i in members),
+         print_factor * (face.sigma_mm or 1.0), face.size_sigma)
+        for face, members in known_points(model.labels, board)
+    ]  # fmt: skip
+    dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
+    if len(dots) >= MIN_DOTS:
+        parts.append(("board", dots, board.places_mm(model.labels[i] for i in dots), board.sigma_mm, 0.0))
+    names, values, gradients = [], [], []
+    for name, members, design, sigma_mm, size_sigma in parts:
+        with suppress(DegenerateError):
+            found = align_similarity(model.xyz_model[members], design)
+            middle = design - design.mean(0)
+            square = float((middle**2).sum())
+            gradient = np.zeros((len(model.labels), 3))
+            gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
+            names.append(name)
+            values.append((np.log(found.scale), sigma_mm**2 / square + size_sigma**2))
+            gradients.append(gradient.ravel())
+    place = {label: i for i, label in enumerate(model.labels)}
+    for known in known_distances(board):
+        if known.first in place and known.second in place:
+            i, j = place[known.first], place[known.second]
+            apart = model.xyz_model[i] - model.xyz_model[j]
+            gradient = np.zeros((len(model.labels), 3))
+            gradient[i] = apart / float(apart @ apart)
+            gradient[j] = -gradient[i]
+            names.append(f"distance {known.first} to {known.second}")
+            values.append((np.log(np.linalg.norm(apart) / known.mm), (known.sigma_mm / known.mm) ** 2))
+            gradients.append(gradient.ravel())
+    log_scale, variance = np.array(values).reshape(-1, 2).T
+    return names, log_scale, np.array(gradients), variance

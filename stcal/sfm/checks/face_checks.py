@@ -1,7 +1,8 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 
@@ -10,17 +11,16 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import faces_of_known_shape
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.parallel import run_in_order
-from stcal.sfm.adjust.calibration import AdjustOptions, Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.refine import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
-from stcal.sfm.checks.significance import Guilt, Trial, assess
+from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
@@ -28,54 +28,43 @@ MIN_HALF = 2
 """Smallest number of images of a group in each half."""
 EXPLAINED = 0.05
 """Smallest share of the variance that a group must add in a tested direction; below it, rounding would be tested."""
-MICRO = 1e3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Again:
-    """Input of further adjustments of parts of a run, which begin at its ``joint`` result and keep its intrinsics."""
+def _loop_remedy(evidence: Evidence) -> str:
+    """Returns what makes comparisons of groups possible; nothing where all images are one group without a board."""
+    return "add a group that closes a loop of faces" if evidence.board.rows or len(evidence.linked) > 1 else ""
 
-    calibration: Calibration
-    joint: JointResult
-    target: TargetDesign
-    board: BoardDesign
-    options: AdjustOptions
 
-    def loop_remedy(self) -> str:
-        """Returns what makes comparisons of groups possible; nothing where all images are one group without a board."""
-        needed = self.board.rows or len(self.joint.models) > 1
-        return "add a group that closes a loop of faces" if needed else ""
-
-    def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
-        """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
-        jobs = [(models, self.board, self.options.flatness_mm, self.joint) for models in parts]
-        return run_in_order(_adjusted, jobs, 1)
-
-    def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
-        """Returns the poses of ``faces``, in the frame of the first one, by the adjustment of a part of the models."""
-        if isinstance(joint, StcalError):
-            raise joint
-        whole = self.calibration.target
-        start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
-        try:
-            posed = calibrated_target(joint, start, self.target, self.options.frame)
-            for face in faces[1:]:
-                np.linalg.cholesky(posed.face_covariance[face])  # fails where rounding is all that determines it
-            return posed, joint
-        except np.linalg.LinAlgError as error:
-            raise _unfixed(joint.models) from error
+def _adjust(evidence: Evidence, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
+    """Adjusts parts of the models as the run did, from its result and with its intrinsics; returns the error of a part
+    that has no result."""
+    jobs = [(models, evidence.board, evidence.options.flatness_mm, evidence.joint) for models in parts]
+    return run_in_order(_adjusted, jobs, 1)
 
 
 def _adjusted(models: Sequence[MetricModel], board, flatness_mm, whole: JointResult) -> JointResult | StcalError:
     models = [model for model in models if model.images]  # a part of a group may hold no two images of a point
-    if not models:
-        return _unfixed(models)
     try:
-        return result_of(adjust_part(models, board, flatness_mm, whole))
+        return result_of(adjust_part(models, board, flatness_mm, whole)) if models else _unfixed(models)
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:
         return _unfixed(models)
+
+
+def _posed(evidence: Evidence, joint: JointResult | StcalError, faces: Sequence[str]) -> CalibratedTarget:
+    """Returns the poses of ``faces``, in the frame of the first one, by the adjustment of a part of the models."""
+    if isinstance(joint, StcalError):
+        raise joint
+    whole = evidence.calibration.target
+    start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
+    try:
+        posed = calibrated_target(joint, start, evidence.target, evidence.options.frame)
+        for face in faces[1:]:
+            np.linalg.cholesky(posed.face_covariance[face])  # fails where rounding is all that determines it
+        return posed
+    except np.linalg.LinAlgError as error:
+        raise _unfixed(joint.models) from error
 
 
 def _unfixed(models: Sequence[MetricModel]) -> DegenerateError:
@@ -94,20 +83,19 @@ def _face_trial(name: str, a: Rigid, b: Rigid, covariance: np.ndarray, redundanc
     return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
 
 
-def halves_check(again: Again) -> Check:
+def halves_check(evidence: Evidence, joint: JointResult) -> Check:
     """Compares two halves of the images, alternate ones of every group; the board's deviations are common to both."""
-    models, reference = again.joint.models, again.calibration.target.reference_face
+    models, faces = joint.models, _faces(evidence)
     fewest = min(models, key=lambda model: len(model.images))
     if len(fewest.images) < 2 * MIN_HALF:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
         return impossible("halves", reason, "add images")
-    faces = [reference, *(f for f in again.calibration.target.target_from_face if f != reference)]
-    joints = again.adjust([[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
+    halves = _adjust(evidence, [[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
     try:
-        (first, joint), (second, second_joint) = (again.posed(joint, faces) for joint in joints)
+        first, second = (_posed(evidence, half, faces) for half in halves)
     except StcalError as error:
         return impossible("halves", f"half of the images do not determine the result ({error})", "add images")
-    redundancy = joint.redundancy + second_joint.redundancy
+    redundancy = sum(half.redundancy for half in halves if isinstance(half, JointResult))
     trials = [
         _face_trial(
             f"face {face}",
@@ -118,66 +106,57 @@ def halves_check(again: Again) -> Check:
         )
         for face in faces[1:]
     ]
-    remedy = (
-        "images of one group contradict one another more than their residuals show: look for images in which something "
-        "moved, or that are blurred; trust no σ below this difference"
-    )
+    remedy = "images of one group contradict one another: look for one that is blurred, or in which something moved"
     return assess("halves", trials, "faces", remedy, covered=True)
 
 
-def groups_check(again: Again, networks: Sequence[Network]) -> Check:
+def _faces(evidence: Evidence) -> list[str]:
+    """Returns the faces of the result, the reference face first."""
+    whole = evidence.calibration.target
+    return list(dict.fromkeys([whole.reference_face, *whole.target_from_face]))
+
+
+def groups_check(evidence: Evidence, joint: JointResult) -> Check:
     """Compares the result without one group with the whole, with the covariance of a nested adjustment. A group is
     named only if the others agree without it, and do not if another one is left out instead."""
-    calibration = again.calibration
-    models, whole = again.joint.models, calibration.target
-    reference = whole.reference_face
-    faces = [reference, *(f for f in whole.target_from_face if f != reference)]
-    members = {m.group: {f.face for f in calibration.faces if f.group == m.group} for m in models}
+    whole, faces = evidence.calibration.target, _faces(evidence)
+    members = {m.group: {f.face for f in evidence.calibration.faces if f.group == m.group} for m in joint.models}
     removable = [
         g
         for g in members
-        if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
+        if len(members) > 1 and _linked([s for other, s in members.items() if other != g], faces[0]) >= set(faces)
     ]
     trials: list[Trial] = []
-    joints = again.adjust([[m for m in models if m.group != group] for group in removable])
-    cures = [
-        not isinstance(joint, StcalError) and _agree(joint, [n for n in networks if n.model.group != group])
-        for group, joint in zip(removable, joints, strict=True)
-    ]
-    for group, adjustment in zip(removable, joints, strict=True):
+    curing = []
+    parts = _adjust(evidence, [[m for m in joint.models if m.group != group] for group in removable])
+    for group, part in zip(removable, parts, strict=True):
+        if isinstance(part, StcalError):
+            continue
+        extra, freedom, free = _added(part, [n for n in evidence.linked if n.model.group != group])
+        if freedom < 1 or float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS:  # the others agree
+            curing.append(group)
         try:
-            without, joint = again.posed(adjustment, faces)
+            without = _posed(evidence, part, faces)
         except StcalError:
             continue
-        scale = (again.joint.sigma_scale / joint.sigma_scale) ** 2
+        scale = (joint.sigma_scale / part.sigma_scale) ** 2
         for face in faces[1:]:
             change = _difference(without.target_from_face[face], whole.target_from_face[face])
             larger = scale * without.face_covariance[face]
             name = f"face {face} without group {group}"
-            trial = _nested_trial(name, change, larger, whole.face_covariance[face], joint.redundancy)
+            trial = _nested_trial(name, change, larger, whole.face_covariance[face], part.redundancy)
             trials += [trial] if trial else []
     if not trials:
-        reason = "every group holds a face that no other links"
-        return impossible("groups", reason, again.loop_remedy())
+        return impossible("groups", "every group holds a face that no other links", _loop_remedy(evidence))
     check = assess("groups", trials, "faces", "", covered=True)
     if not check.names:
         return check
-    curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
     if len(curing) == 1:
         remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
         return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
-    remedy = (
-        "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
-        "the faces in further groups, which show which one is wrong"
-    )
+    remedy = "something moved in one of the groups, or the focus changed: further groups will show which one is wrong"
     words = Guilt("groups", rivals=tuple(curing)).words()
     return replace(check, reason=f"{check.reason}; {words}", names=(), remedy=remedy)
-
-
-def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
-    """Whether a joint adjustment adds no more to the squared residuals of its groups than chance does."""
-    extra, freedom, free = _added(joint, networks)
-    return freedom < 1 or float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS
 
 
 def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int, float]:
@@ -209,9 +188,9 @@ def _linked(members: list[set[str]], start: str) -> set[str]:
     return reached
 
 
-def loops_check(again: Again) -> Check:
+def loops_check(evidence: Evidence, joint: JointResult) -> Check:
     """Compares two ways to one face through different groups, with each group adjusted alone with its board."""
-    calibration = again.calibration
+    calibration, models = evidence.calibration, joint.models
     pairs = [
         (face, first, second)
         for face, chains in measure_chains(calibration.faces, calibration.target).items()
@@ -219,26 +198,23 @@ def loops_check(again: Again) -> Check:
         if not set(first.groups) & set(second.groups)
     ]
     groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
-    alone = again.adjust([[m for m in again.joint.models if m.group == group] for group in groups])
+    alone = _adjust(evidence, [[m for m in models if m.group == group] for group in groups])
     single = dict(zip(groups, alone, strict=True))
 
     @cache  # several ways share a step
     def step_of(group: str, a: str, b: str) -> tuple[Rigid, np.ndarray]:
-        target, _ = again.posed(single[group], (a, b))
+        target = _posed(evidence, single[group], (a, b))
         return target.target_from_face[b], target.face_covariance[b]
 
     trials = []
-    redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
+    redundancy = sum(2 * len(m.image_index) for m in models)
     for face, first, second in pairs:
-        try:
+        with suppress(StcalError):
             (one, of_one), (other, of_other) = (_along(step_of, way) for way in (first, second))
-        except StcalError:
-            continue
-        name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
-        trials.append(_face_trial(name, one, other, of_one + of_other, redundancy))
+            name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
+            trials.append(_face_trial(name, one, other, of_one + of_other, redundancy))
     if not trials:
-        reason = "no face is reached in two ways that share no group"
-        return impossible("loops", reason, again.loop_remedy())
+        return impossible("loops", "no face is reached in two ways that share no group", _loop_remedy(evidence))
     remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
     return assess("loops", trials, "loops", remedy, covered=True)
 
@@ -256,10 +232,10 @@ def _along(step_of: Callable[[str, str, str], tuple[Rigid, np.ndarray]], way: Fa
     return pose, covariance
 
 
-def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
+def agreement_check(evidence: Evidence, joint: JointResult) -> Check:
     """Tests what one target, the board's σ and flat faces add to the residuals (F test of nested models). An adjustment
     that has not settled is suspicious: contradictory observations make its last steps slow."""
-    extra, freedom, free = _added(joint, networks)
+    extra, freedom, free = _added(joint, evidence.linked)
     if freedom < 1:
         return impossible("agreement", "one target and board add no condition to the groups", "add images")
     value = float(np.sqrt(extra / freedom))
@@ -279,13 +255,14 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     )
 
 
-def flatness_check(
-    networks: Sequence[Network], flatness_mm: float | None, printed: Collection[str] = (), factor: float = 1.0
-) -> Check:
-    """Tests the distance of each circle from the plane of the other circles of its face in all free networks.
-    ``printed``: ids of faces of known shape, whose flatness is ``factor`` times the stated one."""
+def flatness_check(evidence: Evidence) -> Check:
+    """Tests the distance of each circle from the plane of the other circles of its face in all free networks. Faces of
+    known shape are as flat as the joint adjustment found them."""
+    networks, flatness_mm = evidence.networks, evidence.options.flatness_mm
     if flatness_mm is None:
         return impossible("flatness", "the run was asked not to use flatness", "state it with --flatness")
+    printed = {face.id for face in faces_of_known_shape(evidence.board)}
+    factor = evidence.joint.bend_factor if evidence.joint else 1.0
     heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = {}
     for network in networks:
         for face, members in network.model.points_by_face().items():
@@ -311,7 +288,7 @@ def flatness_check(
                 trials.append(Trial(label, MICRO * height, "µm", height**2 * weight[i, i], 1, redundancy))
     remedy = "a point out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
     # Bent paper does no harm: its corners are where they are, and the frame is laid over all of them.
-    worst = "suspicious" if heights.keys() <= set(printed) else "failed"
+    worst = "suspicious" if heights.keys() <= printed else "failed"
     return assess("flatness", trials, "points", remedy, worst)
 
 

@@ -2,32 +2,35 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from scipy.special import bdtrc, chdtri
 
-from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
-from stcal.geometry.rigid import skew
+from stcal.errors import StcalError
+from stcal.geometry.camera import PARAMETER_NAMES, intrinsic_basis
 from stcal.geometry.robust import ratio_limit, robust_sigma
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import Label
-from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.refine import Network, ScoreTest, solve_score
+from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.refine import Network, ScoreTest, adjust, solve_score
 from stcal.sfm.checks.significance import (
     FREE,
+    MICRO,
+    MOST,
     MOST_SIGMAS,
+    NO_ELLIPSES,
     SHOWN,
+    Evidence,
     Guilt,
     Trial,
     assess,
-    culprits,
+    by_eccentricity,
+    by_motion,
     culprits_by_score,
     on_face,
 )
-from stcal.sfm.data.group_model import ImageObservations, Outlier
 from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_CIRCLES = 3
@@ -43,35 +46,33 @@ UNEVEN_BY_CHANCE = 0.01
 FIELD_DEGREE = 3
 FIELD_FLOOR_PX = 0.002
 """σ of a field that any centring leaves: pixel raster, JPEG blocks and light from one side do not average out."""
+NEARLY_ALL = 0.7
+"""Share of the images beyond which a check that names them names none."""
+EXCHANGED = 0.1
+"""Largest deviation of exchanged labels: each centre lies at the place of the other to within this share of their
+distance."""
+MANY = 5
+"""Number of centres left out of one image at which they are no longer single hidden or dirty circles."""
 
 
-def camera_check(
-    networks: Sequence[Network],
-    camera: Camera,
-    calibration: Calibration,
-    prior: CameraPrior | None,  # of the intrinsics if they were refined
-    given: bool = True,  # False if the camera was found from the photographs
-) -> Check:
+def camera_check(evidence: Evidence) -> Check:
     """Tests whether the intrinsics are those of the images: in the residuals of all free networks (score test) if they
     are as given, by their distance from the given ones if they were refined."""
-    if not given:
+    if not evidence.camera_given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
         return impossible("camera", reason, "")
-    remedy = (
-        "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
-        "--refine-camera, or calibrate the camera again"
-    )
-    if prior is not None and calibration.joint is not None:  # the options of a run ensure the latter
-        change = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
-        change = change @ (calibration.camera.parameters() - camera.parameters())
-        gained = prior.covariance - calibration.joint.camera_covariance
-        model, estimate, sigma = prior.colmap_model, change, np.sqrt(np.diag(prior.covariance))
-        test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ change)
-        redundancy = sum(n.redundancy.sum() for n in networks)
+    remedy = "not the camera of these images (focus, zoom, lens, size), or too coarse: use --refine-camera"
+    networks, camera, found = evidence.networks, evidence.camera, evidence.calibration.camera
+    if evidence.prior is not None and evidence.joint is not None:  # the options of a run ensure the latter
+        model, stated = evidence.prior.colmap_model, evidence.prior.covariance
+        estimate = np.linalg.pinv(intrinsic_basis(model)) @ (found.parameters() - camera.parameters())
+        gained = stated - evidence.joint.camera_covariance
+        test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ estimate)
+        sigma, redundancy = np.sqrt(np.diag(stated)), sum(n.redundancy.sum() for n in networks)
     else:
         model = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
         model = "THIN_PRISM_FISHEYE" if camera.fisheye else model
-        basis, found = intrinsic_basis(model), calibration.camera
+        basis = intrinsic_basis(model)
         test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
         estimate, sigma = test.estimate, np.sqrt(np.diag(test.covariance))
     names = [PARAMETER_NAMES[i] for i in intrinsic_basis(model).argmax(0)]
@@ -110,17 +111,16 @@ def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
     return fewer, min(redundancy, float(freedom))
 
 
-def field_check(networks: Sequence[Network], camera: Camera) -> Check:
+def field_check(evidence: Evidence) -> Check:
     """Tests for a residual field that is the same in all images, cubics in x and y that no intrinsics explain."""
+    networks, camera = evidence.networks, evidence.calibration.camera
 
     def columns(network: Network) -> np.ndarray:
-        size = np.array([camera.width, camera.height])
         # Not at the measured places: a field that poses and points absorb would leave the residuals themselves.
-        x, y = (2 * camera.project(network.model.xyz_camera()) / size - 1).T
+        x, y = (2 * camera.project(network.model.xyz_camera()) / np.array([camera.width, camera.height]) - 1).T
         terms = np.stack([x**i * y**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i)], axis=1)
         zeros = np.zeros_like(terms)
-        field = np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1)
-        return network.model.whiten(field)
+        return network.model.whiten(np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1))
 
     test, redundancy = tested(networks, columns)
     count = sum(n.residual.size for n in networks)
@@ -128,20 +128,17 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
     value = float(sigma * np.sqrt(max(test.statistic, 0) / count))
     allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(test.freedom, 1)
     trial = Trial("camera", value, "px RMS", test.statistic / allowed, test.freedom, redundancy)
-    remedy = (
-        "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
-        "(FULL_OPENCV), and keep focus and aperture as they were then"
-    )
+    remedy = "the camera model cannot follow the distortion: calibrate with FULL_OPENCV, at this focus and aperture"
     return assess("residual-field", [trial], "residual fields", remedy)
 
 
-def sigma_check(networks: Sequence[Network], factor: float) -> Check:
+def sigma_check(evidence: Evidence) -> Check:
     """Tests σ₀ of the images alone; the σ of the result include it, so that only a large factor is a fault."""
-    low, high = SIGMA_LIMITS
-    verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
-    redundancy = sum(n.redundancy.sum() for n in networks)
+    (low, high), factor = SIGMA_LIMITS, evidence.calibration.sigma_factors.all
+    redundancy = sum(n.redundancy.sum() for n in evidence.networks)
     if redundancy < 1:
         return impossible("centres", FREE, "add images")
+    verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
     measured = (TestedValue("all images", factor, low, "×", None),)
@@ -149,11 +146,11 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
     return Check("centres", CHECKS["centres"][0], verdict, reason, measured, 1, names, remedy if names else "")
 
 
-def image_check(networks: Sequence[Network]) -> Check:
+def image_check(evidence: Evidence) -> Check:
     """Tests the squared residuals of every image against those of its group's other images (F test). Residuals of one
     image are not independent: where images scatter more than they would be, each counts as so many fewer."""
     found: list[tuple[str, float, float, float]] = []  # name, ratio of squares, redundancy of the image and the others
-    for network in networks:
+    for network in evidence.networks:
         square, redundancy = network.square_by_image()
         others = redundancy.sum() - redundancy
         for i, name in enumerate(network.model.images):
@@ -168,151 +165,104 @@ def image_check(networks: Sequence[Network]) -> Check:
     for name, ratio, own, others in found:
         freedom = max(round(own / fewer), 1)
         trials.append(Trial(name, float(np.sqrt(ratio)), "×", ratio * freedom, freedom, others / fewer))
-    check = assess("image-residuals", trials, "images", "")
     remedy = "a blurred image, or one in which something had moved: look at its overlay, leave it out, and run again"
-    return _take_out(check, remedy)
+    return _take_out(assess("image-residuals", trials, "images", ""), remedy)
 
 
-def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> Check:
+def sharpness_check(evidence: Evidence) -> Check:
     """Compares the σ of centres, circle by circle, and the blur of every image with its group's other images."""
     sigma: dict[str, float] = {}
     blur: dict[str, float] = {}
-    for network in networks:
+    for network in evidence.networks:
         model, log_sigma = network.model, np.log(network.model.sigma_px())
         usual = np.array([np.median(log_sigma[model.point_index == p]) for p in range(len(model.labels))])
         away = log_sigma - usual[model.point_index]
         sigma |= {name: float(np.median(away[r])) for name, r in zip(model.images, model.rows_by_image(), strict=True)}
-        log_blur = {name: np.log(blur_px[name]) for name in model.images if blur_px.get(name, 0) > 0}
+        log_blur = {n: np.log(evidence.blur_px[n]) for n in model.images if evidence.blur_px.get(n, 0) > 0}
         blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
+    trials = []
+    for log_ratios, unit in ((sigma, "× σ"), (blur, "× blur")):
+        if log_ratios:
+            values, freedom = np.array(list(log_ratios.values())), max(MAD_EFFICIENCY * len(log_ratios) - 1, 2.0)
+            least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(values), 1, freedom))
+            spread = max(robust_sigma(np.abs(values - np.median(values))), least)
+            trials += [
+                Trial(name, float(np.exp(value)), unit, max(value / spread, 0.0) ** 2, 1, freedom, True)
+                for name, value in log_ratios.items()
+            ]
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight and do no harm"
-    trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
     return assess("sharpness", trials, "values", remedy, "suspicious")
 
 
-def evenness_check(
-    networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera, round_: bool = True
-) -> Check:
+def evenness_check(evidence: Evidence) -> Check:
     """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe. Their
     centres would be off alike in all views; a value is the error that the wider model avoids, µm at the circle."""
-    if not round_:
+    if not evidence.radius_mm:
         return impossible("evenness", "corners alone, which have no rim", "")
-    uneven = {image.name: image.uneven_px for image in images}
+    uneven = {image.name: image.uneven_px for image in evidence.images}
+    focal_px = float(np.sqrt(evidence.calibration.camera.focal.prod()))
     shifts_of_label: dict[str, list[float]] = {}
-    for network in networks:
+    for network in evidence.networks:
         model = network.model
-        depth = model.xyz_camera()[:, 2] / float(np.sqrt(camera.focal.prod()))
+        depth = model.xyz_camera()[:, 2] / focal_px
         for k, (i, p) in enumerate(zip(model.image_index, model.point_index, strict=True)):
             shift_px = float(np.linalg.norm(uneven[model.images[i]][model.keypoint[k]]))
-            shifts_of_label.setdefault(model.labels[p], []).append(1e3 * depth[k] * shift_px)
+            shifts_of_label.setdefault(model.labels[p], []).append(MICRO * depth[k] * shift_px)
     trials = []
     for label, shifts in shifts_of_label.items():
         count = sum(shift > 0 for shift in shifts)
         chance = float(bdtrc(count - 1, len(shifts), UNEVEN_BY_CHANCE)) if count else 1.0
         trials.append(Trial(label, float(np.mean(shifts)), "µm", float(chdtri(1, chance)), 1))
-    remedy = (
-        "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, check "
-        "their light; their centres are measured by a wider model, with a larger σ"
-    )
+    remedy = "one side of them is darker in most views: clean them, shade them from glare, check their light"
     return assess("evenness", trials, "circles", remedy, "suspicious")
 
 
-def _dull(values: dict[str, float], unit: str) -> list[Trial]:
-    if not values:
-        return []
-    log_ratios = np.array(list(values.values()))
-    freedom = max(MAD_EFFICIENCY * len(log_ratios) - 1, 2.0)
-    least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(log_ratios), 1, freedom))
-    sigma = max(robust_sigma(np.abs(log_ratios - np.median(log_ratios))), least)
-    return [
-        Trial(name, float(np.exp(value)), unit, max(value / sigma, 0.0) ** 2, 1, freedom, True)
-        for name, value in values.items()
-    ]
-
-
-def moved_check(networks: Sequence[Network]) -> Check:
+def moved_check(evidence: Evidence) -> Check:
     """Tests whether the target moved relative to the board, one image against all others. The yardstick is the residual
     that the motion leaves in the image and its group: a noisy image seems to move too."""
     trials: list[Trial] = []
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
-    for network in networks:
-        model = network.model
-        of_faces = on_face(model)
+    for network in evidence.networks:
+        model, of_faces = network.model, on_face(network.model)
         if of_faces.all() or not of_faces.any():
             continue
         columns = by_motion(network, model.xyz_model[of_faces].mean(0))
         normal, right = network.score_by_image(columns)
-        redundancy = float(network.redundancy.sum())
-        square = float((network.residual**2).sum())
-        tested = []
+        redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
+        suspects = []
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
-            faces = of_faces[model.point_index[rows]].sum()
-            if min(faces, len(rows) - faces) < MIN_CIRCLES:
-                continue
-            test = solve_score(normal[i], right[i])
-            if test.freedom:
-                shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
+            faces, test = of_faces[model.point_index[rows]].sum(), solve_score(normal[i], right[i])
+            if test.freedom and min(faces, len(rows) - faces) >= MIN_CIRCLES:
                 own = float((network.residual[rows] ** 2).sum()), float(network.redundancy[rows].sum())
                 noise = max(
                     (total - test.statistic) / max(freedom - test.freedom, 1.0)
                     for total, freedom in (own, (square, redundancy))
                 )
-                statistic = test.statistic / max(noise, 1.0)
+                statistic, shift_um = test.statistic / max(noise, 1.0), MICRO * float(np.linalg.norm(test.estimate[3:]))
                 trials.append(Trial(name, shift_um, "µm", statistic, test.freedom, redundancy - test.freedom))
-                tested.append(i)
-        tested_by_group[model.group] = network, columns, tested
+                suspects.append(i)
+        tested_by_group[model.group] = network, columns, suspects
     check = assess("moved", trials, "images", "")
     if not check.names or _nearly_all(check):
         return _take_out(check, "")
     guilt = [
-        culprits_by_score(network, columns, tested, check.tested, f"group {group}")
-        for group, (network, columns, tested) in tested_by_group.items()
-        if any(network.model.images[i] in check.names for i in tested)
+        culprits_by_score(network, columns, suspects, check.tested, f"group {group}")
+        for group, (network, columns, suspects) in tested_by_group.items()
+        if any(network.model.images[i] in check.names for i in suspects)
     ]
-    remedy = (
-        "in these images the target stood at another place relative to the board than in the others of the group: sort "
-        "the images into groups in which nothing moved, or take the group again; leave out a single image"
-    )
-    causes = "target or board moved between these images, or zoom or focus changed: take the group again"
-    return with_culprits(check, guilt, remedy, causes)
-
-
-def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
-    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together about a ``centre`` (3,)."""
-    model = network.model
-    arm = model.xyz_model[model.point_index] - centre
-    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-    return network.by_point @ (motion * on_face(model)[model.point_index][:, None, None])
-
-
-NO_ELLIPSES = (
-    "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
-    "values or of contours need another correction"
-)
-
-
-def by_eccentricity(network: Network) -> np.ndarray:
-    """Returns the derivatives (n, 2, 1) over σ by a factor on the eccentricity."""
-    return network.model.whiten(network.model.shift_px[:, :, None])
+    names, open_ones = [name for own in guilt for name in own.culprits], [w for own in guilt if (w := own.words())]
+    names = sorted(names, key=check.names.index) if set(names) <= set(check.names) else names
+    where = "the target stood elsewhere relative to the board: sort images into groups, or leave a single one out"
+    remedies = [f"{where}: {without_image(name)}" for name in names[:1]] + [
+        "target or board moved between these images, or zoom or focus changed: take the group again"
+    ] * bool(open_ones)
+    reason = "; ".join([check.reason, *open_ones])
+    return replace(check, reason=reason, names=tuple(names), remedy="; ".join(remedies))
 
 
 def without_image(name: str) -> str:
     """Returns the option that excludes an image from a run."""
     return f"--exclude {shlex.quote(name)}"
-
-
-def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:
-    """Returns the check with the names of the culprits alone, and the ``remedy`` for the first of them; if no culprit
-    is known, ``causes`` says what makes such a fault and what to do."""
-    names = tuple(name for own in guilt for name in own.culprits)
-    names = tuple(sorted(names, key=check.names.index)) if set(names) <= set(check.names) else names
-    open_ones = [words for own in guilt if (words := own.words())]
-    reason = "; ".join([check.reason, *open_ones])
-    advice = [f"{remedy}: {without_image(names[0])}"] if names else []
-    return replace(check, reason=reason, names=names, remedy="; ".join(advice + [causes] * bool(open_ones)))
-
-
-NEARLY_ALL = 0.7
-"""Share of the images beyond which a check that names them names none."""
 
 
 def _nearly_all(check: Check) -> bool:
@@ -327,90 +277,68 @@ def _take_out(check: Check, remedy: str) -> Check:
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check
 
 
-EXCHANGED = 0.1
-"""Largest deviation of exchanged labels: each centre lies at the place of the other to within this share of their
-distance."""
-MANY = 5
-"""Number of centres left out of one image at which they are no longer single hidden or dirty circles."""
-
-
-def labels_check(
-    networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
-) -> Check:
+def labels_check(evidence: Evidence) -> Check:
     """Tests every observation against all others by its own covariance (Baarda's data snooping), and names those left
     out. Labels at each other's places are a fault: others may be exchanged without being noticed."""
-    remedy = (
-        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
-        "that was left out does no harm where other images show it"
-    )
+    remedy = "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label"
     trials = []
-    for network in networks:
+    for network in evidence.networks:
         model, total = network.model, float(network.redundancy.sum())
         square, freedom = network.squares_of_observations()
         for k in np.flatnonzero(freedom):
             name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
             length = float(np.linalg.norm(network.residual[k]))
             trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
-    check = assess("labels", trials, "centres", remedy, "suspicious")
+    check, outliers = assess("labels", trials, "centres", remedy, "suspicious"), evidence.outliers
     if not outliers:
         return check
-    swapped = _exchanged(networks, outliers, images, camera)
-    guilt = _images_of_outliers(networks, outliers)
-    lost = tuple(name for own in guilt for name in own.culprits)
-    named = tuple(f"{o.image} {o.label}" for o in outliers)
-    measured = tuple(
+    swapped, guilt = _exchanged(evidence), _images_of_outliers(evidence)
+    lost = [name for own in guilt for name in own.culprits]
+    named = [f"{o.image} {o.label}" for o in outliers]
+    measured = [
         TestedValue(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
-    )
+    ]
     verdict, reason = "suspicious", f"{len(outliers)} left out, first {named[0]}: {measured[0].words()}"
     if guilt:
         verdict = "failed"
         words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
         reason = f"{len(outliers)} left out, {'; '.join(words)}"
-        remedy = (
-            "in these images the target stood at another place relative to the board, or they belong to another group: "
-            f"leave them out, the first with {without_image(lost[0])}"
-            if lost
-            else "target or board moved between the images of a group, or zoom or focus changed: take it again"
-        )
+        remedy = "target or board moved between the images of a group, or zoom or focus changed: take it again"
+        if lost:
+            remedy = (
+                f"the target stood elsewhere, or they are of another group: leave them out: {without_image(lost[0])}"
+            )
     if swapped:
-        verdict = "failed"
-        reason = f"labels exchanged: {swapped[0]}"
+        verdict, reason = "failed", f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
     shown, names = (*measured, *check.measured)[:SHOWN], (*swapped, *lost, *named, *check.names)
     return replace(check, verdict=verdict, reason=reason, measured=shown, names=names, remedy=remedy)
 
 
-def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
-    """Returns the culprits of each group in which an image lost :data:`MANY` centres or more."""
-    count = Counter(o.image for o in outliers)
+def _images_of_outliers(evidence: Evidence) -> list[Guilt]:
+    """Returns the images of each group that lost :data:`MANY` centres or more; none of a group that lost half of it."""
+    count = Counter(o.image for o in evidence.outliers)
     found = []
-    for network in networks:
-        of_group = [name for name in count if name.rpartition("/")[0] == network.model.group]
-        names = list(dict.fromkeys([*network.model.images, *of_group]))
-
-        def worst(out: Collection[int], names: list[str] = names) -> int | None:
-            many = [i for i, name in enumerate(names) if i not in out and count[name] >= MANY]
-            return max(many, key=lambda i: count[names[i]], default=None)
-
-        if worst(()) is not None:
-            found.append(culprits(names, worst, f"group {network.model.group}"))
+    for network in evidence.networks:
+        group = network.model.group
+        names = dict.fromkeys([*network.model.images, *(n for n in count if n.rpartition("/")[0] == group)])
+        many = sorted((name for name in names if count[name] >= MANY), key=lambda name: -count[name])
+        if many:
+            found.append(Guilt(f"group {group}", tuple(many) if len(many) < MOST * len(names) else ()))
     return found
 
 
-def _exchanged(
-    networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
-) -> tuple[str, ...]:
+def _exchanged(evidence: Evidence) -> list[str]:
     """Returns ``image: label and label`` of every pair of outliers that are at each other's places."""
     by_image: dict[str, list[Label]] = {}
-    for outlier in outliers:
+    for outlier in evidence.outliers:
         by_image.setdefault(outlier.image, []).append(outlier.label)
-    observed = {image.name: image for image in images}
+    observed, camera = {image.name: image for image in evidence.images}, evidence.calibration.camera
     pairs = []
-    for network in networks:
+    for network in evidence.networks:
         model = network.model
-        for name in [name for name in model.images if name in by_image]:
-            pose = model.camera_from_model[model.images.index(name)]
-            labels = [label for label in by_image[name] if label in model.labels]
+        for name, pose in zip(model.images, model.camera_from_model, strict=True):
+            labels = [label for label in by_image.get(name, ()) if label in model.labels]
             place = {x: camera.project((pose @ model.xyz_model[model.labels.index(x)])[None])[0] for x in labels}
             measured = dict(zip(observed[name].labels, observed[name].centre_px, strict=True))
             for a, b in combinations(labels, 2):
@@ -418,4 +346,47 @@ def _exchanged(
                 off = max(np.linalg.norm(measured[a] - place[b]), np.linalg.norm(measured[b] - place[a]))
                 if off < EXCHANGED * apart:
                     pairs.append(f"{name}: {a} and {b}")
-    return tuple(pairs)
+    return pairs
+
+
+def control_check(evidence: Evidence) -> Check:
+    """Compares the run with a control without eccentricity, chained with three-point frames, and tests the correction:
+    a factor on it is 1 up to chance, and 0 if the centres are not those of ellipses."""
+    networks = evidence.networks
+    if not evidence.radius_mm:
+        return impossible("control", "corners alone, which have no eccentricity", "")
+    if not evidence.options.eccentricity:
+        return impossible("control", "this run is the control", "run with eccentricity")
+    if not any(n.model.shift_px.any() for n in networks):
+        return impossible("control", "no circle is in the result", "add views of the faces with circles")
+    test = solve_score(*summed(networks, by_eccentricity))
+    if not test.freedom:
+        return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
+    redundancy, share = sum(n.redundancy.sum() for n in networks), float(test.estimate[0])
+    trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
+    check = assess("control", [trial], "corrections", NO_ELLIPSES)
+    try:
+        whole = evidence.calibration.target.target_from_face
+        message, measured = _control(evidence) if whole else ("no face that it could move", ())
+    except StcalError as error:
+        message, measured = f"no uncorrected result ({error})", ()
+    reason = f"{1 + share:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
+    return replace(check, reason=reason, measured=check.measured + measured)
+
+
+def _control(evidence: Evidence) -> tuple[str, tuple[TestedValue, ...]]:
+    camera, whole = evidence.calibration.camera, evidence.calibration.target
+    models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
+    options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
+    control = calibrate(models, camera, evidence.target, evidence.board, options).target
+    shifts = {
+        face: MICRO * float(np.linalg.norm(control.target_from_face[face].translation - pose.translation))
+        for face, pose in whole.target_from_face.items()
+        if face != whole.reference_face
+    }
+    rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
+    rows = [
+        TestedValue(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
+    ]
+    largest = max(shifts.values(), default=0.0)
+    return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", tuple(rows)

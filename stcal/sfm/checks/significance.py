@@ -1,23 +1,28 @@
-"""Definition of a check; every verdict is a test of significance: the probability of the worst value by chance, times
-the number of values tested (Bonferroni). One sound run in seventy shows something suspicious.
-
-A culprit is named only if leaving it out cures the result, and leaving out another one does not.
+"""What checks are made of: the evidence of a run; verdicts, each a test of significance (the probability of the worst
+value by chance, times the number of values tested, after Bonferroni: one sound run in seventy shows something
+suspicious); and culprits, named only if leaving them out cures the result, and leaving out another one does not.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import fdtrc
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit
-from stcal.labels import CircleLabel
+from stcal.io.cameras.camera_model import CameraPrior
+from stcal.labels import CircleLabel, Label
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, image_sigma_factors, with_sigma
+from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.refine import Network, ScoreTest, adjust, eccentricity_px, find_scale, free_network, solve_score
-from stcal.sfm.data.group_model import GroupModel, WorldModel
+from stcal.sfm.adjust.rims import Rim, find_rims
+from stcal.sfm.data.group_model import GroupModel, ImageObservations, Outlier, WorldModel
 from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 
 KNOWN = 1e9
@@ -31,6 +36,70 @@ FREE = "free poses and points explain the images, whatever they show"
 """Why too few images test nothing."""
 SHOWN = 8
 """Number of measurements that a check lists, the worst first."""
+MICRO = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Input of the checks."""
+
+    models: tuple[WorldModel, ...]  # adjusted models of the single groups, without unit
+    outliers: tuple[Outlier, ...]
+    images: tuple[ImageObservations, ...]
+    camera: Camera  # as given
+    target: TargetDesign
+    board: BoardDesign
+    options: AdjustOptions
+    calibration: Calibration
+    prior: CameraPrior | None  # of the intrinsics if they were refined
+    blur_px: dict[str, float]
+    rim: bool = False  # whether rims are estimated for the result
+    camera_given: bool = True  # False if the camera was found from the photographs
+    cause: Check | None = None  # of the whole set if it is known already
+
+    @cached_property
+    def radius_mm(self) -> dict[Label, float]:
+        """Radii of all circles and dots, without the corners of printed faces."""
+        radius: dict[Label, float] = {**self.target.radius_of(), **self.board.radius_of()}
+        return {label: value for label, value in radius.items() if value > POINT_RADIUS_MM}
+
+    @cached_property
+    def networks(self) -> list[Network]:
+        """Free networks of all groups, mm, at the intrinsics of the result."""
+        camera, models, scales = self.calibration.camera, self.models, self.calibration.scales
+        if not camera.same_as(self.camera):
+            models = tuple(adjust(model, camera) for model in models)
+        factors = image_sigma_factors(models, camera, self.target.printed_ids())
+        return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
+
+    @property
+    def joint(self) -> JointResult | None:
+        """Result of the joint adjustment."""
+        return self.calibration.joint
+
+    @property
+    def linked(self) -> list[Network]:
+        """Free networks of the groups that the joint adjustment holds."""
+        groups = {model.group for model in self.joint.models} if self.joint else ()
+        return [network for network in self.networks if network.model.group in groups]
+
+    @cached_property
+    def rims(self) -> dict[str, Rim]:
+        """Rims by kind of circle, as radii show them."""
+        return find_rims(self.calibration.models, self.images, self.radius_mm, self.calibration.camera)
+
+    @property
+    def allowed_mm(self) -> Mapping[str, float | None]:
+        """Heights of rims that the result allows for, by kind; None: the estimated one."""
+        faces = list(self.target.rim_of().values())
+        stated = {"circles": float(np.mean(faces)) if faces else 0.0, "dots": self.board.rim_mm}
+        return dict.fromkeys(self.rims) if self.rim else stated
+
+    @property
+    def face_sigma_mm(self) -> float | None:
+        """Largest σ of a face's position."""
+        known = [np.sqrt(np.diag(c)[3:].max()) for c in self.calibration.target.face_covariance.values()]
+        return float(max(known)) if known else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +265,24 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
 def on_face(model: GroupModel) -> np.ndarray:
     """Returns which points of a model are those of faces, (p,)."""
     return np.array([isinstance(label, CircleLabel) for label in model.labels])
+
+
+def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
+    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together about a ``centre`` (3,)."""
+    model = network.model
+    arm = model.xyz_model[model.point_index] - centre
+    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+    return network.by_point @ (motion * on_face(model)[model.point_index][:, None, None])
+
+
+NO_ELLIPSES = (
+    "centres do not move as those of ellipses: check radii, polarity and exposure; centroids need another method"
+)
+
+
+def by_eccentricity(network: Network) -> np.ndarray:
+    """Returns the derivatives (n, 2, 1) over σ by a factor on the eccentricity."""
+    return network.model.whiten(network.model.shift_px[:, :, None])
 
 
 def apart(network: Network, columns: np.ndarray) -> np.ndarray:

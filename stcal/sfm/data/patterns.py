@@ -1,14 +1,13 @@
-"""Patterns of the faces and the board, their projection into an image, and the pitch of a board's dots."""
+"""Patterns of the faces and the board, and their projection into an image."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
-from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity, TargetDesign
+from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
@@ -17,13 +16,11 @@ from stcal.geometry.plane import (
     circle_image_offset,
     circle_images,
     fit_homography,
-    homography_jacobian,
     refine_planar_pose,
     shape_of_square,
 )
 from stcal.geometry.rigid import Rigid, skew
-from stcal.labels import BOARD, DotLabel, Label, dot_cells
-from stcal.sfm.data.group_model import ImageObservations
+from stcal.labels import BOARD, Label
 
 MAX_TILT_RAD = np.radians(70.0)
 """Largest angle between a circle's normal and the line of sight. Circles seen more obliquely need not be found."""
@@ -155,33 +152,3 @@ def project_circles(
 
 MIN_DOTS = 9
 """Smallest number of dots in an image that is used."""
-MOST_OFF = 0.05
-"""Largest relative deviation of the pitch that is tolerated. Blur enlarges dots by less than this."""
-
-
-def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -> float | None:
-    """Returns the median pitch of the dots, mm, by their radius in the board file; None if too few are seen."""
-    if board.radius_mm <= POINT_RADIUS_MM:
-        return None
-    radius, pitches = board.radius_of(), []
-    for image in images:
-        dots = {i: label for i, label in enumerate(image.labels) if isinstance(label, DotLabel)}
-        if len(dots) < MIN_DOTS:
-            continue
-        cells, rows = dot_cells(dots.values())[:, ::-1].astype(float), list(dots)
-        with suppress(DegenerateError):
-            local = homography_jacobian(fit_homography(cells, image.centre[rows]), cells)
-            steps = np.sqrt(np.abs(np.linalg.det(local) / np.linalg.det(image.shape[rows])))
-            pitches.append(steps * [radius[label] for label in dots.values()])
-    return float(np.median(np.concatenate(pitches))) if pitches else None
-
-
-def pitch_hint(images: Sequence[ImageObservations], board: BoardDesign) -> str:
-    """Returns a hint on what to correct in the board file, empty if its pitch agrees with the images."""
-    pitch = measured_pitch_mm(images, board)
-    if pitch is None or abs(pitch / board.pitch_mm - 1) < MOST_OFF:
-        return ""
-    return (
-        f"; dots of radius_mm {board.radius_mm:g} are {pitch:.3g} mm apart in the images, the board file says pitch_mm "
-        f"{board.pitch_mm:g}: correct pitch_mm, or radius_mm"
-    )

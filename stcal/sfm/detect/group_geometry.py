@@ -12,8 +12,7 @@ from stcal.adjust.engine import Adjustment
 from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.as_drawn import FAR_DEG
-from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.data.group_model import FAR_DEG, ImageObservations
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings
 

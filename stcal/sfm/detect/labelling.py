@@ -35,9 +35,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.as_drawn import FAR_DEG
-from stcal.sfm.data.group_model import Centres, ImageObservations
-from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, SINGLE, Note
+from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ELSEWHERE, FAR_DEG, SINGLE, Centres, ImageObservations, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import Focus, correct_defocus

@@ -33,10 +33,7 @@ from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged
-from stcal.sfm.runs.folder import require_report, write_report
-from stcal.sfm.runs.run_result import AnyRun, SavedRun
-from stcal.sfm.runs.saved import saved_run
-from stcal.sfm.runs.tolerances import (
+from stcal.sfm.runs.comparisons import (
     CameraDifference,
     Crosscheck,
     FaceDifference,
@@ -48,6 +45,8 @@ from stcal.sfm.runs.tolerances import (
     Tolerances,
     allowed_text,
 )
+from stcal.sfm.runs.folder import require_report, write_report
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 from stcal.sfm.runs.transaction import AGAIN, added_results
 
 INSTALL = "install it with `sudo apt-get install colmap` (Debian, Ubuntu) or `brew install colmap` (macOS)"

@@ -39,8 +39,7 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
     worst_of,
 )
-from stcal.sfm.runs.run_result import AnyRun, SavedRun
-from stcal.sfm.runs.saved import adjusted_run, saved_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
 from stcal.synthetic.placement import look_along
 from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, SceneOptions, image_circles, made_group
 

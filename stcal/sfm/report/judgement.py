@@ -12,7 +12,7 @@ from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.document import sentence
 from stcal.report.text import join, number, significant
-from stcal.sfm.data.note import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
+from stcal.sfm.data.group_model import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
 from stcal.sfm.report.check import CAUSE, SUSPICIOUS, Check, invalidated, ranked
 
 TAIL = 2.0

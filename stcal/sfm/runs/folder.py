@@ -1,9 +1,10 @@
-"""Files that a run writes into its folder: overlays, results, report."""
+"""What a run writes into its folder, overlays, results and report, and what it prints."""
 
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from stcal.boards.board_file import save_board
 from stcal.boards.target_file import save_target
+from stcal.design import faces_of_known_shape, known_distances
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
@@ -36,8 +38,10 @@ from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
 from stcal.report.document import (
     Answer,
+    Block,
     Document,
     Notes,
+    Printed,
     Section,
     Table,
     links,
@@ -47,26 +51,39 @@ from stcal.report.document import (
     require_pdf,
     sentence,
 )
-from stcal.report.text import join
+from stcal.report.text import join, wrapped
 from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.data.group_model import GroupModel, ImageObservations, detections_csv
+from stcal.sfm.data.group_model import detections_csv
+from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
+from stcal.sfm.detect.predict import REMEDIES
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.report.judgement import Judgement, judged
-from stcal.sfm.report.run_page import FIRST_IMAGES, Residuals, report_html, shown_overlays
-from stcal.sfm.runs.report_file import ReportFile, report_of, residuals_px
-from stcal.sfm.runs.run_result import AnyRun, RunResult, SavedRun, folder_of
-from stcal.sfm.runs.run_text import found_in_all
-from stcal.sfm.runs.saved import require_run, verify
-from stcal.sfm.runs.task import DetectedImages, Task
+from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
+from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.judgement import QUESTIONS, Judgement, judged, without_sigma_of
+from stcal.sfm.report.run_page import (
+    CONTROL,
+    FIRST_IMAGES,
+    PUBLISHED,
+    Residuals,
+    faces_table,
+    report_html,
+    shown_overlays,
+)
+from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
+from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun, folder_of, require_run, verify
+from stcal.sfm.runs.stages import DetectedImages, Task
 from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
 
-LONGEST_NAME = 200
+LONGEST_NAME, HASH_DIGITS = 200, 12
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
 during writing."""
-HASH_DIGITS = 12
+WEAK_FOCAL = 0.01
+"""Relative σ of a focal length beyond which the views lack what determines it."""
+FIRST = 20
+"""Number of images that are named."""
 
 
 @contextlib.contextmanager
@@ -78,7 +95,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     common; not without ``page``.
     """
     stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
-    save(stage / "detections.csv", detections_csv(seen.observations()))
+    save(stage / "detections.csv", detections_csv(seen.observations))
     pictures = {image.file.name: image for image in seen.detection.images}
     left_out: dict[str, frozenset[Label]] = {}
 
@@ -122,13 +139,15 @@ def overlay_path(out: Path, name: str) -> Path:
 
 def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     """Writes database, models, faces and report beside the overlays; returns the run as it was written."""
-    observations = result.observations
-    ids = image_ids(observations)
-    models = {s.model.group: s.model for s in result.solutions}
-    corrected = _corrected_px(models, observations)
+    observations, models = result.observations, {s.model.group: s.model for s in result.solutions}
+    ids, as_measured = image_ids(observations), {image.name: image.centre_px.copy() for image in observations}
+    for model in models.values():  # as the models of the groups correct them
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            as_measured[name][model.keypoint[rows]] = model.corrected_px()[rows]
+    corrected = list(as_measured.values())
     (out / DATABASE).parent.mkdir()
     write_database(out / DATABASE, result.camera, observations, result.graph.pairs, corrected)
-    save(out / "labels.csv", labels_csv(observations, corrected, residuals_px(result)))
+    save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
     for name, model in models.items():
         folder = out / MODELS / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)
@@ -212,25 +231,15 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         require_pdf()
     complete_interrupted(run)
     notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
-    if out is not None:
-        return ReportAgain(*_page_and_pdf(run, pdf, out), notes)
-    with added_results(run) as stage:
-        files, gone = _page_and_pdf(run, pdf, stage / "report.html")
-    return ReportAgain(tuple(run / path.name for path in files), gone, notes)
-
-
-def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
-    """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
-    report = read_json(run / "report.json", "run", AGAIN)
-    with as_written(run / "report.json"):
-        checked(report, ReportFile)
-        page, gone = _report_page(run, report)
-    contents: dict[Path, str | bytes] = {out: page}
-    if pdf:
-        contents[out.with_suffix(".pdf")] = pdf_of(page)
-    for file, content in contents.items():
-        save(file, content)
-    return tuple(contents), gone
+    with contextlib.nullcontext(run) if out else added_results(run) as stage:
+        file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
+        with as_written(run / "report.json"):
+            checked(report, ReportFile)
+            page, gone = _report_page(run, report)
+        contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
+        for place, content in contents.items():
+            save(place, content)
+    return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), gone, notes)
 
 
 def _report_page(run: Path, report: dict) -> tuple[str, int]:
@@ -266,15 +275,6 @@ def require_report(saved: SavedRun) -> None:
         )
 
 
-def _corrected_px(models: Mapping[str, GroupModel], observations: Sequence[ImageObservations]) -> list[np.ndarray]:
-    """Returns all keypoints of every image as the models of the groups correct them, as measured without a model."""
-    corrected = {image.name: image.centre_px.copy() for image in observations}
-    for model in models.values():
-        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            corrected[name][model.keypoint[rows]] = model.corrected_px()[rows]
-    return list(corrected.values())
-
-
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows = []
@@ -293,3 +293,166 @@ def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedIma
         Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
     ]
     return Document(name, f"{len(rows)} images, no calibrated target", sections, [Answer("no", error.fault)]).page()
+
+
+def run_text(result: RunResult) -> str:
+    """Returns the result of a run for the terminal."""
+    return "\n".join(part for line in document_of(result).text().splitlines() for part in wrapped(line))
+
+
+def document_of(result: RunResult) -> Document:
+    """Returns the result of a run in short: the verdict, faces with σ, checks that did not pass, and remarks."""
+    verdict, *others = [] if result.judgement is None else result.judgement.answers()
+    faces = {face: face_row(result, face) for face in result.target.target_from_face}
+    if faces:
+        failed = result.judgement is not None and result.judgement.verdict == "no"
+        shown = without_sigma_of(faces) if failed else faces
+        blocks: list[Block] = [faces_table(shown, result.target.reference_face)]
+    else:
+        rows = [
+            [name, len(s.labels)]
+            + [f"{each:.6g}" for each in (s.mm_per_unit, s.rows_mm_per_unit)]
+            + [f"{1e3 * each:.2f}" for each in (s.mean_mm(), s.spread_mm())]
+            for name, s in result.calibration.scales.items()
+        ]
+        blocks = [
+            f"the board alone: no face of the target in {len(result.labelled)} images, so that there is no faces.json; "
+            "length of the board's residuals, as in table 1 of Zhang & Wei (2017)",
+            Table(["<group", "dots", "λ mm/unit", "λ by rows", "mean µm", "± µm"], rows),
+        ]
+    names = frozenset(image.name for image in result.observations)
+    doubtful = [check for check in ranked(result.checks, names) if check.verdict in ("failed", "suspicious")]
+    blocks += [f"checks: {count_verdicts(result.checks)} ({BY_CHANCE})"] if doubtful else []
+    blocks += [f"{c.verdict}: {c.title}: {c.reason}{'; ' * bool(c.remedy)}{c.remedy}" for c in doubtful]
+    if result.comparison is not None:
+        blocks += [
+            "compared with Zhang & Wei (2017): distance of faces from the last row's, three-point frames; steps add up",
+            Table(*comparison_cells(result.comparison.model_dump())),
+            *(f"{row.method}: {row.reason}" for row in result.comparison.rows if row.reason),
+        ]
+    blocks.append(Printed([*result.notes, *_remarks(result)]))
+    if (out := result.out) is not None:
+        files = [f"faces:  {out / 'faces.json'}"] if faces else []
+        files += [f"camera: {out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
+        blocks.append(Printed([*files, f"report: {out / 'report.html'}"]))
+    first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
+    answers = [f"{question} {answer}" for question, answer in others]
+    return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
+
+
+def _remarks(result: RunResult) -> Iterator[str]:
+    """Yields what was left out, on what the size and the camera rest, and what was corrected."""
+    unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
+    noted = [image.observations.name for image in result.labelled if image.notes]
+    outliers = sum(len(solution.outliers) for solution in result.solutions)
+    for lines in (_skipped(result.detection), unmapped):
+        yield from lines[:FIRST]
+        if len(lines) > FIRST:
+            yield f"and {len(lines) - FIRST} more, which the report names"
+    if noted:
+        more = f" and {len(noted) - FIRST} more" if len(noted) > FIRST else ""
+        yield f"something was left out in {join(noted[:FIRST])}{more}; the report says what and why"
+    if outliers:
+        yield f"{outliers} {result.target_design.points} left out that contradict the others"
+    yield from _on_size(result)
+    yield from _on_camera(result)
+    calibration, of_dots = result.calibration, result.board_design.rim_mm
+    if calibration.rim_mm:
+        height, sigma = float(np.mean(list(calibration.rim_mm.values()))), calibration.rim_sigma_mm
+        source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
+        yield f"rims: faces are those of the luminous surface, behind rims of {height:.3f}{source}"
+    if of_dots:
+        yield (
+            f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated, and no face depends "
+            "on it"
+        )
+    if result.options.solve == "paper" or not result.options.eccentricity:
+        yield PUBLISHED if result.options.solve == "paper" else CONTROL
+
+
+def _on_size(result: RunResult) -> Iterator[str]:
+    """Yields what the size rests on where that is not the board alone, and how good print and flatness are."""
+    sources, joint = result.scale_from(), result.calibration.joint
+    known = [f for f in faces_of_known_shape(result.board_design) if f.id in result.target.target_from_face]
+    count = len(known_distances(result.board_design)) if "distances" in sources else 0
+    distances = f"{count} known distance{'' if count == 1 else 's'}"
+    if "faces" in sources:
+        beside = " beside the board" if "board" in sources else ", no board"
+        stated = any(face.size_sigma for face in known)
+        size = "" if stated else ", which is taken as exact: state size_sigma_mm of a measured square or tag"
+        faces = f"the printed size of {len(known)} face{'' if len(known) == 1 else 's'}"
+        yield f"scale: from {f'{distances} and ' if count else ''}{faces}{beside}{size}"
+        if joint is not None:
+            within = 1e3 * joint.print_factor * float(np.median([face.sigma_mm or 0.0 for face in known]))
+            flat = result.options.flatness_mm
+            off = "" if flat is None else f", {1e3 * joint.bend_factor * flat:.0f} µm off it"
+            yield f"print: corners lie {within:.0f} µm about the design in the plane{off} (σ, from the photographs)"
+    elif count:
+        yield f"scale: from {distances}"
+    if "drawing" in sources:
+        (drawn,) = known_distances(result.board_design)
+        yield (
+            f"scale: unknown, nothing of known size is in view; the unit is such that {drawn.first} and {drawn.second} "
+            f"are {drawn.mm:g} mm apart, as drawn"
+        )
+
+
+def _on_camera(result: RunResult) -> Iterator[str]:
+    """Yields how well a camera that was found from the photographs is determined, or that its stated σ is left out."""
+    given, refined = result.camera.covariance, result.refined_camera
+    if given is not None and not result.options.refine_camera:
+        yield (
+            f"the camera file states σ of its parameters ({np.sqrt(given[0, 0]):.2g} px of the focal length), and this "
+            "run takes them as exact: no σ below includes them; --refine-camera adjusts the intrinsics within them and "
+            "includes them in all σ"
+        )
+    if result.camera_given or refined is None or refined.covariance is None:
+        return
+    sigma, focal, centre = np.sqrt(np.diag(refined.covariance)), refined.focal, refined.centre
+    yield (
+        f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
+        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px from the centre of the "
+        "first pixel (in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more)"
+    )
+    if sigma[0] > WEAK_FOCAL * focal[0]:
+        yield (
+            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from a shorter "
+            f"distance, and of faces tilted by 30° to 60°, or give a camera file"
+        )
+
+
+def _skipped(detection: DetectionResult) -> list[str]:
+    return [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
+
+
+def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
+    """Returns faces and dots of each image, and what was left out."""
+    return "\n".join([*found_lines(labelled), *_skipped(detection), found_in_all(labelled)])
+
+
+def found_in_all(labelled: Sequence[LabelledImage]) -> str:
+    """Returns in how many images faces and board are, and what was left out in most of them."""
+    images, count = [each.observations for each in labelled], len(labelled)
+    faces = sum(bool(image.face_ids()) for image in images)
+    dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
+    alike: dict[str, list[str]] = {}
+    for each in labelled:
+        for kind, note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
+            alike.setdefault(kind, []).append(note)
+    most = max(alike.values(), key=len, default=[])
+    reason = f"; in {len(most)} of {count}: {most[0]}" if most else ""
+    return f"a face in {faces} of {count} images, the board in {dots}{reason}"
+
+
+def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
+    """Yields faces and dots of each image, and what was left out in it and helps."""
+    counts = [sum(isinstance(label, DotLabel) for label in each.observations.labels) for each in labelled]
+    for each, dots in zip(labelled, counts, strict=True):
+        image = each.observations
+        faces = ", ".join(sorted(image.face_ids())) or "none"
+        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
+        yield from (f"  {note}" for note in each.notes)
+        if not image.face_ids():
+            yield f"  no face is read: {REMEDIES['face']}"
+        if any(counts) and not dots:
+            yield f"  the board is not read: {REMEDIES['board']}"

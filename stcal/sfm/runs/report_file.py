@@ -11,19 +11,18 @@ import stcal
 from stcal.design import faces_of_known_shape
 from stcal.geometry.arrays import rms
 from stcal.geometry.plane import fit_plane
-from stcal.io.images import Skipped, name_fault
+from stcal.io.images import Skipped
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, ResultFile, Vector, Vector3
-from stcal.labels import DotLabel, Label
+from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import FaceChain
-from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations
-from stcal.sfm.data.note import Note, lost_groups
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
-from stcal.sfm.runs.groups import GroupSolution
-from stcal.sfm.runs.run_result import Comparison, RunResult
-from stcal.sfm.runs.tolerances import Crosscheck
+from stcal.sfm.runs.comparisons import Comparison, Crosscheck
+from stcal.sfm.runs.saved import ImageRow, RunResult
+from stcal.sfm.runs.stages import GroupSolution
 
 MICRO = 1e3
 Row = dict[str, Any]
@@ -50,13 +49,6 @@ class LeftOut(Part):
     images: list[Row]
     circles: list[Row]
     notes: list[Row]
-
-
-class ImageRow(Part):
-    image_id: int
-    name: str
-    group: str
-    circles: int
 
 
 class CameraInSpace(Part):
@@ -178,43 +170,9 @@ class ReportFile(ResultFile):
     crosscheck: Crosscheck | None = Field(None, description="only after `crosscheck`, with")
 
 
-class InitialPair(Part):
-    first: str
-    second: str
-
-
-class GroupRead(Part):
-    name: str
-    pairs: list[InitialPair] = Field(min_length=1)
-
-
-class SummaryRead(Part):
-    residual_rms_px: float
-
-
-class ReportRead(Part):
-    """Content of ``report.json`` that every command on a run needs, of whatever version."""
-
-    format: Literal["stcal report 1"] = "stcal report 1"
-    images: list[ImageRow]
-    groups: list[GroupRead]
-    summary: SummaryRead
-
-    def names(self) -> list[tuple[str, str, int]]:
-        """Returns (name, group, circles) of the images in the database's order."""
-        pairs = {entry.name: entry.pairs[0] for entry in self.groups}
-        group_of = {entry.name: entry.group for entry in self.images}
-        for name, group in group_of.items():
-            if fault := name_fault(name):
-                raise ValueError(f"image {name!r}: its name {fault}")
-            if not all(group_of.get(each) == group for each in (pairs[group].first, pairs[group].second)):
-                raise ValueError(f"group {group}: its initial pair is not of its images")
-        return [(entry.name, entry.group, entry.circles) for entry in self.images]
-
-
 def report_of(result: RunResult) -> ReportFile:
     """Returns the report of a run."""
-    models, options, camera = _final_models(result), result.options, result.calibration.camera
+    models, options, camera = result.final_models(), result.options, result.calibration.camera
     residual = {name: model.residuals_px(camera) for name, model in models.items()}
     shown = ("solve", "frame", "eccentricity", "refine_camera")
     content = {
@@ -293,32 +251,6 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
         "edge_share": printed.edge_share if printed else None,
         "printed_faces": sorted(design.printed_ids()),
     }
-
-
-def residuals_px(result: RunResult) -> list[np.ndarray]:
-    """Returns corrected minus projected keypoints of every image, (k, 2); NaN for keypoints not in the result."""
-    models = _final_models(result)
-    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations}
-    for model in models.values():
-        residual = model.residuals_px(result.calibration.camera)
-        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            by_image[name][model.keypoint[rows]] = residual[rows]
-    return list(by_image.values())
-
-
-def unadjusted(result: RunResult) -> dict[str, frozenset[Label]]:
-    """Returns the labels of the keypoints that are not in the result, by image."""
-    return {
-        image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residual).any(axis=1)))
-        for image, residual in zip(result.observations, residuals_px(result), strict=True)
-    }
-
-
-def _final_models(result: RunResult) -> dict[str, GroupModel]:
-    """Returns the models that the result rests on, by group."""
-    if result.calibration.joint:
-        return {model.group: model for model in result.calibration.joint.models}
-    return {solution.model.group: solution.model for solution in result.solutions}
 
 
 def face_row(result: RunResult, face_id: str) -> Row:

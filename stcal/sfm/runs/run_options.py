@@ -1,21 +1,27 @@
 """Options of a run."""
 
-import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
-from stcal.design import TargetDesign
-from stcal.errors import InputError
+import numpy as np
+
+from stcal.boards.board_designs import CornerBoard
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import require_fields
+from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.chain import FrameKind
-from stcal.sfm.data.as_drawn import faces_in_name
+from stcal.sfm.data.group_model import faces_in_name
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 
 Compare = Literal["paper"]
+VAGUE = 0.01
+"""Relative σ of a camera file's focal length above which the boards tell it better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +112,44 @@ class RunOptions:
             )
         return settled
 
+    def for_run(self, camera: CameraModel | None, target: TargetDesign, board: BoardDesign) -> "RunOptions":
+        """Returns the options settled for a run of these inputs; refuses those that camera file and designs forbid."""
+        printed, options = target.with_faces(printed=True).faces, self
+        if camera is None:
+            options = replace(options, refine_camera=True)
+        elif is_vague(camera) and not (options.refine_camera or options.compare):
+            options = replace(options, refine_camera=True)
+            known = f"camera file {camera.source}: states its focal length to ±{focal_sigma_px(camera):.3g} px only"
+            warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
+        of_circles = {
+            "--solve paper": options.solve == "paper",
+            "--compare paper": options.compare is not None,
+            "--board-only": options.board_only,
+        }
+        for name in (name for name, is_given in of_circles.items() if printed and is_given):
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
+            )
+        if camera is None and not (board.rows or printed):
+            raise InputError(
+                "E-CAMERA-NEEDED",
+                "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
+                "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or "
+                "tags",
+            )
+        options = options.settled(target)
+        if options.compare:
+            require_dots(board, f"--compare {options.compare}")
+            if options.solve != "joint" or not options.eccentricity:
+                raise InputError(
+                    "E-OPTION-CONFLICT",
+                    f"--compare paper: compares with the joint adjustment, but --solve is {options.solve}"
+                    f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity "
+                    "out",
+                )
+        return options
+
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
         """Returns the faces that the photographs of all ``groups``, also of lost ones, were to show."""
         if self.board_only:
@@ -113,20 +157,23 @@ class RunOptions:
         ids = [face.id for face in target.faces]
         if self.expect_faces:
             return [face for face in ids if face in self.expect_faces]
-        groups = list(groups)
-        named = [faces_in_name(name, [*ids, *unknown_faces(groups, target)]) for name in groups]
+        named = [faces_in_name(name, ids) for name in groups]
         return [face for face in ids if all(named) and any(face in faces for faces in named)]
 
 
-def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]:
-    """Returns what seem to be faces that the target lacks, with their group: beside a face in a name of two words, if
-    another group is named after two faces."""
-    ids, groups = [face.id for face in target.faces], list(groups)
-    found: dict[str, str] = {}
-    for group in groups if any(faces_in_name(name, ids) for name in groups) else ():
-        words = re.split("[-_+ ]", group)
-        parts = words if len(words) > 1 else list(group)
-        match [part for part in parts if part not in ids]:
-            case [other] if len(parts) == 2 and not faces_in_name(other, ids):
-                found.setdefault(other, group)
-    return found
+def is_vague(camera: CameraModel) -> bool:
+    """Returns whether a camera file, as of EXIF, states its focal length less well than the boards tell it."""
+    return camera.colmap_model == "OPENCV" and focal_sigma_px(camera) > VAGUE * camera.focal[0]
+
+
+def focal_sigma_px(camera: CameraModel) -> float:
+    """Returns the σ of a focal length, 0 if the file states none."""
+    return 0.0 if camera.covariance is None else float(np.sqrt(camera.covariance[0, 0]))
+
+
+def require_dots(board: BoardDesign | None, option: str) -> None:
+    """Refuses a board of corners for an option whose method finds dots."""
+    if isinstance(board, CornerBoard):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
+        )

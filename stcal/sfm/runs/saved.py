@@ -1,19 +1,20 @@
-"""A finished run read back from its folder, for every command that continues from it; and the comparison of its files
-with the hashes stored at its end."""
+"""A run: what it was given and what it found, just made, or read back from its folder for every command that continues
+from it; and the comparison of its files with the hashes stored at its end."""
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
 
 from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
-from stcal.design import scale_reference
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances, scale_reference
 from stcal.errors import InputError
-from stcal.geometry.arrays import OF_PIXEL, first_fault, frozen, require_arguments
+from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, frozen, require_arguments, rms
 from stcal.geometry.camera import Camera
+from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
@@ -30,25 +31,436 @@ from stcal.io.files import (
     read_bytes,
     require_unchanged,
 )
-from stcal.io.json import checked, read_json
+from stcal.io.images import name_fault
+from stcal.io.json import Part, checked, read_json
 from stcal.io.table import csv_rows
-from stcal.sfm.adjust.calibration import with_sigma
-from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.labels import CircleLabel, Label, circle_labels
+from stcal.report.document import html
+from stcal.sfm.adjust.calibration import Calibration, SigmaFactors, with_sigma
+from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
+from stcal.sfm.adjust.faces_file import FacesFile, TargetCircles
 from stcal.sfm.adjust.joint import Adjusted, adjusted
-from stcal.sfm.adjust.refine import with_edge_sigma
+from stcal.sfm.adjust.refine import ScaleSource, projection_jacobians, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import with_differences
-from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.checks.significance import Evidence
+from stcal.sfm.data.group_model import GroupModel, ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.detect_files import DetectionResult
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
-from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.report_file import ReportRead
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions
+from stcal.sfm.report.check import Check
+from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs.comparisons import Comparison
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.run_result import AnyRun, SavedRun, by_circle, folder_of, no_faces
-from stcal.sfm.runs.transaction import AGAIN, RESULTS, MarkerFile, as_written, complete_interrupted, files_below
+from stcal.sfm.runs.stages import GroupSolution
+from stcal.sfm.runs.transaction import (
+    AGAIN,
+    RESULTS,
+    MarkerFile,
+    as_written,
+    complete_interrupted,
+    files_below,
+    read_marker,
+)
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from stcal.sfm.runs.report_file import ReportCamera
+
+ReportPart = TypeVar("ReportPart", bound=Part)
+Value = TypeVar("Value")
+Rows = Literal["faces", "circles", "images", "observations"]
+"""Tables of :meth:`RunResult.to_dataframe`."""
 COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
+OF_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ImageResult(Brief):
+    """An image that the result rests on.
+
+    Parameters
+    ----------
+    name, group : str
+        Of the image, as in all results.
+    camera_from_target : Rigid
+        Its pose as adjusted, mm.
+    covariance : (6, 6) array
+        Covariance of the pose from this image's circles, rad and mm, left perturbation in the camera frame: target,
+        board and camera are taken as they were calibrated. ``stcal.sfm.measure`` adds the target's own uncertainty.
+    labels : tuple of Label
+        n circles and dots of the image that were used.
+    xy_px : (n, 2) array
+        Their measured centres, corrected for the eccentricity, px.
+    residuals_px : (n, 2) array
+        Measured minus projected, px.
+    """
+
+    name: str
+    group: str
+    camera_from_target: Rigid
+    covariance: np.ndarray
+    labels: tuple[Label, ...]
+    xy_px: np.ndarray
+    residuals_px: np.ndarray
+
+    @property
+    def rms_px(self) -> float:
+        """RMS of the residuals per axis, px."""
+        return rms(self.residuals_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SavedRun(Brief):
+    """A run: what it was given, and what it found. One that was just made is a :class:`RunResult`.
+
+    Parameters
+    ----------
+    out : Path or None
+        The run's folder; None if no file stays.
+    photographs : Path or str
+        The folder of photographs as given.
+    options : RunOptions
+        Options with every default decided.
+    camera : Camera
+        The camera as its file states it; refined intrinsics are ``calibration.camera``.
+    target_design, board_design : TargetDesign, BoardDesign
+        The designs as given.
+    observations : tuple of ImageObservations
+        Labelled centres of all images, px, in the database's order; without the shapes of the ellipses if read back.
+    corrected_px : tuple of (n, 2) array
+        By image, the centres in the database, corrected for the eccentricity.
+    faces_file : FacesFile or None
+        Content of ``faces.json``; None of the board alone.
+    report : dict
+        Content of ``report.json``.
+    """
+
+    out: Path | None
+    photographs: Path | str
+    options: RunOptions
+    camera: Camera
+    target_design: TargetDesign
+    board_design: BoardDesign
+    observations: tuple[ImageObservations, ...]
+    corrected_px: tuple[np.ndarray, ...] = ()
+    faces_file: FacesFile | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def database(self) -> Path:
+        """Path of COLMAP's database."""
+        return self.folder / DATABASE
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder; an error if no file of it was kept."""
+        if self.out is None:
+            raise InputError("E-RUN-FOLDER", "run: in memory, no file of it was kept; run it with out=")
+        return self.out
+
+    @property
+    def faces(self) -> FacesFile:
+        """Content of ``faces.json``; an error if the run is of the board alone."""
+        if self.faces_file is None:
+            raise no_faces(self.folder)
+        return self.faces_file
+
+    @property
+    def sha256(self) -> dict[str, str]:
+        """Hashes of the folder's files at the end of the run, by path below the folder."""
+        return read_marker(self.folder).sha256 or {}
+
+    @property
+    def target(self) -> CalibratedTarget:
+        """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
+        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
+        return CalibratedTarget(
+            faces.reference_face,
+            faces.poses(),
+            by_circle(faces.circles),
+            {},
+            dict(faces.target_from_face_covariance),
+            by_circle(faces.circle_covariance_mm2),
+            {},
+            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
+            None if joint is None else joint.matrix(),
+        )
+
+    def groups(self) -> dict[str, list[ImageObservations]]:
+        """Returns the observations by group, in order."""
+        return by_group(self.observations)
+
+    def sigma_factors(self) -> SigmaFactors:
+        """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
+        summary = self.report["summary"]
+        overall = summary["sigma_factor"]
+        circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
+        printed = summary.get("printed_sigma_factor") or circles
+        return SigmaFactors(overall, circles, dots, printed, self.target_design.printed_ids())
+
+    def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
+        """Heights of the rims behind which the faces lie, by circle, and σ of all, mm, 0 if they are stated."""
+        return by_circle(self.faces.rim_mm), self.report["summary"].get("rim_sigma_mm") or 0.0
+
+    def failed_checks(self) -> list[dict]:
+        """Returns the checks that failed, as ``report.json`` has them."""
+        return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
+
+    def report_as(self, part: type[ReportPart]) -> ReportPart:
+        """Returns the part of ``report.json`` that a command needs."""
+        with as_written(self.folder / "report.json"):
+            return checked(self.report, part)
+
+    def adjusted_camera(self, own: "ReportCamera") -> Camera:
+        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
+        if not self.options.refine_camera:
+            return self.camera
+        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
+        return Camera.of(camera, self.camera.colmap_model)
+
+
+def no_faces(folder: Path) -> InputError:
+    """Returns the error of a run without a result for faces."""
+    return InputError(
+        "E-RUN-NO-FACES",
+        f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
+        "that show them",
+    )
+
+
+def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
+    """Returns values of ``faces.json`` by the labels of the circles."""
+    return dict(zip(circle_labels(values), values.values(), strict=True))
+
+
+AnyRun = SavedRun | str | Path
+"""A finished run: its folder, or what ``load_run`` or ``run`` returned."""
+
+
+def folder_of(run: AnyRun) -> Path:
+    """Returns the folder of a run; an error if no file of it was kept."""
+    return run.folder if isinstance(run, SavedRun) else Path(run)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
+class RunResult(SavedRun):
+    """A run with the results of its stages; :attr:`target` is the calibrated target. Further fields are those of every
+    run: ``out``, ``photographs``, ``options``, ``camera`` (as its file states it; refined intrinsics are
+    ``calibration.camera``), ``target_design``, ``board_design``, ``observations``, ``corrected_px``, ``faces_file``,
+    ``report``.
+
+    Parameters
+    ----------
+    detection : DetectionResult
+        Detections of each image, and the images skipped.
+    labelled : tuple of LabelledImage
+        Labelled centres of all images, px, in the database's order.
+    graph : ImageGraph
+        Pairs of images that were matched.
+    solutions : tuple of GroupSolution
+        Solutions of the single groups, in worlds without unit.
+    calibration : Calibration
+        Target and models in mm, target frame.
+    chains : dict of tuple of FaceChain
+        Ways to each face through single groups, by face id.
+    notes : tuple of str
+        What was left out or did not settle, and what to do.
+    checks : tuple of Check
+        Checks in the order of the report.
+    comparison : Comparison, optional
+        Comparison with the published method, if requested.
+    judgement : Judgement, optional
+        The report in words, once it is made.
+    camera_given : bool
+        False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
+    """
+
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    graph: ImageGraph
+    solutions: tuple[GroupSolution, ...]
+    calibration: Calibration
+    chains: dict[str, tuple[FaceChain, ...]]
+    notes: tuple[str, ...]
+    checks: tuple[Check, ...] = ()
+    comparison: Comparison | None = None
+    judgement: Judgement | None = None
+    camera_given: bool = True
+
+    def scale_from(self) -> list[ScaleSource]:
+        """Returns what the size of the result rests on."""
+        board, drawn = self.board_design, self.target_design.up_to_scale
+        known = {
+            "board": board.rows,
+            "faces": faces_of_known_shape(board),
+            "distances": known_distances(board) and not drawn,
+            "drawing": drawn,
+        }
+        return [source for source in get_args(ScaleSource) if known[source]]
+
+    @property
+    def target(self) -> CalibratedTarget:
+        """The calibrated target."""
+        return self.calibration.target
+
+    def __repr__(self) -> str:
+        place = f" in {self.out}" if self.out else ""
+        return f"<RunResult{place}: {'not judged' if self.judgement is None else self.judgement.use.removesuffix('.')}>"
+
+    def _repr_html_(self) -> str:
+        """Returns verdict, faces and checks as HTML, which notebooks show."""
+        from stcal.sfm.runs.folder import document_of
+
+        document = document_of(self)
+        return html(document.about, *document.banner, *document.sections[0].blocks)
+
+    def circles(self) -> TargetCircles:
+        """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
+        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.of_target)
+
+    def images(self) -> tuple[ImageResult, ...]:
+        """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""
+        calibration, images = self.calibration, []
+        scale = 1.0 if calibration.joint is None else calibration.joint.sigma_scale  # factor on the centres' σ
+        for model in calibration.models:
+            by_pose = model.whiten(projection_jacobians(model, calibration.camera)[0])
+            alone = np.linalg.inv(blocks_of(by_pose, by_pose[..., 0], model.image_index, len(model.images))[0])
+            corrected, residuals = model.corrected_px(), model.residuals_px(calibration.camera)
+            of_images = zip(model.images, model.camera_from_model, scale**2 * alone, model.rows_by_image(), strict=True)
+            for name, pose, covariance, rows in of_images:
+                labels = tuple(model.labels[k] for k in model.point_index[rows])
+                images.append(
+                    ImageResult(name, model.group, pose, covariance, labels, corrected[rows], residuals[rows])
+                )
+        return tuple(images)
+
+    def final_models(self) -> dict[str, GroupModel]:
+        """Returns the models that the result rests on, by group."""
+        models = self.calibration.joint.models if self.calibration.joint else [s.model for s in self.solutions]
+        return {model.group: model for model in models}
+
+    def residuals_px(self) -> dict[str, np.ndarray]:
+        """Returns corrected minus projected keypoints, (k, 2), by image; NaN for keypoints not in the result."""
+        by_image = {image.name: np.full((len(image), 2), np.nan) for image in self.observations}
+        for model in self.final_models().values():
+            residual = model.residuals_px(self.calibration.camera)
+            for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+                by_image[name][model.keypoint[rows]] = residual[rows]
+        return by_image
+
+    def unadjusted(self) -> dict[str, frozenset[Label]]:
+        """Returns the labels of the keypoints that are not in the result, by image."""
+        residuals = self.residuals_px()
+        return {
+            image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residuals[image.name]).any(axis=1)))
+            for image in self.observations
+        }
+
+    def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
+        """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
+
+        Parameters
+        ----------
+        rows : {"faces", "circles", "images", "observations"}
+            ``faces``: place, rotation vector and σ of each face, target frame; ``circles``: the calibrated circles;
+            ``images``: pose of each image; ``observations``: each circle in each image, with its residual.
+
+        Raises
+        ------
+        InputError
+            pandas is not installed, or there is no such table.
+        """
+        if rows not in get_args(Rows):
+            raise InputError("E-OPTION-VALUE", f"table of {rows!r}: not a choice; use {', '.join(get_args(Rows))}")
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise InputError(
+                "E-EXTRA-MISSING", "DataFrame: needs pandas; install stereo-target-calibration[pandas]"
+            ) from error
+        target, table = self.target, []
+        if rows == "faces":
+            for face, pose in target.target_from_face.items():
+                table.append({"face": face} | _cells(OF_POSE, pose.log(), target.face_covariance.get(face)))
+        elif rows == "circles":
+            for label, xyz in target.circles.items():
+                cells = _cells(OF_POSE[3:], xyz, target.circle_covariance.get(label))
+                table.append({"label": str(label), "face": label.face} | cells)
+        for image in self.images() if rows in ("images", "observations") else ():
+            place = {"image": image.name, "group": image.group}
+            if rows == "images":
+                cells = _cells(OF_POSE, image.camera_from_target.log(), image.covariance)
+                table.append(place | cells | {"circles": len(image.labels), "rms_px": image.rms_px})
+                continue
+            columns = ("x_px", "y_px", "residual_x_px", "residual_y_px")
+            for label, row in zip(image.labels, np.hstack([image.xy_px, image.residuals_px]).tolist(), strict=True):
+                table.append(place | {"label": str(label)} | dict(zip(columns, row, strict=True)))
+        return DataFrame(table)
+
+    @property
+    def refined_camera(self) -> Camera | None:
+        """Camera as adjusted, with covariance; None if the intrinsics were held fixed."""
+        joint = self.calibration.joint
+        if joint is None or not joint.camera_covariance.size:
+            return None
+        return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
+
+    def evidence(self) -> Evidence:
+        """Returns the input of the checks."""
+        blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
+        return Evidence(
+            models=tuple(s.model for s in self.solutions),
+            outliers=tuple(o for s in self.solutions for o in s.outliers),
+            images=self.observations,
+            camera=self.camera,
+            target=self.target_design,
+            board=self.board_design,
+            options=self.options.adjustment(self.target_design),
+            calibration=self.calibration,
+            prior=camera_prior(self.camera) if self.options.refine_camera else None,
+            rim=bool(self.options.rim),
+            camera_given=self.camera_given,
+            blur_px={name: float(np.median(edge_blur)) for name, edge_blur in blur.items() if len(edge_blur)},
+        )
+
+
+def _cells(names: Sequence[str], values: np.ndarray, covariance: np.ndarray | None) -> dict[str, float]:
+    """Returns the cells of values and their σ, NaN without a covariance."""
+    sigma = np.full(len(names), np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sigmas = zip([f"sigma_{name}" for name in names], sigma.tolist(), strict=True)
+    return dict(zip(names, values.tolist(), strict=True)) | dict(sigmas)
+
+
+class ImageRow(Part):
+    image_id: int
+    name: str
+    group: str
+    circles: int
+
+
+class ReportRead(Part):
+    """Content of ``report.json`` that every command on a run needs, of whatever version."""
+
+    format: Literal["stcal report 1"] = "stcal report 1"
+    images: list[ImageRow]
+    groups: list[dict[str, Any]]
+    summary: dict[str, Any]
+
+    def names(self) -> list[tuple[str, str, int]]:
+        """Returns (name, group, circles) of the images in the database's order; an error if something is missing."""
+        pairs = {row["name"]: row["pairs"][0] for row in self.groups}
+        group_of = {entry.name: entry.group for entry in self.images}
+        for name, group in group_of.items():
+            if fault := name_fault(name):
+                raise ValueError(f"image {name!r}: its name {fault}")
+            if not all(group_of.get(pairs[group][which]) == group for which in ("first", "second")):
+                raise ValueError(f"group {group}: its initial pair is not of its images")
+        float(self.summary["residual_rms_px"])
+        return [(entry.name, entry.group, entry.circles) for entry in self.images]
 
 
 def saved_run(run: AnyRun) -> SavedRun:

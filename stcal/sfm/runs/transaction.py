@@ -5,7 +5,6 @@ holds the input of the run, and the hashes of its files."""
 import csv
 import os
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -30,7 +29,6 @@ from stcal.io.files import (
     save,
 )
 from stcal.io.json import ResultFile, read_result
-from stcal.sfm.runs.run_options import RunOptions
 
 ByFile = Annotated[str, "file"]
 AGAIN = "run it again"
@@ -50,14 +48,10 @@ class MarkerFile(ResultFile):
     )
 
     @classmethod
-    def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
-        """Returns the marker of a run, or of a detection alone, that begins."""
-        return cls(
-            program="stcal-sfm",
-            version=stcal.__version__,
-            images=str(Path(images).absolute()),
-            options=None if options is None else asdict(options),
-        )
+    def of(cls, images: str | Path, options: Any) -> "MarkerFile":
+        """Returns the marker of a run with these options, or of a detection alone, that begins."""
+        plain, place = None if options is None else asdict(options), str(Path(images).absolute())
+        return cls(program="stcal-sfm", version=stcal.__version__, images=place, options=plain)
 
     def sealed(self, digests: dict[str, str]) -> "MarkerFile":
         """Returns the marker of results with these hashes, which include its own."""
@@ -66,8 +60,8 @@ class MarkerFile(ResultFile):
         return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
 
 
-STAGE, READY, HOLDER = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready", f"{INTERNAL}/holder.txt"
-"""Results that are being written, results that are complete, and who writes."""
+STAGE, READY = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready"
+"""Results that are being written, and results that are complete."""
 GONE = "gone.txt"
 """Names of the earlier results that complete ones lack."""
 RESULTS = tuple(name for name in RUN_ENTRIES if name != INTERNAL)
@@ -133,7 +127,7 @@ def added_results(out: Path) -> Iterator[Path]:
     writes. The PDF of a report that is replaced is removed."""
     with _staged(out) as stage:
         yield stage
-        marker = read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN)
+        marker = read_marker(out)
         gone = [REPORT_PDF] if (stage / "report.html").exists() and not (stage / REPORT_PDF).exists() else []
         if marker.sha256 is not None:
             kept = {name: digest for name, digest in marker.sha256.items() if name not in gone}
@@ -149,23 +143,18 @@ def _staged(out: Path) -> Iterator[Path]:
     try:
         (out / CACHE).mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
-        complete(out)
+        _complete(out)
         remove(out / STAGE)
         (out / STAGE).mkdir()
     except filelock.Timeout as error:
-        holder = "another process"
-        with suppress(OSError, ValueError):
-            holder = (out / HOLDER).read_text(encoding="utf-8").strip() or holder
         raise InputError(
             "E-OUTPUT-IN-USE",
-            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out",
+            f"output folder {out}: another process is writing a run there; wait for its end, or give another --out",
         ) from error
     except OSError as error:
         lock.release()
         raise _unwritable(out, error) from error
     try:
-        with suppress(StcalError):  # it only says to others who writes here
-            save(out / HOLDER, f"process {os.getpid()} on {socket.gethostname()}\n")
         yield out / STAGE
     finally:
         remove(out / STAGE)
@@ -189,9 +178,14 @@ def as_written(file: Path | str) -> Iterator[None]:
 def is_finished(out: Path) -> bool:
     """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
     with suppress(InputError):
-        if read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN).sha256 is not None:
+        if read_marker(out).sha256 is not None:
             return True
     return (out / "faces.json").exists()
+
+
+def read_marker(out: Path) -> MarkerFile:
+    """Reads the marker of a run's folder."""
+    return read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN)
 
 
 def _digests(stage: Path) -> dict[str, str]:
@@ -204,12 +198,12 @@ def _exchange(out: Path, marker: MarkerFile, gone: Sequence[str]) -> None:
     save(out / STAGE / GONE, "\n".join(gone))
     try:
         os.replace(out / STAGE, out / READY)
-        complete(out)
+        _complete(out)
     except OSError as error:
         raise _unwritable(out, error) from error
 
 
-def complete(out: Path) -> None:
+def _complete(out: Path) -> None:
     """Moves results that are ready to their places, and at last their marker; the folder must be locked."""
     ready = out / READY
     if (ready / GONE).is_file():
@@ -228,7 +222,7 @@ def complete_interrupted(out: Path) -> None:
     """Completes a finished run that was killed while its results took their places; call it before the run is read."""
     if (out / READY).exists():
         with _staged(out):
-            pass
+            pass  # as every command that writes does
 
 
 def _unwritable(out: Path, error: OSError) -> InputError:

@@ -11,11 +11,12 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
 from stcal.sfm.checks import suite
-from stcal.sfm.checks.causes import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.checks.significance import moved_apart
+from stcal.sfm.checks.suite import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.report.check import CAUSE, OF_WHOLE_SET, ranked
-from stcal.sfm.runs import groups as solve
-from stcal.sfm.runs.groups import GroupSolution, refine_or_explain
+from stcal.sfm.runs import stages as solve
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.stages import Groups, GroupSolution, refine_or_explain
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.sfm.checks.test_checks import Lab, seen_circles
@@ -269,12 +270,13 @@ def test_one_photograph_that_contradicts_a_group_is_named(few, lab, monkeypatch,
 
 def test_circles_that_no_image_shows_as_drawn_are_named(few, lab):
     models = lab.labels_only.models(few, lab.observe(few))
-    solutions = [GroupSolution((), model, "", 0, {}, ()) for model in models]
-    assert solve.unseen_circles(solutions, few.target) == []
+    solutions = tuple(GroupSolution((), model, "", 0, {}, ()) for model in models)
+    groups = Groups((), (), None, few.camera, few.board, RunOptions(), False, (), solutions)
+    assert groups.unseen_notes(few.target) == []
 
     def without(model, lost: str):
         return model.without(np.array([model.labels[p] == lost for p in model.point_index]))
 
-    cut = [replace(each, model=without(each.model, "1:4")) for each in solutions]
-    [note] = solve.unseen_circles(cut, few.target)
+    cut = tuple(replace(each, model=without(each.model, "1:4")) for each in solutions)
+    [note] = replace(groups, solutions=cut).unseen_notes(few.target)
     assert note.startswith("1:4: not in the result, as too few images show it as drawn; check radius and place")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,8 +19,8 @@ from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import face_checks
 from stcal.sfm.checks.board_checks import board_checks
 from stcal.sfm.checks.image_checks import moved_check
-from stcal.sfm.checks.significance import MOST_ENLARGED, Trial, culprits, judge
-from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
+from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
 from stcal.sfm.report.run_page import checks_section
@@ -158,9 +159,6 @@ def test_radii_of_another_design_are_no_wrong_pitch(full_scene, lab):
         images.append(replace(image, shape=image.shape * larger[:, None, None]))
     checks = lab.check(full_scene, images)
     assert not_passed(checks) == {"radius-design": "failed"}
-    assert checks["pitch"].reason.endswith("by positions alone, which radii contradict")
-    by_radii = next(m for m in checks["pitch"].measured if m.name == "by radii of circles")
-    assert by_radii.value == pytest.approx(80_000, rel=0.05)
 
 
 def test_a_rim_is_said_alone(full_scene, lab):
@@ -214,9 +212,9 @@ def test_a_noisy_image_has_not_moved(full_scene, lab):
         images[4] = replace(images[4], centre_px=images[4].centre_px + noise)
         refined, calibration, _ = lab.calibrate(full_scene, images)
         networks = [free_network(each.model, calibration.camera) for each in refined]
-        assert moved_check(networks).verdict == "passed"
-        bent = [check for check in board_checks(networks, full_scene.board) if check.verdict != "passed"]
-        assert bent == []
+        evidence = SimpleNamespace(networks=networks, board=full_scene.board)
+        verdicts = [check.verdict for check in (moved_check(evidence), *board_checks(evidence))]
+        assert verdicts == ["passed"] * 3
 
 
 @pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])
@@ -400,12 +398,3 @@ def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(l
     assert checks["groups"].verdict == verdict
     larger = max(check.enlarges for check in checks.values())
     assert (1.2 < larger <= MOST_ENLARGED) == (verdict == "suspicious")
-
-
-def test_a_group_that_tells_nothing_of_a_face_is_no_trial():
-    """Without it the face's covariance is the same but for rounding, so that no change of it can be tested."""
-    covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6])
-    assert face_checks._nested_trial("face 2 without group 15", np.zeros(6), covariance, covariance, 100) is None
-    trial = face_checks._nested_trial("face 2 without group 15", 1e-3 * np.ones(6), 2 * covariance, covariance, 100)
-    assert trial is not None
-    assert trial.freedom == 6

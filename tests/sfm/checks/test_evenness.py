@@ -1,6 +1,7 @@
 """Circles that are darker on one side are suspected, and by chance none is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,7 +34,10 @@ class Group:
         for i, image in enumerate(self.images):
             shift = [[0.6 * SHIFT_PX, 0.8 * SHIFT_PX] if uneven(label, i) else [0, 0] for label in image.labels]
             images.append(replace(image, uneven_px=np.array(shift)))
-        return evenness_check([self.network], images, self.camera)
+        calibration = SimpleNamespace(camera=self.camera)
+        return evenness_check(
+            SimpleNamespace(networks=[self.network], images=images, calibration=calibration, radius_mm={"any": 1.0})
+        )
 
     def in_all(self):
         return sorted(set.intersection(*(set(image.labels) for image in self.images)))

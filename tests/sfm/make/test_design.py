@@ -189,13 +189,13 @@ def test_some_sides_alone_have_circles():
 )
 def test_sides_that_no_photograph_links_are_refused(faces, said):
     with fails_with(said):
-        faces_of(faces)
+        DesignOptions(SIZE, faces=faces_of(faces))
 
 
 @pytest.mark.parametrize("size", ["130", "130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"])
 def test_sizes_are_three_lengths(size):
     with pytest.raises(InputError, match="--size"):
-        size_of(size)
+        DesignOptions(size_of(size))
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from stcal.errors import MappingError
-from stcal.sfm.data.note import ELSEWHERE, Note
+from stcal.sfm.data.group_model import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
 from stcal.sfm.report.judgement import judged, judgement_of
 from stcal.sfm.report.run_page import report_html

@@ -18,7 +18,7 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
-from stcal.sfm.data.note import GROUP_LEFT_OUT
+from stcal.sfm.data.group_model import GROUP_LEFT_OUT
 from stcal.sfm.detect import detect_files as files
 from stcal.synthetic.scene import image_circles
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
@@ -293,45 +293,12 @@ def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
     assert (small.out / "faces.json").read_text(encoding="utf-8") == "mine"
 
 
-def test_the_images_as_output_are_refused(small_set, stcal_sfm):
-    small = small_set("12", detected=False)
-    outcome = stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.images)
-    assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.images), "--out")
-    assert len(list(small.images.rglob("*"))) == 5
-
-
 def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, stcal_sfm):
     small = small_set()
     own_copy(small_run / "faces.json", small.out)
     outcome = stcal_sfm("run", small.folder / "imagse", "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-IMAGES-FOLDER", "imagse", "does not exist")
     assert results_in(small.out) == ["faces.json"]
-
-
-def test_a_truth_that_is_none(small_run, small_dataset, stcal_sfm, tmp_path):
-    """What files may hold is in tests/sfm/report/test_compare.py."""
-    true = json.loads((small_dataset / "truth.json").read_text(encoding="utf-8"))
-    path = tmp_path / "truth.json"
-    for changes, *parts in (
-        ({"groups": {"12": {"images": {}}}}, "groups.12", "no 'board_circles_target'"),
-        ({"circles": true["circles"] | {"2:1": [1, 2]}}, "circles.2:1: [1, 2]: shape (2,), (3,) needed"),
-        ({"circles": true["circles"] | {"2:1": [np.nan] * 3}}, "circles.2:1: ", "not finite"),
-        ({"target_from_face": {"2": (2 * np.eye(4)).tolist()}}, "target_from_face.2: ", "0 0 0 1 needed"),
-        ({"target_from_face": {"x": np.eye(4).tolist()}}, "no face in common"),
-        ({"reference_face": "2"}, "reference face 1 in the run, 2 in", "--reference-face 2"),
-    ):
-        path.write_text(json.dumps(true | changes), encoding="utf-8")
-        assert_error(stcal_sfm("compare", small_run / "faces.json", path), INPUT, *parts)
-    path.write_text("", encoding="utf-8")
-    assert_error(stcal_sfm("compare", small_run / "faces.json", path), INPUT, "not JSON", "give a finished run")
-
-
-def test_an_unfinished_run_is_not_compared(small_set, stcal_sfm):
-    small = small_set()
-    outcome = stcal_sfm("compare", small.out, small.folder / "truth.json")
-    assert_error(
-        outcome, INPUT, "E-FILE-UNREADABLE", str(small.out / "faces.json"), "No such file", "give a finished run"
-    )
 
 
 def command(*arguments) -> list[str]:

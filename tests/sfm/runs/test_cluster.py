@@ -168,19 +168,3 @@ def test_a_run_by_a_cluster_that_loses_its_scheduler_ends_in_one_line(small_data
         with fails_with(f"E-WORKER-DIED … {address}"), cluster.dask_cluster(address):
             run_into(tmp_path / "run", small_dataset, progress=progress)
         assert killed
-
-
-@pytest.mark.slow
-def test_an_image_that_ends_its_workers_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
-    file = ImageFile(tmp_path / "a.jpg", "a.jpg", ".")
-    with two_workers(tmp_path) as (address, *_), fails_with(f"E-WORKER-DIED … {address}"):  # noqa: SIM117
-        with cluster.dask_cluster(address):
-            dict(run_on_images(end, [(file,)]))
-
-
-@pytest.mark.slow
-def test_trials_of_a_study_go_to_a_cluster_or_stay_here(tmp_path):
-    with two_workers(tmp_path) as (address, *_), cluster.executor_of(address) as there, cluster.executor_of() as here:
-        for pool in (there, here):
-            assert list(pool.map(pow, range(20), [2] * 20)) == [i * i for i in range(20)]

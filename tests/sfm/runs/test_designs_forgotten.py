@@ -1,13 +1,11 @@
 """Designs that were forgotten or are wrong: what was assumed, and what the images say."""
 
 import re
-from dataclasses import replace
 
 import pytest
 
 from stcal.boards.target_file import target_toml
-from stcal.design import reference_board, reference_target
-from stcal.sfm.data.patterns import measured_pitch_mm, pitch_hint
+from stcal.design import reference_target
 from stcal.sfm.detect.sightings import likeness_notes
 from stcal.synthetic.designs import second_design
 
@@ -63,18 +61,6 @@ def test_measure_calibrate_camera_and_plan_name_what_they_assumed(stcal_sfm, sma
     assert not any(said in out for said in (TARGET_ASSUMED, "reference board"))
     out = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")[1]
     assert (TARGET_ASSUMED in out, BOARD_ASSUMED in out) == (True, True)
-
-
-def test_images_tell_the_pitch(small_result):
-    images = small_result.observations
-    board = reference_board()
-    # Blur of 0.7 px on dots of some 10 px makes them larger by a few per cent at most, and the pitch as much smaller.
-    assert measured_pitch_mm(images, board) == pytest.approx(30, rel=0.03)
-    assert pitch_hint(images, board) == ""
-    hint = pitch_hint(images, replace(board, pitch_mm=25.0))
-    assert "dots of radius_mm 7.5 are 30" in hint or "dots of radius_mm 7.5 are 29" in hint
-    assert "the board file says pitch_mm 25: correct pitch_mm, or radius_mm" in hint
-    assert measured_pitch_mm([image.select([]) for image in images], board) is None
 
 
 @pytest.mark.slow

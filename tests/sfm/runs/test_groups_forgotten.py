@@ -1,7 +1,5 @@
 """Folders of groups that were forgotten, or given one level too high: what was assumed, and what to do."""
 
-import shutil
-
 import pytest
 
 from tests.outcome import INPUT, assert_error
@@ -24,17 +22,6 @@ def test_images_without_folders_are_said_to_be_one_group_and_lost_boards_are_cou
     assert "the board of 4 of them (1" in out
     remedy = "put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
     assert remedy in " ".join(out.split())
-
-
-def test_one_image_beside_the_folders_gets_its_own_advice(stcal_sfm, small_set):
-    small = small_set("12")
-    shutil.move(small.image(3), small.images / "stray.jpg")
-    files = "--target", small.folder / "target.toml", "--board", small.folder / "board.toml", "--solve", "chain"
-    code, out, _ = stcal_sfm(*small.arguments(*files))
-    assert code == 0
-    out = " ".join(out.split())
-    assert "group .: 1 usable image (stray.jpg), 2 needed; it lies beside the folders of groups (12)" in out
-    assert "move it into the one it belongs to, or leave it out with --exclude stray.jpg" in out
 
 
 def test_the_parent_of_the_images_is_told_from_them(stcal_sfm, small_set):

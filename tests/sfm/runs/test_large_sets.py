@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.incremental import complete
 from stcal.sfm.mapping.pairs import (
     MIN_SHARED,
@@ -22,8 +23,8 @@ from stcal.sfm.mapping.pairs import (
     incidence,
     track_parts,
 )
-from stcal.sfm.runs.groups import solve_groups
 from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.runs.stages import Groups, solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 
@@ -46,8 +47,10 @@ def solve(scene, observations, kind, out):
     options = RunOptions().settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
     (out / ".stcal/cache").mkdir(parents=True)
-    folders, designs = (out / "scratch", out / ".stcal/cache"), (scene.target, scene.board)
-    solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
+    labelled = tuple(LabelledImage(image, ()) for image in observations)
+    groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
+    solved, _ = solve_groups(groups, scene.target, out / "scratch", out / ".stcal/cache", lambda *_: None)
+    solutions = list(solved.values())
     return (
         graph,
         solutions,
@@ -128,12 +131,6 @@ def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
         # 50 views over 80° × 80°: farthest-point choice of 20 leaves none further than a fifth of that from one.
         away = np.degrees(np.arccos(np.clip((direction @ own.T).max(1), -1, 1)))
         assert away.max() < 16
-
-
-def test_small_groups_are_mapped_as_they_are(crowd):
-    scene, observations = crowd
-    few = observations[:SKELETON]
-    assert image_graph(few, scene.board, "sparse").skeleton["12"].tolist() == list(range(SKELETON))
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.sfm.pipeline import run
-from stcal.sfm.runs.paper import AS_PUBLISHED, STEPS
+from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS
 from stcal.sfm.runs.run_options import RunOptions
 from tests.outcome import fails_with
 

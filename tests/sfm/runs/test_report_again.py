@@ -11,7 +11,7 @@ from stcal.io.files import RUN_MARKER
 from stcal.report.document import with_code
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
-from stcal.sfm.runs.run_text import run_text
+from stcal.sfm.runs.folder import run_text
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import added_results
 from tests.outcome import INPUT, assert_error
@@ -31,15 +31,6 @@ def test_the_same_files_make_the_same_page(own_run, small_run, stcal_sfm, monkey
         (stage / "report.html").write_text("another")
     assert not (own_run / "report.pdf").exists()  # it was made of the page before
     assert verify(own_run).notes() == []
-
-
-def test_files_that_the_run_did_not_leave_so_are_said(own_run, stcal_sfm):
-    """Fewer lines of the table of centres, of which the page draws residuals."""
-    lines = (own_run / "labels.csv").read_text().splitlines(keepends=True)
-    (own_run / "labels.csv").write_text("".join(lines[: len(lines) // 2]))
-    code, out, _ = stcal_sfm("report", own_run)
-    assert code == 0
-    assert out.startswith("note: the run's folder is not as the run left it: 1 changed (labels.csv)\n")
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
-from stcal.sfm.runs.groups import LIKELY, explained, require_usable, usable_groups, wrong_file
-from stcal.sfm.runs.run_text import run_text
+from stcal.sfm.runs.folder import run_text
+from stcal.sfm.runs.stages import LIKELY, explained, usable_groups, wrong_file
 from tests.outcome import fails_with, refuses
 
 
@@ -28,15 +28,14 @@ def only(group, board: bool):
 
 
 def test_two_images_with_board_and_face_will_do(group):
-    require_usable(group[:2])
     assert usable_groups({"12": group[:2]}, []) == ({"12": group[:2]}, [])
 
 
 def test_what_is_missing_is_named(group):
     with fails_with("E-GROUP-FEW-IMAGES … 1 usable image"):
         usable_groups({group[0].group: group[:1]}, [])
-    refuses("E-GROUP-NO-FACE … 5", require_usable, only(group, board=True))
-    refuses("E-GROUP-NO-BOARD … 5", require_usable, only(group, board=False))
+    refuses("E-GROUP-NO-FACE … 5", usable_groups, {"12": only(group, board=True)}, [])
+    refuses("E-GROUP-NO-BOARD … 5", usable_groups, {"12": only(group, board=False)}, [])
 
 
 def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):

@@ -7,7 +7,6 @@ import shutil
 import pytest
 
 from stcal.io.files import RUN_MARKER
-from stcal.sfm.interop import crosscheck as interop
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
@@ -101,19 +100,6 @@ def test_a_run_and_an_addition_wait_for_each_other(made):
         run_folder(made, MARKER, {}).__enter__()
     with run_folder(made, MARKER, {}), fails_with("E-OUTPUT-IN-USE"):
         added_results(made).__enter__()
-
-
-def test_no_run_begins_while_a_crosscheck_maps(small_run, tmp_path, monkeypatch):
-    run = own_copy(small_run, tmp_path / "run")
-
-    def meanwhile(*_):
-        with run_folder(run, MARKER, {}):
-            pytest.fail("a run began")
-
-    monkeypatch.setattr(interop, "_compared", meanwhile)
-    with fails_with("E-OUTPUT-IN-USE"):
-        interop.crosscheck(run, into_report=True)
-    assert verify(run).notes() == []
 
 
 def test_a_run_without_hashes_gets_none(made):

@@ -17,8 +17,7 @@ from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.report_file import unadjusted
-from stcal.sfm.runs.task import Task, detect_with
+from stcal.sfm.runs.stages import Task, detect_with
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -57,7 +56,7 @@ def test_a_dot_that_one_image_alone_shows_is_crossed_in_its_overlay(small_set, s
         cv2.imwrite(str(small.images / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
     result = calibrate(small.folder, small.out)
     (name, *_), first = seen, next(iter(seen.values()))
-    assert {label for labels in unadjusted(result).values() for label in labels} == {out}
+    assert {label for labels in result.unadjusted().values() for label in labels} == {out}
     drawn = cv2.imread(str(small.out / "overlays" / name))
     assert drawn.shape[:2] == (864, 1296)
     for label in (out, DotLabel(3, 5)):

@@ -1,4 +1,5 @@
-"""The stage of a run that maps: which groups can be solved, and the solution of each, which is cached by its inputs."""
+"""The stages of a run that lead to solved groups: detect and label, with the camera to begin with; and map, group by
+group, each of which is cached by its inputs."""
 
 import hashlib
 import json
@@ -11,37 +12,56 @@ from typing import TypeVar
 
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape
-from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
+from stcal.boards.finders import why_unseen
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
+from stcal.errors import (
+    ConvergenceError,
+    DegenerateError,
+    DetectionError,
+    InputError,
+    MappingError,
+    ScaleError,
+    StcalError,
+)
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
-from stcal.io.cameras.camera_model import CameraModel, refinable
-from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
+from stcal.io.cameras.camera_model import CameraModel, model_of, refinable
+from stcal.io.cameras.read import camera_of_photograph
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, ImageFile, ImageFiles, Skipped, require_common_size
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_in_order
 from stcal.report.text import significant
 from stcal.sfm.adjust.refine import Refined, find_scale, refine, with_edge_sigma
-from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
-from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
+from stcal.sfm.camera.calibrate import camera_of_dots, camera_of_labelled, weighted_rms_px
+from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, moved_apart
-from stcal.sfm.data.group_model import ImageObservations, Outlier, WorldModel, by_group
-from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
-from stcal.sfm.data.patterns import pitch_hint
-from stcal.sfm.detect.labelling import LabelledImage, is_board_alone
+from stcal.sfm.checks.suite import EXPLAINS, cause_of_file
+from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, Outlier, WorldModel, by_group
+from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
+from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
+from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
-from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model, place_with_camera
+from stcal.sfm.mapping.placed import (
+    BY_FACES,
+    LENS,
+    model_of_body,
+    pair_of_model,
+    place_and_find_camera,
+    place_with_camera,
+    unknown_lens,
+)
 from stcal.sfm.report.check import Check
-from stcal.sfm.runs.run_options import RunOptions, unknown_faces
-from stcal.sfm.runs.task import DetectedImages, Task
+from stcal.sfm.runs.run_options import RunOptions, is_vague, require_dots
+from stcal.sfm.runs.transaction import RunFolder
 
 CACHE_VERSION = 8
 LEAST_WITHOUT, MOST_WITHOUT = 3, 40
 """Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
-FEW_NAMED = 6
 SHOW_MORE = "show two faces of it at once, or one by more corners"
 UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)
 """Errors by which one group has no solution, while others may."""
@@ -49,6 +69,145 @@ LIKELY = "; the likely cause: "
 """How the part of an error begins that says what the photographs that cannot be solved have in common."""
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 S = TypeVar("S")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What all stages of a run work on."""
+
+    files: ImageFiles
+    folder: RunFolder  # claimed
+    target: TargetDesign
+    board: BoardDesign  # without rows where there is none
+    options: RunOptions
+    progress: Progress
+    camera: CameraModel | None = None  # as given
+    photographs: Path | str = ""  # the folder that they are in
+
+    @property
+    def camera_given(self) -> bool:
+        """False if the camera is found from the photographs, also where its file is only a start of that."""
+        return self.camera is not None and not (self.options.refine_camera and is_vague(self.camera))
+
+    def named(self, words: str) -> "Task":
+        """Returns the task with other words for its stages, of which ``{}`` is the own name."""
+        return replace(self, progress=lambda stage, *count: self.progress(words.format(stage), *count))
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DetectedImages(Brief):
+    """The circles and corners of all images.
+
+    ``detection`` : what was measured, and the images ``skipped``; ``labelled`` : images with their labels, in the
+    database's order; ``camera`` : with which they were detected; ``notes`` : on the camera, and on what no image shows.
+    """
+
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    camera: CameraModel
+    notes: tuple[str, ...] = ()
+
+    @property
+    def observations(self) -> list[ImageObservations]:
+        """Labelled centres of all images."""
+        return [image.observations for image in self.labelled]
+
+    @property
+    def images(self) -> dict[str, Detection]:
+        """Labels, centres and covariances, px, by the name of the image."""
+        return {
+            (seen := image.observations).name: Detection(
+                seen.labels, seen.centre_px, seen.covariance_px2, tuple(image.notes)
+            )
+            for image in self.labelled
+        }
+
+
+def detect(task: Task) -> DetectedImages:
+    """Detects and labels with the camera given, or with the one that printed faces, or the board's dots, determine."""
+    camera, printed = task.camera, task.target.with_faces(printed=True)
+    if camera is None and printed.faces:
+        faces_alone = replace(task, target=printed, board=scale_reference(None, printed))
+        guesses = guessed_cameras(task.files[0])
+        seen = detect_with(faces_alone, model_of(guesses[0], PHOTOGRAPHS))
+        if not any(image.face_ids() for image in seen.observations):
+            return seen  # :func:`scaled_by_drawing` refuses it
+        found = place_and_find_camera(seen.observations, printed.faces, guesses).camera
+        if not task.board.rows and len(printed.faces) == len(task.target.faces):  # all was measured already
+            return _labelled(task, seen_by(seen.detection, found, task.target), model_of(found, PHOTOGRAPHS))
+        camera = model_of(found, PHOTOGRAPHS)
+    elif camera is None or (task.board.rows and not task.camera_given):
+        camera = camera_by_dots(task, camera)
+    return detect_with(task, camera)
+
+
+def detect_with(task: Task, camera: CameraModel) -> DetectedImages:
+    """Detects and labels the images by the rules that the options ask for."""
+    (chosen, skipped), target, options = task.files, task.target, task.options
+    step = counted(task.progress, "detect", len(chosen))
+    dots, detector = task.board if task.board.rows else None, None
+    if options.solve == "paper":
+        require_dots(dots, "--solve paper")
+        PublishedPattern.of(target)
+        detector = detect_published
+    how = options.ellipses, task.folder.cache, options.workers
+    detection = detect_files(chosen, camera, target, dots, *how, step, detector)
+    detection = replace(detection, skipped=(*skipped, *detection.skipped))
+    require_upright(detection.images, task.board)
+    return _labelled(task, detection, camera)
+
+
+def _labelled(task: Task, detection: DetectionResult, camera: CameraModel) -> DetectedImages:
+    target, options, dots = task.target, task.options, task.board if task.board.rows else None
+    if dots is not None and (options.board_only or is_board_alone(detection)):
+        labelled = label_boards(detection, target, dots)
+    elif options.solve == "paper":
+        labelled = label_once(detection, target, dots)
+    else:
+        labelled = label_images(detection, target, dots, options.ellipses, task.folder.cache, options.workers)
+    return DetectedImages(detection, tuple(labelled), camera)
+
+
+def camera_by_dots(task: Task, rough: CameraModel | None) -> CameraModel:
+    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens."""
+    files = task.files[0]
+    start = guessed_cameras(files)[0] if rough is None else rough.calibrated(*require_common_size(files)[0])
+    seen = detect_with(task.named("{} for the camera"), model_of(start, PHOTOGRAPHS))
+    return model_of(unknown_lens(camera_of_dots(files, seen.detection, task.board, start, LENS).camera), PHOTOGRAPHS)
+
+
+def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
+    """Returns where the search for a camera begins: at the first EXIF that states one, or a medium focal length."""
+    (width, height), _ = require_common_size(list(files))
+    for file in files:
+        with suppress(InputError):
+            camera = camera_of_photograph(file.path).camera
+            if (camera.width, camera.height) == (width, height):
+                return [camera]
+    return [Camera.of(start_camera(width, height, LENS), LENS)]
+
+
+def unseen_faces(task: Task, seen: DetectedImages) -> str:
+    """Returns that no printed face of the target is seen, and which tags are; empty if one is, or none is printed."""
+    printed = task.target.with_faces(printed=True).faces
+    faces = {face for image in seen.observations for face in image.face_ids()}
+    return why_unseen(task.files[0], printed) if printed and faces.isdisjoint(face.id for face in printed) else ""
+
+
+def scaled_by_drawing(task: Task, seen: DetectedImages, board_given: bool) -> Task:
+    """Returns the task, in the unit of the drawing if nothing of known size is seen; refuses unseen printed faces."""
+    if task.options.board_only:
+        return task
+    is_seen = any(image.face_ids() for image in seen.observations)
+    if not is_seen and (unseen := unseen_faces(task, seen)):
+        raise DetectionError("E-TARGET-UNSEEN", unseen)
+    if board_given or task.target.has_scale:
+        return task
+    labels = [image.labels for image in seen.observations]
+    if any(isinstance(label, DotLabel) for of_image in labels for label in of_image):
+        return task
+    target = with_drawn_size(task.target, labels)
+    return replace(task, target=target, board=scale_reference(None, target))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +224,7 @@ class GroupSolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """The images by the groups in which they are solved."""
+    """The images by the groups in which they are solved, and their solutions."""
 
     labelled: tuple[LabelledImage, ...]
     names: tuple[str, ...]  # of the groups that can be solved
@@ -75,27 +234,51 @@ class Groups:
     options: RunOptions
     board_alone: bool
     notes: tuple[str, ...]  # on groups that cannot be solved
+    solutions: tuple[GroupSolution, ...] = ()
+    unsolved: tuple[str, ...] = ()  # notes on groups that were not
 
+    @property
     def observations(self) -> list[ImageObservations]:
-        """Returns the labelled centres of all images."""
+        """Labelled centres of all images."""
         return [image.observations for image in self.labelled]
 
+    @property
     def usable(self) -> list[ImageObservations]:
-        """Returns the labelled centres of the images whose groups can be solved."""
-        return [image for image in self.observations() if image.group in self.names]
+        """Labelled centres of the images whose groups can be solved."""
+        return [image for image in self.observations if image.group in self.names]
 
     def explained(self) -> AbstractContextManager[None]:
         """Lets errors name what of the camera file is wrong, unless the file is a start alone."""
-        return nullcontext() if self.options.refine_camera else explained(self.usable(), self.camera, self.board)
+        return nullcontext() if self.options.refine_camera else explained(self.usable, self.camera, self.board)
 
+    def assumed_notes(self) -> list[str]:
+        """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
+        images = [image for image in self.labelled if image.observations.group == TOP_GROUP]
+        lost = [i.observations.name for i in images if any(getattr(n, "code", "") == BOARD_LEFT_OUT for n in i.notes)]
+        remark = (
+            f"; the board of {len(lost)} of them ({_listed(lost)}) is elsewhere and was left out, so that they are "
+        )
+        note = (
+            f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
+            f"moved{f'{remark}more than one group' if lost else ''}; put the images of each setting of target and "
+            "board into a folder of its own, IMAGES/<group>/"
+        )
+        return [note] if images else []
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
-    """The solutions of groups, and notes on those that have none."""
-
-    groups: Groups
-    solutions: tuple[GroupSolution, ...]
-    notes: tuple[str, ...]
+    def unseen_notes(self, target: TargetDesign) -> list[str]:
+        """Returns notes on rows and columns of the board, and on circles or corners of the faces in the result, that no
+        image shows as the designs have them."""
+        mapped = {label for solution in self.solutions for label in solution.model.labels}
+        dots = (label for label in mapped if isinstance(label, DotLabel))
+        faces = {label.plane for label in mapped}
+        every = (label for face in target.faces if face.id in faces for label in face.labels())
+        missing = [str(label) for label in every if label not in mapped]
+        them = "it" if len(missing) == 1 else "them"
+        note = (
+            f"{_listed(missing)}: not in the result, as too few images show {them} as drawn; check radius and place in "
+            "target.toml, unless something hides it"
+        )
+        return [*unseen_lines(dots, self.board.rows, self.board.columns), *([note] if missing else [])]
 
 
 def groups_of(task: Task, seen: DetectedImages) -> Groups:
@@ -104,11 +287,10 @@ def groups_of(task: Task, seen: DetectedImages) -> Groups:
     if not task.board.rows:
         labelled = tuple(replace(i, observations=replace(i.observations, group=TOP_GROUP)) for i in labelled)
     observations = [image.observations for image in labelled]
-    camera = start_of(seen.camera, seen, options)
     board_alone = options.board_only or is_board_alone(seen.detection)
     if board_alone and options.solve == "joint":
         options = replace(options, solve="chain", refine_camera=False)
-    board = with_edge_sigma(task.board, observations)
+    board, camera = with_edge_sigma(task.board, observations), start_of(seen.camera, seen, task.options)
     skipped, needs_board = seen.detection.skipped, not task.target.has_scale
     usable, notes = usable_groups(by_group(observations), skipped, board_alone, needs_board)
     task.progress("map", 0, len(usable))
@@ -122,21 +304,15 @@ def start_of(model: CameraModel, seen: DetectedImages, options: RunOptions) -> C
     return refinable(camera) if options.refine_camera else camera
 
 
-def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Mapped:
+def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Groups:
     """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
-    camera, target, board, options = groups.camera, task.target, groups.board, groups.options
-    known = () if groups.board_alone else faces_of_known_shape(board)
     with groups.explained():
-        if known:
-            circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
-            body = place_with_camera(groups.usable(), (*known, *circles), camera)
-            solutions, notes = _solve_body(task, groups, body)
-            notes += body.unlinked_notes()
+        if faces_of_known_shape(groups.board) and not groups.board_alone:
+            solutions, unsolved = _solve_body(task, groups)
         else:
             folders = task.folder.stage / "scratch", task.folder.cache
-            arguments = camera, target, board, options, task.progress, names or groups.names
-            solutions, notes = solve_groups(groups.observations(), groups.graph, *folders, *arguments)
-    return Mapped(groups, tuple(solutions), tuple(notes))
+            solutions, unsolved = solve_groups(groups, task.target, *folders, task.progress, names or groups.names)
+    return replace(groups, solutions=tuple(solutions.values()), unsolved=tuple(unsolved))
 
 
 def _each_group(names: Iterable[str], solve: Callable[[str], S]) -> tuple[dict[str, S], list[str]]:
@@ -172,14 +348,19 @@ def usable_groups(
             count = f"1 usable image ({group[0].name})" if group else "0 usable images"
             why = f", not {lost[name].name}: {lost[name].reason}" if name in lost else ""
             remedy = "add photographs from other places"
-            if name == TOP_GROUP and group and len(groups) > 1:
-                others = _listed([g for g in groups if g != TOP_GROUP])
-                remedy = (
-                    f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
-                    f"leave it out with --exclude {group[0].name}"
-                )
             raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
-        require_usable(group, board_alone, needs_board)
+        if not board_alone and not any(image.face_ids() for image in group):
+            raise MappingError(
+                "E-GROUP-NO-FACE",
+                f"group {name}: no face of the target recognised in {len(group)} images; look at the overlays, check "
+                "target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
+            )
+        if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
+            raise MappingError(
+                "E-GROUP-NO-BOARD",
+                f"group {name}: no board recognised in {len(group)} images; keep the whole board in view, check "
+                "board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
+            )
         return group
 
     try:
@@ -189,75 +370,8 @@ def usable_groups(
         raise
 
 
-def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
-    """Refuses a group that cannot be solved: without a needed board, or without a face."""
-    where = f"group {group[0].group}"
-    if not board_alone and not any(image.face_ids() for image in group):
-        raise MappingError(
-            "E-GROUP-NO-FACE",
-            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
-            "check target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
-        )
-    if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
-        raise MappingError(
-            "E-GROUP-NO-BOARD",
-            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
-            "check board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
-        )
-
-
-def _listed(names: Sequence[str], most: int = 4, more: str = ", …") -> str:
-    return ", ".join(names[:most]) + more * (len(names) > most)
-
-
-def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
-    """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
-    images = [image for image in labelled if image.observations.group == TOP_GROUP]
-    dropped = [
-        image.observations.name
-        for image in images
-        if any(isinstance(note, Note) and note.code == BOARD_LEFT_OUT for note in image.notes)
-    ]
-    remark = (
-        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
-        "more than one group"
-    )
-    note = (
-        f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
-        f"moved{remark if dropped else ''}; put the images of each setting of target and board into a folder of its "
-        "own, IMAGES/<group>/"
-    )
-    return [note] if images else []
-
-
-def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]:
-    """Returns notes on faces that groups are named after and the target does not have."""
-    known = ", ".join(face.id for face in target.faces)
-    return [
-        f"group {group} seems to be named after face {face}, which the target does not have (faces {known}): add it to "
-        "target.toml, or rename the folder"
-        for face, group in unknown_faces(groups, target).items()
-    ]
-
-
-def unseen_board(solutions: Sequence[GroupSolution], board: BoardDesign) -> list[str]:
-    """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
-    dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
-    return unseen_lines(dots, board.rows, board.columns)
-
-
-def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> list[str]:
-    """Returns a note on circles or corners of the faces in the result that no image shows as the design has them."""
-    mapped = {label for s in solutions for label in s.model.labels}
-    faces = {label.plane for label in mapped}
-    every = (label for face in target.faces if face.id in faces for label in face.labels())
-    missing = [str(label) for label in every if label not in mapped]
-    note = (
-        f"{_listed(missing, FEW_NAMED, ' …')}: not in the result, as too few images show "
-        f"{'it' if len(missing) == 1 else 'them'} as drawn; check radius and place in target.toml, unless something "
-        "hides it"
-    )
-    return [note] if missing else []
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + " …" * (len(names) > most)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,40 +407,34 @@ class _Group:
 
 
 def solve_groups(
-    observations: Sequence[ImageObservations],
-    graph: ImageGraph,
+    groups: Groups,
+    target: TargetDesign,
     scratch: Path,  # a folder that is made and removed again
     cache: Path,  # folder for what later runs take up
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
     progress: Progress,
     names: Collection[str] | None = None,  # groups to solve, all if None
-) -> tuple[list[GroupSolution], list[str]]:
+) -> tuple[dict[str, GroupSolution], list[str]]:
     """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
     solution, the error of the first group is raised."""
-    common = camera, target, board, options.pairs, options.eccentricity
-    groups = {
-        name: _Group(
-            images,
-            [observations[i].name for i in graph.skeleton[name]],
-            _pairs_within(name, observations, graph),
-            *common,
-        )
-        for name, images in by_group(observations).items()
-        if names is None or name in names
-    }
-    paths = {name: cache / f"group-{group.key()}.npz" for name, group in groups.items()}
+    images, options = groups.observations, groups.options
+    inputs = {}
+    for name, of_group in by_group(images).items():
+        if names is None or name in names:
+            within = np.array([image.group == name for image in images])
+            pairs = (np.cumsum(within) - 1)[groups.graph.pairs[within[groups.graph.pairs].all(1)]]
+            skeleton = [images[i].name for i in groups.graph.skeleton[name]]
+            how = groups.camera, target, groups.board, options.pairs, options.eccentricity
+            inputs[name] = _Group(of_group, skeleton, pairs, *how)
+    paths = {name: cache / f"group-{group.key()}.npz" for name, group in inputs.items()}
     found: dict[str, GroupSolution | StcalError | None] = {name: kept(path, _stored) for name, path in paths.items()}
     pending = [name for name, solution in found.items() if solution is None]
-    step = counted(progress, "map", len(groups))
-    for _ in range(len(groups) - len(pending)):
+    step = counted(progress, "map", len(inputs))
+    for _ in range(len(inputs) - len(pending)):
         step(None)
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
-        jobs = [(groups[name], scratch / str(k)) for k, name in enumerate(pending)]
+        jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
         for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[name] = solution
             if isinstance(solution, GroupSolution):
@@ -336,24 +444,12 @@ def solve_groups(
 
     def scaled(name: str) -> GroupSolution:
         solution = found[name]
-        try:
-            if not isinstance(solution, GroupSolution):
-                raise solution or KeyError(name)
-            find_scale(solution.model, board)
-        except UNSOLVED as error:
-            error.append(pitch_hint(groups[name].images, board))
-            raise
+        if not isinstance(solution, GroupSolution):
+            raise solution or KeyError(name)
+        find_scale(solution.model, groups.board)
         return solution
 
-    solutions, notes = _each_group(groups, scaled)
-    return list(solutions.values()), notes
-
-
-def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
-    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
-    within = np.array([image.group == group for image in observations])
-    pairs = graph.pairs[within[graph.pairs].all(1)]
-    return (np.cumsum(within) - 1)[pairs]
+    return _each_group(inputs, scaled)
 
 
 def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
@@ -393,10 +489,12 @@ def _stored(stored, meta) -> GroupSolution:
     return GroupSolution(model=WorldModel(group, tuple(images), poses, parse_labels(labels), **arrays), **plain)
 
 
-def _solve_body(task: Task, groups: Groups, body: PlacedBody) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines the groups of a body that its faces have placed; returns solutions, and notes on others."""
+def _solve_body(task: Task, groups: Groups) -> tuple[dict[str, GroupSolution], list[str]]:
+    """Places the body by its faces, and maps and refines its groups; returns solutions, and notes on others."""
     camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
-    images = by_group(groups.usable())
+    circles = [face for face in task.target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+    body = place_with_camera(groups.usable, (*faces_of_known_shape(board), *circles), camera)
+    images = by_group(groups.usable)
     step = counted(task.progress, "map", len(images))
 
     def solved(name: str) -> GroupSolution:
@@ -414,7 +512,7 @@ def _solve_body(task: Task, groups: Groups, body: PlacedBody) -> tuple[list[Grou
         return GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers)
 
     solutions, notes = _each_group(images, solved)
-    return list(solutions.values()), notes
+    return solutions, notes + body.unlinked_notes()
 
 
 def refine_or_explain(
