@@ -418,7 +418,7 @@ def designs_told(
     the context name the designs."""
     from stcal.boards.target_file import target_of
     from stcal.design import reference_board, reference_target
-    from stcal.sfm.detect.sightings import likeness_notes
+    from stcal.sfm.detect.face_patterns import likeness_notes
 
     assumed = []
     if target is not None:

@@ -1,7 +1,7 @@
 """Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered. A
 plain board looks the same after half a turn: a reading carries every numbering that fits the image."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from stcal.errors import DegenerateError, DetectionError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian, singular_values
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern
+from stcal.sfm.detect.sightings import BoardSighting
 
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3
@@ -34,16 +35,7 @@ MAX_UNEXPLAINED = 2
 """Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardReading:
-    """One board in one image."""
-
-    candidates: np.ndarray  # (n,) the dots found
-    numberings: np.ndarray  # (k, n, 2) row and column, by numbering that the image admits, the likeliest first
-    unlikely: np.ndarray  # (u, n, 2) further numberings, that hold where dots are covered
-
-
-def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
+def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardSighting]:
     """Finds the boards and returns the one with the most dots first; ``image_corners``: (4, 2) normalised, ideal."""
     if len(candidates) < MIN_SIDE**2:
         return []
@@ -51,7 +43,7 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     count = (links >= 0).sum(1)
     seeds = [int(i) for i in np.argsort(-count, kind="stable") if count[i] >= MIN_LINKS]
     free = np.ones(len(candidates), bool)
-    readings: list[BoardReading] = []
+    readings: list[BoardSighting] = []
     for _ in range(MAX_BOARDS):
         cells = _largest_grid(candidates, links, steps, seeds, free, board)
         if len(cells) < MIN_SHARE * len(board.cells()):
@@ -59,9 +51,9 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
         free[list(cells)] = False
         reading = _number(candidates, cells, board, image_corners)
         if reading is not None:
-            free[reading.candidates] = False
+            free[reading.rows] = False
             readings.append(reading)
-    return sorted(readings, key=lambda r: -len(r.candidates))
+    return sorted(readings, key=lambda r: -len(r.rows))
 
 
 def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
@@ -157,7 +149,7 @@ def _grow(candidates: Candidates, links, steps, seed: int, free, board: BoardDes
     return cells
 
 
-def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardReading | None:
+def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardSighting | None:
     """Fits the homography of the grown cells, matches all dots with it, and lists the numberings that fit."""
     index, uv = np.array(list(cells)), np.array(list(cells.values()))
     homography = _robust_homography(board.flat(uv), candidates, index)
@@ -192,12 +184,12 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     index = index[common]
     numberings = np.stack([cells[common] for _, cells in likely])
     further = [cells[common] for count, inside, cells in placements if count > most and inside[common].all()]
-    return BoardReading(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
+    return BoardSighting(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
 
 
 def by_rings(
-    reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
-) -> BoardReading:
+    reading: BoardSighting, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
+) -> BoardSighting:
     """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates.
     DetectionError: it shows as many holes as are stated, at other places by any numbering."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
@@ -209,7 +201,7 @@ def by_rings(
     seen: list[np.ndarray] = []
     for numbering in reading.numberings:
         xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
-        homography = fit_homography(xy_mm, xy[reading.candidates])
+        homography = fit_homography(xy_mm, xy[reading.rows])
         values = []
         for share in RING_SHARES:
             rim = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))

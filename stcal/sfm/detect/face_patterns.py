@@ -4,15 +4,18 @@ which is extended to all circles of a face. A face is named only if one reading 
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian, singular_values
-from stcal.labels import CircleLabel
+from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches
-from stcal.sfm.detect.sightings import MIN_NAMING, is_named, mirror_images
+from stcal.sfm.detect.sightings import FaceSighting, OpenFace
 
+MIN_NAMING = 6
+"""Smallest number of circles that can name a face: four determine a homography, two more confirm it."""
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
 PAIR_TOLERANCE = 0.3
@@ -34,31 +37,11 @@ MAX_SIZE_RATIO = 1.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FaceReading:
-    """One face in one image: ``index`` : (n circles,) into the candidates, −1 if missing."""
-
-    face: FaceDesign
-    index: np.ndarray
-
-    def count(self) -> int:
-        """Returns the number of circles found."""
-        return int((self.index >= 0).sum())
-
-    def used(self) -> np.ndarray:
-        """Returns the indices of the candidates of the face."""
-        return self.index[self.index >= 0]
-
-    def labels(self) -> list[CircleLabel]:
-        """Returns the labels of the circles found."""
-        return [label for label, i in zip(self.face.labels(), self.index, strict=True) if i >= 0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """Faces in one image; a face in view twice has two readings."""
+    """Faces in one image, by their candidates; a face in view twice occurs twice."""
 
-    faces: tuple[FaceReading, ...]  # unambiguously named
-    refused: tuple[tuple[FaceReading, ...], ...]  # readings of each pattern without a name
+    faces: tuple[FaceSighting, ...]  # unambiguously named
+    refused: tuple[OpenFace, ...]  # patterns without a name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +145,7 @@ class FaceFinder:
 
     def find(self, candidates: Candidates) -> FaceFinding:
         """Finds all faces among the candidates; the mirror image of a face may look like another one."""
-        readings: list[FaceReading] = []
+        readings: list[FaceSighting] = []
         if len(candidates) < MIN_NAMING or not self.target.faces:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
@@ -171,7 +154,7 @@ class FaceFinder:
         for rank, first in enumerate(starts.origin.tolist()):
             if rank == FIRST_HYPOTHESES:
                 for reading in readings:
-                    explained[reading.used()] |= reading.count() >= needed_circles(reading.face)
+                    explained[reading.rows] |= len(reading.rows) >= needed_circles(self.target.face(reading.face))
             if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
                 continue
             tries[first] += rank >= FIRST_HYPOTHESES
@@ -185,8 +168,9 @@ class FaceFinder:
                 continue
             depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
             if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
-                readings.append(FaceReading(face, _of_one_size(candidates, face, *match)))
-                is_open[starts.agree(number, readings[-1].index)] = False
+                index = _of_one_size(candidates, face, *match)
+                readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
+                is_open[starts.agree(number, index)] = False
         return _decide(readings, self.target)
 
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
@@ -198,12 +182,12 @@ class FaceFinder:
         grown = zip(ranks, *found, size, strict=True)
         return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
-    def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
-        """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""
-        if any(reading.face.id not in mirror_images(self.target) for reading in named):
+    def find_mirrored(self, candidates: Candidates, named: tuple[FaceSighting, ...]) -> tuple[str, ...]:
+        """Returns the ids of faces that appear mirrored; none if a ``named`` face shows that the image is not."""
+        alike = mirror_images(self.target)
+        if any(each.face not in alike for each in named):
             return ()
-        found = self.find(candidates.mirrored()).faces
-        return tuple(reading for reading in found if reading.face.id not in mirror_images(self.target))
+        return tuple(each.face for each in self.find(candidates.mirrored()).faces if each.face not in alike)
 
     def _hypotheses(self, candidates: Candidates) -> _Starts:
         """Returns all pairs of neighbouring outlines that may be a pair of the design, with their support."""
@@ -280,22 +264,113 @@ def needed_circles(face: FaceDesign) -> int:
     return min(MIN_NAMING, len(face.ids))
 
 
-def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
+def _decide(readings: list[FaceSighting], target: TargetDesign) -> FaceFinding:
     """Keeps the readings that explain more circles than every other reading of the same candidates."""
-    readings = [r for r in readings if r.count() >= needed_circles(r.face)]
-    readings.sort(key=lambda r: -r.count())
-    named: list[FaceReading] = []
-    refused: list[tuple[FaceReading, ...]] = []
+    readings = [r for r in readings if len(r.rows) >= needed_circles(target.face(r.face))]
+    readings.sort(key=lambda r: -len(r.rows))
+    named: list[FaceSighting] = []
+    refused: list[OpenFace] = []
     settled: set[int] = set()
     for reading in readings:
-        used = set(reading.used())
+        used = set(reading.rows)
         if settled & used:
             continue
         settled |= used
-        rivals = [r for r in readings if used & set(r.used()) and r.count() >= reading.count()]
-        ambiguous = [r for r in rivals if r.face is not reading.face or (r.index != reading.index).any()]
-        if ambiguous or not is_named(reading.face, reading.index >= 0, target):
+        rivals = [r for r in readings if used & set(r.rows) and len(r.rows) >= len(reading.rows)]
+        ambiguous = [r for r in rivals if _read(r) != _read(reading)]
+        face = target.face(reading.face)
+        if ambiguous or not is_named(face, np.isin(np.arange(len(face.ids)), reading.circles), target):
             refused.append((reading, *ambiguous))
         else:
             named.append(reading)
     return FaceFinding(tuple(named), tuple(refused))
+
+
+def _read(reading: FaceSighting) -> tuple[str, list[int], list[int]]:
+    return reading.face, reading.rows.tolist(), reading.circles.tolist()
+
+
+def confusable(face: FaceDesign, target: TargetDesign) -> set[frozenset[int]]:
+    """Returns the sets of a face's circles that another reading explains as well; such a set names no face."""
+    return set().union(
+        *(common_circles(face.xy_mm, face.radius_mm, o.xy_mm, o.radius_mm, o.id == face.id) for o in target.faces)
+    )
+
+
+def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
+    """Returns the largest number of circles that coincide with another face, or with the own after a turn; 0 below
+    ``MIN_COMMON``. The face is moved rigidly or, if ``mirrored``, turned over."""
+    xy = np.asarray(face.xy_mm) * [-1 if mirrored else 1, 1]
+    same = face.id == other.id and not mirrored
+    found = common_circles(xy, face.radius_mm, other.xy_mm, other.radius_mm, same)
+    return max(map(len, found), default=0)
+
+
+def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
+    """Returns whether the circles found (mask) name the face, as no other reading explains them all."""
+    circles = frozenset(np.flatnonzero(found).tolist())
+    return not any(circles <= rival for rival in confusable(face, target))
+
+
+def likeness_notes(target: TargetDesign) -> list[str]:
+    """Returns notes about faces that only one circle distinguishes, and mirror images; tags name themselves."""
+    target = target.with_faces(printed=False)
+    near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
+    notes = []
+    if near:
+        gap, face, other, circle = min(near)
+        faces = [each.id for each in target.faces if any(each.id in telling[1:3] for telling in near)]
+        rival = "the same face turned" if face == other else f"face {other}"
+        notes.append(
+            f"target {target.name}: face{'s' * (len(faces) > 1)} {', '.join(faces)}: one circle tells each from "
+            f"another, or from itself turned (the least is {face}:{circle} against {rival}, {gap:.1f} mm); where it is "
+            "hidden, the face has no name"
+        )
+    alike = mirror_images(target)
+    if pairs := {tuple(sorted((face, other))) for face, others in alike.items() for other in others}:
+        listed = ", ".join(f"{a} of itself" if a == b else f"{a} and {b}" for a, b in sorted(pairs))
+        notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
+    partly = [
+        (len(pairs), face.id, other.id, len(other.ids))
+        for face, other in product(target.faces, target.faces)
+        if other.id not in alike.get(face.id, ())
+        for pairs in mirrored_as(face, other)
+        if len(pairs) >= MIN_NAMING and is_named(other, np.isin(np.arange(len(other.ids)), pairs[:, 1]), target)
+    ]
+    if partly:
+        common, face, other, count = max(partly)
+        notes.append(
+            f"target {target.name}: a reflection of face {face} shows {common} of the {count} circles of "
+            f"{'that face' if face == other else f'face {other}'} itself; where the others are hidden, it passes for it"
+        )
+    return notes
+
+
+def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str, str]]:
+    """Returns single circles that distinguish a face from another one: distance in mm, both faces, and the circle."""
+    rival = other.xy_mm, other.radius_mm
+    telling = []
+    for common in common_circles(face.xy_mm, face.radius_mm, *rival, same=face is other):
+        if len(common) != len(face.ids) - 1:
+            continue
+        shared = np.array(sorted(common))
+        like = whole_likeness(face.xy_mm[shared], face.radius_mm[shared], *rival, shared if face is other else None)
+        if like is not None:
+            (alone,) = set(range(len(face.ids))) - common
+            gap = np.linalg.norm(like.moved(face.xy_mm[alone]) - other.xy_mm, axis=1).min()
+            telling.append((float(gap), face.id, other.id, face.ids[alone]))
+    return telling
+
+
+def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
+    """Returns by face the faces that its mirror image looks like, whole and with its radii; others have no entry."""
+    found: dict[str, tuple[str, ...]] = {}
+    for face, other in product(target.faces, target.faces):
+        if any(len(face.ids) == len(other.ids) == len(pairs) for pairs in mirrored_as(face, other)):
+            found[face.id] = (*found.get(face.id, ()), other.id)
+    return found
+
+
+def mirrored_as(face: FaceDesign, other: FaceDesign) -> list[np.ndarray]:
+    """Returns the circles of a face's mirror image that pass for circles of another."""
+    return mirrored_circles(face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)

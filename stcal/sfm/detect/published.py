@@ -9,7 +9,7 @@ half of the 45° to the next name. Distances are measured in radii of the circle
 §1.2 does not mention, is found as everywhere in this package.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ from stcal.sfm.detect.circles.candidates import (
 )
 from stcal.sfm.detect.dot_grid import find_boards
 from stcal.sfm.detect.image import image_corners
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
+from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
 
 SMOOTHING_PX = 5
 """Side of the Gaussian filter, px."""
@@ -146,9 +146,9 @@ def detect_published(
     boards, free, own = [], np.ones(len(ellipses[target.polarity]), bool), candidates[target.polarity]
     if board is not None:
         for grid in find_boards(candidates[board.polarity], board, image_corners(camera)):
-            boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
+            boards.append(replace(grid, rows=start[board.polarity] + grid.rows))
             if board.polarity == target.polarity:
-                free[grid.candidates] = False
+                free[grid.rows] = False
     faces, notes = _Rules(pattern, target, own, ellipses[target.polarity]).find(free)
     centres = []
     for polarity, every in ellipses.items():

@@ -12,7 +12,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.lookalikes import MIN_COMMON
 from stcal.sfm import make
-from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
+from stcal.sfm.detect.face_patterns import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import (
     HIDDEN,
     LARGE,

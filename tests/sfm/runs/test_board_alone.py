@@ -9,8 +9,7 @@ import pytest
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.labelling import _is_symmetry, _numbered
-from stcal.sfm.detect.sightings import PlaneView
+from stcal.sfm.detect.labelling import PlaneView, _is_symmetry, _numbered
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet
 from tests.sfm.runs.test_bad_input import blacken

@@ -8,7 +8,7 @@ import pytest
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
 from stcal.sfm.data.patterns import measured_pitch_mm, pitch_hint
-from stcal.sfm.detect.sightings import likeness_notes
+from stcal.sfm.detect.face_patterns import likeness_notes
 from stcal.synthetic.scene import second_design
 
 pytestmark = pytest.mark.usefixtures("no_page")
