@@ -11,8 +11,7 @@ One score decides throughout: the number of circles that a rigid arrangement of 
 3. All groups have one arrangement of the faces, grown in the same way, with groups in the place of images. A face that
    most groups have elsewhere goes out; one that other groups know is sought.
 4. A second look (:mod:`.predict`) measures circles that must be in view and have no label. What is not as large as
-   its plane asks for, or not where its group has it, goes out. So does a face that one image alone reads, and others,
-   which must show it, do not.
+   its plane asks for, or not where its group has it, goes out.
 
 In photographs of the board alone, the camera's motion numbers a plain board, which looks the same after half a turn.
 The numbering of a group's first image is a convention. The corners of printed faces name themselves.
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from stcal.boards.board_designs import CornerBoard
 from stcal.boards.board_file import board_of
@@ -40,15 +40,15 @@ from stcal.io.images import grey_of
 from stcal.labels import BOARD, DotLabel, Label
 from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.group_model import Centres, ImageObservations
-from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, SINGLE, Note
+from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of, planar_pose
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.detect_files import DetectedImage, DetectionResult, look_again
+from stcal.sfm.detect.face_patterns import MIN_NAMING
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import (
     PredictedCircles,
-    SecondLook,
     adjusted_planes,
     contradicted_notes,
     contradictions,
@@ -63,346 +63,6 @@ if TYPE_CHECKING:
 
 Named = tuple[str, str, ImageDetection]
 """Name and group of an image, and what it shows."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledImage:
-    """One image with the labels of its circles."""
-
-    observations: ImageObservations
-    notes: tuple[str, ...]  # on what was excluded
-    focus: Focus | None = None  # from which the observations are corrected; None if it has too few circles
-
-    def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
-        """Returns the image with further circles and notes."""
-        more = labelled_image(self.observations.name, self.observations.group, labels, centres, ())
-        return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
-
-    def without(self, labels: Collection[Label], notes: Sequence[str]) -> "LabelledImage":
-        """Returns the image without the circles of ``labels``, and with further notes."""
-        if not labels:
-            return self
-        keep = [i for i, label in enumerate(self.observations.labels) if label not in labels]
-        return LabelledImage(self.observations.select(keep), (*self.notes, *notes))
-
-
-def labelled_image(
-    name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
-) -> LabelledImage:
-    """Returns the image of labelled circles; identical notes are merged."""
-    measured = {f.name: getattr(centres, f.name) for f in fields(ImageObservations)[3:]}
-    merged = [
-        note if n == 1 else Note(f"{note} ({n} times)", getattr(note, "code", ""), getattr(note, "place", ""))
-        for note, n in Counter(notes).items()
-    ]
-    return LabelledImage(ImageObservations(name, group, tuple(labels), **measured), tuple(merged))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Detection(ByValue):
-    """The labelled circles of one image.
-
-    Parameters
-    ----------
-    labels : tuple of Label
-        n labels: ``face:circle``, or ``board:row:column`` from 0.
-    xy_px : (n, 2) array
-        Centres of the ellipses, px, with the centre of the top-left pixel at (0, 0).
-    covariance_px2 : (n, 2, 2) array
-        Covariances of the centres.
-    notes : tuple of str
-        What was left out, and why.
-    """
-
-    labels: tuple[Label, ...]
-    xy_px: np.ndarray
-    covariance_px2: np.ndarray
-    notes: tuple[str, ...] = ()
-
-    @property
-    def sigma_px(self) -> np.ndarray:
-        """Standard deviation of each centre per axis (RMS over both axes), (n,)."""
-        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def __repr__(self) -> str:
-        planes = ", ".join(f"{plane}: {n}" for plane, n in Counter(label.plane for label in self.labels).items())
-        return f"<Detection of {len(self)} circles ({planes or 'none'}), {len(self.notes)} notes>"
-
-    def plot(self, ax: "Axes") -> None:
-        """Draws the centres with their labels into axes of matplotlib, over an image shown there."""
-        ax.plot(*self.xy_px.T, "+", color="tab:red")
-        for label, (x, y) in zip(self.labels, self.xy_px.tolist(), strict=True):
-            ax.annotate(str(label), (x, y), (3, 3), textcoords="offset points", fontsize=6, color="tab:red")
-
-
-@require_arguments
-def detect_circles(
-    image: np.ndarray,
-    camera: Camera | CameraModel | str | Path,
-    target: TargetDesign | str | Path,
-    board: BoardDesign | str | Path | None = None,
-    options: EllipseOptions | None = None,
-) -> Detection:
-    """Returns the labelled circles of one image.
-
-    A single image may leave labels open. A run decides them from all images of a group, and searches again for circles
-    that were missed.
-
-    Parameters
-    ----------
-    image : (height, width) or (height, width, 3) array
-        Grey or RGB, 8 or 16 bit, of the camera's size.
-    camera : Camera
-        The camera that took the image, or its file.
-    target : TargetDesign
-        Design of the target, or its file.
-    board : BoardDesign, optional
-        The dot board, if it may be in view, or its file.
-    options : EllipseOptions, optional
-        Options of the search; the defaults if None.
-
-    Returns
-    -------
-    Detection
-        Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
-
-    Raises
-    ------
-    InputError
-        The array is no image, or not of the camera's size.
-    """
-    grey = grey_of(image, "image")
-    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)
-    board = None if board is None else board_of(board)
-    found = detect_image(grey, camera, target, board, options or EllipseOptions())
-    ((images, _),) = label_groups([[("image", "", found)]], target.with_faces(printed=False), board, _focal_px(camera))
-    sharp = without_defocus([_with_corners(images[0], found, target)], camera, patterns_of(target, board))[0]
-    seen = sharp.observations
-    return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
-
-
-def without_defocus(
-    images: Sequence[LabelledImage], camera: Camera, patterns: Mapping[str, Pattern]
-) -> list[LabelledImage]:
-    """Returns the images with centres corrected for blur that varies across a circle, and what their blur shows."""
-    corrected, focus = correct_defocus([image.observations for image in images], camera, patterns)
-    by_name = {own.image: own for own in focus}
-    blurs = [by_name.get(observations.name) for observations in corrected]
-    return [
-        LabelledImage(observations, (*image.notes, *([blur.note] if blur and blur.note else [])), blur)
-        for image, observations, blur in zip(images, corrected, blurs, strict=True)
-    ]
-
-
-def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
-    """Returns the faces of a single image, for a target that may move from image to image."""
-    faces = detection.single_faces()
-    labels = [label for each in faces for label in each.labels(target.face(each.face))]
-    rows = np.concatenate([np.zeros(0, int), *(each.rows for each in faces)])
-    unnamed = [_open_face_note(len(each[0].rows), [face.face for face in each]) for each in detection.open_faces]
-    return labelled_image(name, group, labels, detection.centres.select(rows), [*_notes_of(detection), *unnamed])
-
-
-def label_images(
-    detection: DetectionResult,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: EllipseOptions,
-    cache: Path,
-    workers: int | None = None,
-) -> list[LabelledImage]:
-    """Returns the labelled circles and corners of all images, in the order of their groups, after two looks."""
-    files, camera, focal_px = {i.file.name: i for i in detection.images}, detection.camera, _focal_px(detection.camera)
-    circles, groups = target.with_faces(printed=False), _groups(detection)
-    board = in_scale(groups, circles, board)
-    patterns = patterns_of(circles, board)
-    sought = patterns_of(circles, None if isinstance(board, CornerBoard) else board)  # corners are used as found
-    first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
-    jobs: list[tuple[DetectedImage, PredictedCircles]] = []
-    for labelled in label_groups(groups, circles, board, focal_px):
-        group, arrangement = _without_outlying(*labelled, patterns, focal_px)
-        for i, pose in arrangement.camera_from_group.items():
-            seen, planes = group[i].observations, arrangement.group_from_plane
-            predicted, steep = (
-                predict_circles(pose, planes, seen.labels, sought, camera, tilt) for tilt in (MAX_TILT_RAD, STEEP_RAD)
-            )
-            wrong = contradictions(steep, seen, camera)
-            group[i] = group[i].without(wrong, contradicted_notes(wrong))
-            if predicted.wanted.any():
-                jobs.append((files[seen.name], predicted))
-        first_looks.append((group, arrangement))
-    looks = look_again(jobs, camera, options, cache, workers)
-    second = [_without_outlying(_second(group, looks), known, patterns, focal_px)[0] for group, known in first_looks]
-    sharp = without_defocus([image for group in second for image in group], camera, patterns)
-    return [_with_corners(image, files[image.observations.name].detection, target) for image in sharp]
-
-
-def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
-    """Labels all images as :func:`label_images`, without a second look."""
-    groups = _groups(detection)
-    board = in_scale(groups, target, board)
-    labelled = label_groups(groups, target, board, _focal_px(detection.camera))
-    return [each for found, _ in labelled for each in found]
-
-
-def _focal_px(camera: Camera) -> float:
-    return float(np.sqrt(camera.focal.prod()))
-
-
-def _groups(detection: DetectionResult) -> list[list[Named]]:
-    groups: dict[str, list[Named]] = {}
-    for image in detection.images:
-        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
-    return list(groups.values())
-
-
-def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
-    """Returns the image with the corners of its printed faces."""
-    labels = [label for each in detection.printed for label in each.labels(target.face(each.face))]
-    rows = [each.rows for each in detection.printed]
-    return image.plus(labels, detection.centres.select(np.concatenate(rows)), ()) if rows else image
-
-
-def _without_outlying(
-    group: list[LabelledImage], arrangement: "Arrangement", patterns: dict[str, Pattern], focal_px: float
-) -> tuple[list[LabelledImage], "Arrangement"]:
-    """Removes circles that contradict the others of the group, and adjusts the arrangement without them."""
-    placed, cameras = list(arrangement.camera_from_group), Poses.of(arrangement.camera_from_group.values())
-    seen, planes = [group[i].observations for i in placed], arrangement.group_from_plane
-    *poses, outlying = outlying_circles(cameras, planes, seen, patterns, focal_px)
-    reasons = dict(zip(placed, outlying, strict=True))
-    images = [e.without(own := reasons.get(i, {}), contradicted_notes(own)) for i, e in enumerate(group)]
-    return images, arrangement.moved(*poses)
-
-
-MIN_EXPECTED = 6
-"""Least number of circles that other images must show for their absence to count: as many as identify a face."""
-STEEP_RAD = np.radians(85)
-"""Largest tilt of circles of the first look that are compared with their places."""
-MIN_CONFIRMED = 0.2
-"""Least share of these circles that must be found. A face of which two images show less could not be mapped either."""
-
-
-def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
-    """Adds the circles of the second look, and removes faces of a single image that others must show and do not."""
-    faces = [image.observations.face_ids() for image in group]
-    own = [looks.get(image.observations.name) for image in group]
-    images = [
-        image if look is None else image.plus(look.labels, look.centres, missed_notes(look.missed))
-        for image, look in zip(group, own, strict=True)
-    ]
-    for face in [face for face, count in Counter(chain.from_iterable(faces)).items() if count == 1]:
-        others = [look for shown, look in zip(faces, own, strict=True) if look is not None and face not in shown]
-        found = sum(label.plane == face for look in others for label in look.labels)
-        expected = found + sum(label.plane == face for look in others for label in look.missed)
-        if expected < MIN_EXPECTED or found >= MIN_CONFIRMED * expected:
-            continue
-        read = f"face {face}: read in one image of the group alone, {found} of {expected} of its circles found"
-        note = f"{read} that other images must show; left out, it is a reflection or another object, or hidden there"
-        for i, image in enumerate(images):
-            labels_of_face = [label for label in image.observations.labels if label.plane == face]
-            images[i] = image.without(labels_of_face, [Note(note, SINGLE, face)])
-    return images
-
-
-def label_groups(
-    groups: Sequence[Sequence[Named]],
-    target: TargetDesign,
-    board: BoardDesign | None,
-    focal_px: float,
-) -> list[tuple[list[LabelledImage], "Arrangement"]]:
-    """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
-    apart = [
-        np.linalg.norm(f.xy_mm[:, None] - f.xy_mm, axis=2) + np.diag(np.full(len(f.ids), np.inf)) for f in target.faces
-    ]
-    steps = np.concatenate([np.zeros(0), *(each.min(1) for each in apart)])
-    step_mm = board.pitch_mm if board is not None else float(np.median(steps)) if len(steps) else 0.0
-    alone: list[Arrangement] = []
-    readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
-    likely = [[likely_views(own) for own in group] for group in readings]
-    for group, likely_ones in zip(readings, likely, strict=True):
-        found = arrange(likely_ones, step_mm, focal_px)
-        if any(why == ELSEWHERE for _, why in chain.from_iterable(found.left.values())):
-            # readings with covered dots must explain more circles
-            found = max(found, arrange(group, step_mm, focal_px), key=Arrangement.explained)
-        alone.append(as_drawn(found, target.rough_poses()))
-    arrangements = across_groups(alone, MAX_SHIFT_PITCHES * step_mm)
-    return [
-        ([_labelled(*image, own, found, i) for i, (image, own) in enumerate(zip(images, views, strict=True))], found)
-        for images, views, found in zip(groups, likely, arrangements, strict=True)
-    ]
-
-
-def _labelled(
-    name: str, group: str, detection: ImageDetection, readings: "list[Readings]", arrangement: "Arrangement", image: int
-) -> LabelledImage:
-    if detection.mirrored:
-        shown = f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does"
-        remedy = "left out, turn it back, or use the file that the camera wrote"
-        return _of_views(name, group, detection, (), [*detection.notes, f"{shown}; {remedy}"])
-    if image in arrangement.views:
-        views = arrangement.views[image]
-        notes = [_left_out(*each) for each in arrangement.left.get(image, ())]
-    else:
-        times = Counter(each[0].plane for each in readings if each[0].named)
-        views = [each[0] for each in readings if len(each) == 1 and each[0].named and times[each[0].plane] == 1]
-        notes = [_left_out(each) for each in readings if len(each) > 1 or not each[0].named]
-    return _of_views(name, group, detection, views, [*_notes_of(detection), *notes])
-
-
-def _of_views(
-    name: str, group: str, detection: ImageDetection, views: "Sequence[PlaneView]", notes: Sequence[str]
-) -> LabelledImage:
-    """Returns the image with the labels of accepted readings, in the order of its centres."""
-    labels = [label for view in views for label in view.labels]
-    rows = np.concatenate([np.zeros(0, int), *(view.rows for view in views)])
-    order = np.argsort(rows, kind="stable")
-    return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
-
-
-def _notes_of(detection: ImageDetection) -> list[str]:
-    repeated = [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
-    return [*detection.notes, *repeated]
-
-
-FOREIGN = "foreign"
-
-
-def _left_out(views: "Readings", why: str = "") -> str:
-    """Returns the note on a pattern without labels; ``why`` : ELSEWHERE or FOREIGN; else several numberings fit."""
-    view, dots = views[0], f"board of {len(views[0].rows)} dots"
-    is_board = view.plane == BOARD
-    if why == FOREIGN:
-        reason = (
-            f"not where other groups see that face against the others, or turned from its rough_pose by more than "
-            f"{FAR_DEG:.0f}°; left out, it is a reflection or another object, the image is mirrored, or rough_pose is "
-            "wrong"
-        )
-    elif not view.named:
-        return _open_face_note(len(view.rows), [view.plane for view in views])
-    elif why == ELSEWHERE:
-        reason = (
-            "not where the group's other images see it; left out, it is a reflection or another object, or the "
-            "photograph is of another group or of a body that was moved"
-        )
-    else:
-        return Note(
-            f"{dots} left out: {len(views)} numberings fit, none keeps it where the group's other images see it; show "
-            "a face that they show, or check that nothing was moved",
-            BOARD_LEFT_OUT,
-        )
-    name = f"a {dots}" if is_board else f"a pattern like face {view.plane}"
-    return Note(f"{name}: {reason}", BOARD_LEFT_OUT if is_board else ELSEWHERE, view.plane)
-
-
-def _open_face_note(circles: int, faces: Collection[str]) -> str:
-    return (
-        f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another; left out, "
-        "show the circles that tell the faces apart"
-    )
 
 
 MIN_POSE_CIRCLES = 5
@@ -727,22 +387,21 @@ def in_scale(groups: Sequence[Sequence[Named]], target: TargetDesign, board: Boa
     size, it seems to move from image to image; that the drawing has another is for the checks to say."""
     if board is None:
         return None
-    middle, board_ways, face_ways = board.xy_mm().mean(0), [], []
+    middle, ways = np.append(board.xy_mm().mean(0), 0.0), [np.zeros((0, 2, 3))]
     for images in groups:
-        places: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+        places: dict[str, list[np.ndarray]] = {}  # of the board's middle, and of the camera, from each face
         for _, _, detection in images:
-            views = [] if detection.mirrored else [each[0] for each in readings_of(detection, target, board) if each]
-            on_board = [view.camera_from_plane @ np.append(middle, 0.0) for view in views if view.plane == BOARD]
-            for view in (each for each in views if each.plane != BOARD and each.named):
-                turn, place = view.camera_from_plane.rotation.T, view.camera_from_plane.translation
-                places.setdefault(view.plane, []).extend((turn @ seen, turn @ place) for seen in on_board[:1])
-        for seen in (each for each in places.values() if len(each) > 1):
+            views = [] if detection.mirrored else [each[0] for each in readings_of(detection, target, board)]
+            for dots in [view for view in views if view.plane == BOARD][:1]:
+                for view in (each for each in views if each.plane != BOARD and each.named):
+                    seen = np.stack([dots.camera_from_plane @ middle, view.camera_from_plane.translation])
+                    places.setdefault(view.plane, []).append(seen @ view.camera_from_plane.rotation)
+        for seen in map(np.array, places.values()):
             first, second = np.triu_indices(len(seen), 1)
-            for ways, each in zip((board_ways, face_ways), np.swapaxes(seen, 0, 1), strict=True):
-                ways.extend(each[first] - each[second])
-    if not board_ways:
+            ways.append(seen[first] - seen[second])
+    way, wanted = np.swapaxes(np.concatenate(ways), 0, 1)
+    if not len(way):
         return board
-    way, wanted = np.array(board_ways), np.array(face_ways)
     square = np.maximum((way**2).sum(1), np.finfo(float).tiny)  # the camera may not have moved
     each = (way * wanted).sum(1) / square
     order = np.argsort(each)
@@ -752,11 +411,324 @@ def in_scale(groups: Sequence[Sequence[Named]], target: TargetDesign, board: Boa
     return board.scaled(factor) if is_other else board
 
 
-MAX_CORNER_SHIFT_PITCHES = 0.3
-"""Largest distance of corners from one another under a symmetry of the board."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledImage:
+    """One image with the labels of its circles."""
+
+    observations: ImageObservations
+    notes: tuple[str, ...]  # on what was excluded
+    focus: Focus | None = None  # from which the observations are corrected; None if it has too few circles
+
+    def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
+        """Returns the image with further circles and notes."""
+        more = labelled_image(self.observations.name, self.observations.group, labels, centres, ())
+        return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
+
+    def without(self, labels: Collection[Label], notes: Sequence[str]) -> "LabelledImage":
+        """Returns the image without the circles of ``labels``, and with further notes."""
+        if not labels:
+            return self
+        keep = [i for i, label in enumerate(self.observations.labels) if label not in labels]
+        return LabelledImage(self.observations.select(keep), (*self.notes, *notes))
+
+
+def labelled_image(
+    name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
+) -> LabelledImage:
+    """Returns the image of labelled circles; identical notes are merged."""
+    measured = {f.name: getattr(centres, f.name) for f in fields(ImageObservations)[3:]}
+    merged = [
+        note if n == 1 else Note(f"{note} ({n} times)", getattr(note, "code", ""), getattr(note, "place", ""))
+        for note, n in Counter(notes).items()
+    ]
+    return LabelledImage(ImageObservations(name, group, tuple(labels), **measured), tuple(merged))
+
+
+def label_groups(
+    groups: Sequence[Sequence[Named]],
+    target: TargetDesign,
+    board: BoardDesign | None,
+    focal_px: float,
+) -> list[tuple[list[LabelledImage], Arrangement]]:
+    """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
+    steps = np.concatenate([np.zeros(0), *(KDTree(f.xy_mm).query(f.xy_mm, k=2)[0][:, 1] for f in target.faces)])
+    step_mm = board.pitch_mm if board is not None else float(np.median(steps)) if len(steps) else 0.0
+    alone: list[Arrangement] = []
+    readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
+    likely = [[likely_views(own) for own in group] for group in readings]
+    for group, likely_ones in zip(readings, likely, strict=True):
+        found = arrange(likely_ones, step_mm, focal_px)
+        if any(why == ELSEWHERE for _, why in chain.from_iterable(found.left.values())):
+            # readings with covered dots must explain more circles
+            found = max(found, arrange(group, step_mm, focal_px), key=Arrangement.explained)
+        alone.append(as_drawn(found, target.rough_poses()))
+    arrangements = across_groups(alone, MAX_SHIFT_PITCHES * step_mm)
+    return [
+        ([_labelled(*image, own, found, i) for i, (image, own) in enumerate(zip(images, views, strict=True))], found)
+        for images, views, found in zip(groups, likely, arrangements, strict=True)
+    ]
+
+
+def _labelled(
+    name: str, group: str, detection: ImageDetection, readings: list[Readings], arrangement: Arrangement, image: int
+) -> LabelledImage:
+    if detection.mirrored:
+        shown = f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does"
+        remedy = "left out, turn it back, or use the file that the camera wrote"
+        return _of_views(name, group, detection, (), [*detection.notes, f"{shown}; {remedy}"])
+    if image in arrangement.views:
+        views = arrangement.views[image]
+        notes = [_left_out(*each) for each in arrangement.left.get(image, ())]
+    else:
+        times = Counter(each[0].plane for each in readings if each[0].named)
+        views = [each[0] for each in readings if len(each) == 1 and each[0].named and times[each[0].plane] == 1]
+        notes = [_left_out(each) for each in readings if len(each) > 1 or not each[0].named]
+    return _of_views(name, group, detection, views, [*_notes_of(detection), *notes])
+
+
+def _of_views(
+    name: str, group: str, detection: ImageDetection, views: Sequence[PlaneView], notes: Sequence[str]
+) -> LabelledImage:
+    """Returns the image with the labels of accepted readings, in the order of its centres."""
+    labels = [label for view in views for label in view.labels]
+    rows = np.concatenate([np.zeros(0, int), *(view.rows for view in views)])
+    order = np.argsort(rows, kind="stable")
+    return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
+
+
+def _notes_of(detection: ImageDetection) -> list[str]:
+    repeated = [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
+    return [*detection.notes, *repeated]
+
+
+FOREIGN = "foreign"
+
+
+def _left_out(views: Readings, why: str = "") -> str:
+    """Returns the note on a pattern without labels; ``why`` : ELSEWHERE or FOREIGN; else several numberings fit."""
+    view, dots = views[0], f"board of {len(views[0].rows)} dots"
+    is_board = view.plane == BOARD
+    if why == FOREIGN:
+        reason = (
+            f"not where other groups see that face against the others, or turned from its rough_pose by more than "
+            f"{FAR_DEG:.0f}°; left out, it is a reflection or another object, the image is mirrored, or rough_pose is "
+            "wrong"
+        )
+    elif not view.named:
+        return _open_face_note(len(view.rows), [view.plane for view in views])
+    elif why == ELSEWHERE:
+        reason = (
+            "not where the group's other images see it; left out, it is a reflection or another object, or the "
+            "photograph is of another group or of a body that was moved"
+        )
+    else:
+        return Note(
+            f"{dots} left out: {len(views)} numberings fit, none keeps it where the group's other images see it; show "
+            "a face that they show, or check that nothing was moved",
+            BOARD_LEFT_OUT,
+        )
+    name = f"a {dots}" if is_board else f"a pattern like face {view.plane}"
+    return Note(f"{name}: {reason}", BOARD_LEFT_OUT if is_board else ELSEWHERE, view.plane)
+
+
+def _open_face_note(circles: int, faces: Collection[str]) -> str:
+    return (
+        f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another; left out, "
+        "show the circles that tell the faces apart"
+    )
+
+
+STEEP_RAD = np.radians(85)
+"""Largest tilt of circles of the first look that are compared with their places."""
+
+
+def label_images(
+    detection: DetectionResult,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    cache: Path,
+    workers: int | None = None,
+) -> list[LabelledImage]:
+    """Returns the labelled circles and corners of all images, in the order of their groups, after two looks."""
+    files, camera, focal_px = {i.file.name: i for i in detection.images}, detection.camera, _focal_px(detection.camera)
+    circles, groups = target.with_faces(printed=False), _groups(detection)
+    board = in_scale(groups, circles, board)
+    patterns = patterns_of(circles, board)
+    sought = patterns_of(circles, None if isinstance(board, CornerBoard) else board)  # corners are used as found
+    first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
+    jobs: list[tuple[DetectedImage, PredictedCircles]] = []
+    for found in label_groups(groups, circles, board, focal_px):
+        group, arrangement = _without_outlying(*found, patterns, focal_px)
+        for i, pose in arrangement.camera_from_group.items():
+            seen, planes = group[i].observations, arrangement.group_from_plane
+            predicted, steep = (
+                predict_circles(pose, planes, seen.labels, sought, camera, tilt) for tilt in (MAX_TILT_RAD, STEEP_RAD)
+            )
+            wrong = contradictions(steep, seen, camera)
+            group[i] = group[i].without(wrong, contradicted_notes(wrong))
+            if predicted.wanted.any():
+                jobs.append((files[seen.name], predicted))
+        first_looks.append((group, arrangement))
+    looks = look_again(jobs, camera, options, cache, workers)
+    labelled = []
+    for group, arrangement in first_looks:
+        for i, image in enumerate(group):
+            if look := looks.get(image.observations.name):
+                group[i] = image.plus(look.labels, look.centres, missed_notes(look.missed))
+        labelled += _without_outlying(group, arrangement, patterns, focal_px)[0]
+    sharp = without_defocus(labelled, camera, patterns)
+    return [_with_corners(image, files[image.observations.name].detection, target) for image in sharp]
+
+
+def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
+    """Labels all images as :func:`label_images`, without a second look."""
+    groups = _groups(detection)
+    board = in_scale(groups, target, board)
+    labelled = label_groups(groups, target, board, _focal_px(detection.camera))
+    return [each for found, _ in labelled for each in found]
+
+
+def _focal_px(camera: Camera) -> float:
+    return float(np.sqrt(camera.focal.prod()))
+
+
+def _groups(detection: DetectionResult) -> list[list[Named]]:
+    groups: dict[str, list[Named]] = {}
+    for image in detection.images:
+        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
+    return list(groups.values())
+
+
+def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
+    """Returns the image with the corners of its printed faces."""
+    labels = [label for each in detection.printed for label in each.labels(target.face(each.face))]
+    rows = [each.rows for each in detection.printed]
+    return image.plus(labels, detection.centres.select(np.concatenate(rows)), ()) if rows else image
+
+
+def _without_outlying(
+    group: list[LabelledImage], arrangement: Arrangement, patterns: dict[str, Pattern], focal_px: float
+) -> tuple[list[LabelledImage], Arrangement]:
+    """Removes circles that contradict the others of the group, and adjusts the arrangement without them."""
+    cameras, planes, images = arrangement.camera_from_group, arrangement.group_from_plane, list(group)
+    seen = [group[i].observations for i in cameras]
+    *poses, outlying = outlying_circles(Poses.of(cameras.values()), planes, seen, patterns, focal_px)
+    for i, reasons in zip(cameras, outlying, strict=True):
+        images[i] = group[i].without(reasons, contradicted_notes(reasons))
+    return images, arrangement.moved(*poses)
+
+
+def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
+    """Returns the faces of a single image, for a target that may move from image to image."""
+    faces = detection.single_faces()
+    labels = [label for each in faces for label in each.labels(target.face(each.face))]
+    rows = np.concatenate([np.zeros(0, int), *(each.rows for each in faces)])
+    unnamed = [_open_face_note(len(each[0].rows), [face.face for face in each]) for each in detection.open_faces]
+    return labelled_image(name, group, labels, detection.centres.select(rows), [*_notes_of(detection), *unnamed])
+
+
+def without_defocus(
+    images: Sequence[LabelledImage], camera: Camera, patterns: Mapping[str, Pattern]
+) -> list[LabelledImage]:
+    """Returns the images with centres corrected for blur that varies across a circle, and what their blur shows."""
+    corrected, focus = correct_defocus([image.observations for image in images], camera, patterns)
+    by_name = {own.image: own for own in focus}
+    blurs = [by_name.get(observations.name) for observations in corrected]
+    return [
+        LabelledImage(observations, (*image.notes, *([blur.note] if blur and blur.note else [])), blur)
+        for image, observations, blur in zip(images, corrected, blurs, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection(ByValue):
+    """The labelled circles of one image.
+
+    Parameters
+    ----------
+    labels : tuple of Label
+        n labels: ``face:circle``, or ``board:row:column`` from 0.
+    xy_px : (n, 2) array
+        Centres of the ellipses, px, with the centre of the top-left pixel at (0, 0).
+    covariance_px2 : (n, 2, 2) array
+        Covariances of the centres.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    labels: tuple[Label, ...]
+    xy_px: np.ndarray
+    covariance_px2: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviation of each centre per axis (RMS over both axes), (n,)."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __repr__(self) -> str:
+        planes = ", ".join(f"{plane}: {n}" for plane, n in Counter(label.plane for label in self.labels).items())
+        return f"<Detection of {len(self)} circles ({planes or 'none'}), {len(self.notes)} notes>"
+
+    def plot(self, ax: "Axes") -> None:
+        """Draws the centres with their labels into axes of matplotlib, over an image shown there."""
+        ax.plot(*self.xy_px.T, "+", color="tab:red")
+        for label, (x, y) in zip(self.labels, self.xy_px.tolist(), strict=True):
+            ax.annotate(str(label), (x, y), (3, 3), textcoords="offset points", fontsize=6, color="tab:red")
+
+
+@require_arguments
+def detect_circles(
+    image: np.ndarray,
+    camera: Camera | CameraModel | str | Path,
+    target: TargetDesign | str | Path,
+    board: BoardDesign | str | Path | None = None,
+    options: EllipseOptions | None = None,
+) -> Detection:
+    """Returns the labelled circles of one image.
+
+    A single image may leave labels open. A run decides them from all images of a group, and searches again for circles
+    that were missed.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, 3) array
+        Grey or RGB, 8 or 16 bit, of the camera's size.
+    camera : Camera
+        The camera that took the image, or its file.
+    target : TargetDesign
+        Design of the target, or its file.
+    board : BoardDesign, optional
+        The dot board, if it may be in view, or its file.
+    options : EllipseOptions, optional
+        Options of the search; the defaults if None.
+
+    Returns
+    -------
+    Detection
+        Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
+
+    Raises
+    ------
+    InputError
+        The array is no image, or not of the camera's size.
+    """
+    grey = grey_of(image, "image")
+    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)
+    board = None if board is None else board_of(board)
+    found = detect_image(grey, camera, target, board, options or EllipseOptions())
+    ((images, _),) = label_groups([[("image", "", found)]], target.with_faces(printed=False), board, _focal_px(camera))
+    sharp = without_defocus([_with_corners(images[0], found, target)], camera, patterns_of(target, board))[0]
+    seen = sharp.observations
+    return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
+
+
 CLEAR_RAD = np.radians(20.0)
 """Smallest difference of the camera's rotation between the best numbering and the next one."""
-UNNUMBERED = "left out, show the whole board, or a face with it"
 
 
 def is_board_alone(detection: DetectionResult) -> bool:
@@ -765,63 +737,44 @@ def is_board_alone(detection: DetectionResult) -> bool:
     if not any(image.boards for image in images) or any(image.faces or image.open_faces for image in images):
         return False
     outside_boards = [image.candidates - sum(len(board.rows) for board in image.boards) for image in images]
-    return float(np.median(outside_boards)) < MIN_EXPECTED
+    return float(np.median(outside_boards)) < MIN_NAMING
 
 
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
     """Returns the labelled dots of all images, in the order of their groups."""
     labelled = []
     for images in _groups(detection):
-        chosen, reasons = _numbered([_views(image, target, board) for _, _, image in images])
-        for i, (name, group, found) in enumerate(images):
-            notes = [*found.notes, *([reasons[i]] if i in reasons else [])]
-            labelled.append(_of_views(name, group, found, [chosen[i]] if i in chosen else [], notes))
+        boards = [likely_views([r for r in readings_of(d, target, board) if r[0].plane == BOARD]) for _, _, d in images]
+        numbered = _numbered([max(each, key=lambda v: len(v[0].rows), default=[]) for each in boards])
+        for (name, group, found), choice in zip(images, numbered, strict=True):
+            why = "a board without a pose; left out, show the whole board, or a face with it" if found.board else ""
+            note = choice if isinstance(choice, str) and choice else why
+            views, notes = ([choice], []) if isinstance(choice, PlaneView) else ([], [note] if note else [])
+            labelled.append(_of_views(name, group, found, views, [*_notes_of(found), *notes]))
     return without_defocus(labelled, detection.camera, patterns_of(target, board))
 
 
-def _views(detection: ImageDetection, target: TargetDesign, board: BoardDesign) -> list[PlaneView] | str:
-    """Returns the symmetric numberings of the only board of an image, or why there are none."""
-    if detection.board is None:
-        return "board found more than once; left out" if detection.boards else ""
-    boards = [each for each in likely_views(readings_of(detection, target, board)) if each and each[0].plane == BOARD]
-    views = max(boards, key=lambda v: len(v[0].rows), default=[])
-    if not views:
-        return f"a board without a pose; {UNNUMBERED}"
-    if not all(_is_symmetry(views[0].camera_from_plane.inverse() @ v.camera_from_plane, board) for v in views):
-        return Note(f"board of {len(views[0].rows)} dots: {len(views)} numberings fit; {UNNUMBERED}", BOARD_LEFT_OUT)
-    return views
-
-
-def _is_symmetry(difference: Rigid, board: BoardDesign) -> bool:
-    width, height = board.columns - 1, board.rows - 1
-    xy = board.pitch_mm * board.flat(np.array([[0.0, 0], [width, 0], [0, height], [width, height]]))
-    corners = np.pad(xy, ((0, 0), (0, 1)))
-    away = np.linalg.norm((difference @ corners)[:, None] - corners, axis=2)
-    return bool(away.min(1).max() < MAX_CORNER_SHIFT_PITCHES * board.pitch_mm)
-
-
-def _numbered(views: list[list[PlaneView] | str]) -> tuple[dict[int, PlaneView], dict[int, str]]:
-    """Returns the numbering of each image, and why others have none; next is what turns least from a numbered one."""
-    reasons = {i: numberings for i, numberings in enumerate(views) if isinstance(numberings, str) and numberings}
-    open_images = {i: numberings for i, numberings in enumerate(views) if not isinstance(numberings, str)}
-    if not open_images:
-        return {}, reasons
-    first = max(open_images, key=lambda i: len(open_images[i][0].rows))
-    numbered = {first: open_images.pop(first)[0]}
-    while open_images:
-        known = [view.camera_from_plane.inverse() for view in numbered.values()]
+def _numbered(views: Sequence[Readings]) -> list[PlaneView | str]:
+    """Returns the numbering of each image, or why it has none. Next is what turns least from a numbered image; the
+    first has the fewest numberings and the most dots."""
+    chosen: list[PlaneView | str] = [""] * len(views)
+    unsettled = {i: numberings for i, numberings in enumerate(views) if numberings}
+    if unsettled:
+        first = min(unsettled, key=lambda i: (len(unsettled[i]), -len(unsettled[i][0].rows)))
+        chosen[first] = unsettled.pop(first)[0]
+    while unsettled:
+        known = [view.camera_from_plane.inverse() for view in chosen if isinstance(view, PlaneView)]
         turns = {
-            (i, k): min((view.camera_from_plane @ other).angle_rad() for other in known)
-            for i, numberings in open_images.items()
-            for k, view in enumerate(numberings)
+            i: sorted((min((view.camera_from_plane @ other).angle_rad() for other in known), k) for k, view in each)
+            for i, each in ((i, enumerate(numberings)) for i, numberings in unsettled.items())
         }
-        i, k = min(turns, key=lambda key: turns[key])
-        numberings = open_images.pop(i)
-        rivals = [turns[i, m] for m in range(len(numberings)) if m != k]
-        if rivals and min(rivals) - turns[i, k] < CLEAR_RAD:
-            turned = f"by {np.degrees(turns[i, k]):.0f}° or {np.degrees(min(rivals)):.0f}° from the nearest image"
-            remedy = "left out, add views in between, or show a face"
-            reasons[i] = f"board numbered from either end: the camera is turned {turned}; {remedy}"
-        else:
-            numbered[i] = numberings[k]
-    return numbered, reasons
+        i = min(turns, key=lambda i: turns[i][0][0])
+        numberings, (least, k), rival = unsettled.pop(i), turns[i][0], (*turns[i][1:], (np.inf, 0))[0][0]
+        chosen[i] = numberings[k]
+        if rival - least < CLEAR_RAD:
+            turned = (
+                f"the camera is turned by {np.degrees(least):.0f}° or {np.degrees(rival):.0f}° from the nearest image"
+            )
+            fit = f"board of {len(numberings[0].rows)} dots: {len(numberings)} numberings fit, {turned}"
+            chosen[i] = f"{fit}; left out, add views in between, show the whole board, or a face"
+    return chosen

@@ -12,7 +12,7 @@ from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.document import sentence
 from stcal.report.text import join, number, significant
-from stcal.sfm.data.note import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
+from stcal.sfm.data.note import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN
 from stcal.sfm.report.check import CAUSE, SUSPICIOUS, Check, invalidated, ranked
 
 TAIL = 2.0
@@ -215,9 +215,10 @@ class _Run:
 
     def _left_out_in(self, face: str) -> list[str]:
         """Returns the images in which a face was read but left out."""
-        of_face = {(ELSEWHERE, face), (SINGLE, face)}
         notes = self.report["left_out"]["notes"]
-        return list(dict.fromkeys(each["image"] for each in notes if (each["code"], each["place"]) in of_face))
+        return list(
+            dict.fromkeys(each["image"] for each in notes if (each["code"], each["place"]) == (ELSEWHERE, face))
+        )
 
     def _has_circles(self, face: str) -> bool:
         rows = [*self.report["residuals_by_label"], *self.report["left_out"]["circles"]]
