@@ -31,7 +31,7 @@ from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
-from stcal.sfm.mapping.placed import plain_lens
+from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.groups import (

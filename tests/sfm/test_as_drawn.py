@@ -14,8 +14,7 @@ from stcal.sfm.checks.causes import cause_of_drawing
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
-from stcal.sfm.mapping.body import Corners, wrong_sizes
-from stcal.sfm.mapping.placed import place_with_camera
+from stcal.sfm.mapping.body import Corners, place_with_camera, wrong_sizes
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.run_options import RunOptions

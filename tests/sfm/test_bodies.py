@@ -29,7 +29,7 @@ from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
+from stcal.sfm.mapping.body import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.planning.plan_report import plan_text
 from stcal.sfm.planning.session import PlanOptions, plan, planned_photographs

@@ -1,7 +1,9 @@
-"""Placement of a body by its faces of known shape: poses of faces and images, and the camera if it is unknown. Of the
-two reflections of each view (Schweighofer & Pinz 2006) those are taken on which the images agree."""
+"""The way of mapping by faces of known shape: the poses of faces and images, of the whole body at once, and the camera
+if it is unknown. Of the two reflections of each view (Schweighofer & Pinz 2006) those are taken on which the images
+agree."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +14,35 @@ from scipy.spatial.transform import Rotation
 from stcal.adjust.blocks import Block, Huber, Vector
 from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign
-from stcal.errors import DegenerateError, MappingError
-from stcal.geometry.camera import Camera
+from stcal.errors import ConvergenceError, DegenerateError, MappingError
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Normal, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
-from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
+from stcal.sfm.mapping.incremental import (
+    MAX_REPROJECTION_PX,
+    MIN_RAY_ANGLE_RAD,
+    Mapping,
+    complete,
+    left_out,
+    rays_of,
+    widest_angle_rad,
+)
+from stcal.sfm.mapping.models import assemble
+from stcal.sfm.mapping.pairs import PairScore
 
+BY_FACES = "faces of known shape, placed together"
+SHOW_MORE = "show two faces of it at once, or one by more corners"
+LENS = "OPENCV"  # model of an unknown camera
+SIGMA_FOCAL, SIGMA_SQUARE = 0.5, 2e-3
+"""Relative σ of the focal length of an unknown camera, and of the ratio of its two focal lengths."""
+SIGMA_CENTRE = 0.03  # σ of its principal point, in longer image sides
+SIGMA_RADIAL, SIGMA_TANGENTIAL = np.array([0.3, 0.1]), 0.003
+"""σ of its distortion, as shares of a corner's distance from the middle of the image: lenses of cameras have no more,
+and few or small faces would take noise for it."""
 MIN_CORNERS = 4  # smallest number of corners of a view of a face: they determine its homography
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 """Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
@@ -63,20 +85,17 @@ class Corners:
             label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
         }
         rows: list[tuple[int, int, int]] = []
-        pixels, covariances = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+        seen = [ImageObservations("", "", (), *np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))]
         for i, image in enumerate(observations):
-            own = [k for k, label in enumerate(image.labels) if label in place]
-            of_face = np.array([place[image.labels[k]][0] for k in own], int)
-            keep = [k for k, f in zip(own, of_face, strict=True) if (of_face == f).sum() >= MIN_CORNERS]
+            of_face = np.array([place.get(label, (-1,))[0] for label in image.labels], int)
+            keep = np.flatnonzero((of_face >= 0) & (np.sum(of_face[:, None] == of_face, axis=1) >= MIN_CORNERS))
             rows += [(i, *place[image.labels[k]]) for k in keep]
-            pixels.append(image.centre_px[keep])
-            covariances.append(image.covariance_px2[keep])
+            seen.append(image.select(keep))
         image, face, corner = np.array(rows, int).reshape(-1, 3).T
         xy = np.array([faces[f].xy_mm[k] for f, k in zip(face, corner, strict=True)]).reshape(-1, 2)
-        covariance = np.concatenate(covariances) + LEAST_SIGMA_PX**2 * np.eye(2)
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        names = tuple(each.name for each in observations)
-        return cls(names, tuple(faces), image, face, corner, xy, np.concatenate(pixels), root)
+        covariance = np.concatenate([each.covariance_px2 for each in seen]) + LEAST_SIGMA_PX**2 * np.eye(2)
+        root, xy_px = np.linalg.inv(np.linalg.cholesky(covariance)), np.concatenate([each.centre_px for each in seen])
+        return cls(tuple(each.name for each in observations), tuple(faces), image, face, corner, xy, xy_px, root)
 
     def select(self, keep: np.ndarray) -> "Corners":
         """Returns the corners of a mask."""
@@ -101,9 +120,8 @@ class Body:
 
     def xyz_camera(self, corners: Corners) -> np.ndarray:
         """Returns the corners in the frames of the cameras, (n, 3)."""
-        f, i = self.body_from_face, self.camera_from_body
-        body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
-        return np.einsum("nij,nj->ni", i.rotation[corners.image], body) + i.translation[corners.image]
+        xyz_body = self.body_from_face[corners.face] @ corners.xyz_face()
+        return self.camera_from_body[corners.image] @ xyz_body
 
     def lengths(self, corners: Corners) -> np.ndarray:
         """Returns the lengths of the residuals in σ, (n,); infinite behind a camera."""
@@ -146,6 +164,10 @@ class _Views:
     face: np.ndarray
     poses: Poses  # (2v,) camera_from_face, both minima of each view one after the other
     cost: np.ndarray  # (v, 2)
+
+    def both(self, of: np.ndarray) -> Poses:
+        """Returns both poses of each of some views."""
+        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
 
     @classmethod
     def of(cls, corners: Corners, camera: Camera) -> "_Views":
@@ -325,24 +347,32 @@ def _images(
     views: _Views, corners: Corners, body_from_face: Poses, placed_faces: np.ndarray, camera: Camera
 ) -> tuple[Poses, np.ndarray]:
     """Returns camera_from_body of each image: of what its views say, that which fits most of its corners best."""
-    count = len(corners.images)
-    rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
-    placed = np.zeros(count, bool)
-    f = body_from_face
-    body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
+    poses, placed = [Rigid(np.eye(3), [0.0, 0.0, 1.0]) for _ in corners.images], np.zeros(len(corners.images), bool)
+    xyz_body = body_from_face[corners.face] @ corners.xyz_face()
     for image in np.unique(views.image):
         own = np.flatnonzero((corners.image == image) & placed_faces[corners.face])
         if len(own) < MIN_POINTS:
             continue
-        part, candidates = corners.select(own), []
-        for v in np.flatnonzero((views.image == image) & placed_faces[views.face]):
-            for k in (2 * v, 2 * v + 1):
-                turn = views.poses.rotation[k] @ f.rotation[views.face[v]].T
-                candidates.append((turn, views.poses.translation[k] - turn @ f.translation[views.face[v]]))
-        costs = [_robust(_lengths(body[own] @ turn.T + shift, part, camera)) for turn, shift in candidates]
+        part, of = corners.select(own), np.flatnonzero((views.image == image) & placed_faces[views.face])
+        candidates = views.both(of) @ body_from_face[np.repeat(views.face[of], 2)].inverse()
+        costs = [_robust(_lengths(pose @ xyz_body[own], part, camera)) for pose in candidates]
         if min(costs, default=np.inf) < np.inf:
-            (rotation[image], translation[image]), placed[image] = candidates[int(np.argmin(costs))], True
-    return Poses(rotation, translation), placed
+            poses[image], placed[image] = candidates[int(np.argmin(costs))], True
+    return Poses.of(poses), placed
+
+
+def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
+    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
+    poses, camera_from_body = list(body.body_from_face), body.camera_from_body
+    for face in np.flatnonzero(body.placed_faces)[1:]:
+        part = corners.select((corners.face == face) & body.placed_images[corners.image])
+        of = np.flatnonzero((views.face == face) & body.placed_images[views.image])
+        candidates = [poses[face], *(camera_from_body[np.repeat(views.image[of], 2)].inverse() @ views.both(of))]
+        seen = (camera_from_body[part.image] @ (pose @ part.xyz_face()) for pose in candidates)
+        costs = np.array([_robust(_lengths(xyz, part, body.camera)) for xyz in seen])
+        costs[0] *= 1 - BETTER
+        poses[face] = candidates[int(np.argmin(costs))]
+    return Poses.of(poses)
 
 
 def adjust_body(
@@ -398,28 +428,6 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
     return at(*a.minimum(start, settled=1e-7, max_steps=MAX_STEPS).state.values())
 
 
-def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
-    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
-    rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
-    i = body.camera_from_body
-    for face in np.flatnonzero(body.placed_faces)[1:]:
-        own = np.flatnonzero((corners.face == face) & body.placed_images[corners.image])
-        part, xyz = corners.select(own), corners.xyz_face()[own]
-
-        candidates, costs = [(rotation[face].copy(), translation[face].copy())], []
-        for v in np.flatnonzero((views.face == face) & body.placed_images[views.image]):
-            back = i.rotation[views.image[v]].T
-            for k in (2 * v, 2 * v + 1):
-                shift = back @ (views.poses.translation[k] - i.translation[views.image[v]])
-                candidates.append((back @ views.poses.rotation[k], shift))
-        for turn, shift in candidates:
-            in_body = xyz @ turn.T + shift
-            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
-            costs.append(_robust(_lengths(seen, part, body.camera)) * (1.0 if costs else 1 - BETTER))
-        rotation[face], translation[face] = candidates[int(np.argmin(costs))]
-    return Poses(rotation, translation)
-
-
 def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
     """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
@@ -461,3 +469,179 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
 def _robust(length: np.ndarray) -> float:
     """Returns the cost of residuals of these lengths, in σ, that hardly grows with gross ones."""
     return float((np.minimum(length, 1e3) ** 0.5).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBody:
+    """A body with the faces and images that are placed."""
+
+    body_from_face: dict[str, Rigid]
+    camera_from_body: dict[str, Rigid]
+    faces: tuple[FaceDesign, ...]
+    camera: Camera  # with the covariance of the assumptions about an unknown one
+    unlinked: tuple[str, ...]  # faces that are seen, and never with a placed one
+    contradictions: tuple[Outlier, ...]  # corners that lie elsewhere than the body has them
+
+    def unlinked_notes(self) -> list[str]:
+        """Returns a note for each face of known shape that no image shows together with one that is placed."""
+        return [
+            f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} "
+            "corners each; add one that does"
+            for face in self.unlinked
+        ]
+
+
+def plain_lens(camera: Camera) -> Camera:
+    """Returns a camera of this focal length with a tenth of the σ of :func:`unknown_lens` about no distortion and a
+    principal point in the middle: for images that do not tell these."""
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2
+    lens = unknown_lens(replace(camera, centre=middle, distortion=np.zeros_like(camera.distortion)))
+    assert lens.covariance is not None
+    share = np.where(np.arange(len(lens.covariance)) < 2, 1.0, 0.1)
+    return replace(lens, covariance=lens.covariance * np.outer(share, share))
+
+
+def unknown_lens(camera: Camera) -> Camera:
+    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values."""
+    side = max(camera.width, camera.height)
+    reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
+    radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach
+    sigma = np.concatenate([[1.0, 1.0], [SIGMA_CENTRE * side] * 2, radial, [tangential] * 2])
+    covariance, focal = np.diag(sigma**2), float(camera.focal.mean())
+    covariance[:2, :2] = focal**2 * (SIGMA_FOCAL**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 / 2 * np.eye(2))
+    return Camera.of(camera, LENS, covariance)
+
+
+def place_with_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
+) -> PlacedBody:
+    """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
+    corners = Corners.of(observations, faces)
+    _require_sizes(corners, camera)
+    body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
+    return _named(body, corners, camera)
+
+
+def place_and_find_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
+) -> PlacedBody:
+    """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
+    corners = Corners.of(observations, faces)
+    side, first = max(starts[0].width, starts[0].height), starts[0]
+    cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
+    _require_sizes(corners, first)
+    bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
+    best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
+    if best is None:
+        raise MappingError(
+            "E-BODY-NO-CAMERA",
+            f"camera: no focal length of {cameras[-1].focal[0]:.0f} px and less explains the views of the faces; check "
+            "the sizes in target.toml, or give a camera file with --camera",
+        )
+    lens = unknown_lens(best.camera)
+    assert lens.covariance is not None
+    basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
+    with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
+        best = settled_body(best, corners, basis, prior, lens)
+    return _named(best, corners, unknown_lens(best.camera))
+
+
+def _require_sizes(corners: Corners, camera: Camera) -> None:
+    """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
+    wrong, alike = wrong_sizes(corners, camera)
+    if not wrong:
+        return
+    names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
+    if alike < len(names):
+        told = (
+            f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+            f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states; measure the "
+            "side of each print"
+        )
+    else:
+        each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
+        told = (
+            f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other faces "
+            "agree with one another; measure the side of its print"
+        )
+    raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
+
+
+def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
+    """Returns the body with an adjusted focal length, None if there is none from this start."""
+    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
+    try:
+        for _ in range(2):  # the reflections are chosen again with the better camera
+            prior = np.array([[(2 * camera.focal[0]) ** -2]])
+            body = adjust_body(place_body(corners, camera), corners, basis, prior, camera)
+            camera = body.camera
+        return body
+    except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
+        return None
+
+
+def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
+    placed = np.flatnonzero(body.placed_faces).tolist()
+    return PlacedBody(
+        {corners.faces[f].id: body.body_from_face[f] for f in placed},
+        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
+        tuple(corners.faces[f] for f in placed),
+        camera,
+        tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
+        tuple(contradictions(body, corners)),
+    )
+
+
+def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:
+    """Returns the model of a group: placed images, points that two of them see, and what these determine further."""
+    placed = [image for image in group if image.name in body.camera_from_body]
+    if len(placed) < 2:
+        raise MappingError(
+            "E-BODY-FEW-IMAGES",
+            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, 2 "
+            "needed; add images that each show two faces",
+        )
+    designed: dict[Label, np.ndarray] = {
+        label: xyz
+        for face in body.faces
+        for label, xyz in zip(face.labels(), body.body_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+    }
+    rays = rays_of(placed, body.camera_from_body, designed)
+    xyz = {label: designed[label] for label, (_, ray) in rays.items() if widest_angle_rad(ray) > MIN_RAY_ANGLE_RAD}
+    poses = [body.camera_from_body[image.name] for image in placed]
+    model = assemble(WorldModel, group[0].group, placed, poses, xyz)
+    return complete(model, list(group), camera, MAX_REPROJECTION_PX)
+
+
+def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> Mapping:
+    """Maps one group by a body that its faces have placed, without the corners that contradict it."""
+    model = model_of_body(body, group, camera)
+    gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+    seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
+    is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+    missing = left_out(group, model, SHOW_MORE)
+    return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)
+
+
+def pair_of_model(model: WorldModel) -> PairScore:
+    """Returns the pair of images with most points in common: a report names one for each group."""
+    sees = np.zeros((len(model.images), len(model.labels)), bool)
+    sees[model.image_index, model.point_index] = True
+    shared = np.triu(sees.astype(int) @ sees.T.astype(int), 1)
+    i, j = np.unravel_index(int(shared.argmax()), shared.shape)
+    pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
+    both = model.xyz_model[sees[i] & sees[j]]
+    towards = [both - model.camera_from_model[k].inverse().translation for k in (i, j)]
+    cosine = (towards[0] * towards[1]).sum(1) / np.prod([np.linalg.norm(ray, axis=1) for ray in towards], axis=0)
+    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1)))) if len(both) else 0.0
+    length = float(np.linalg.norm(pose.translation)) or 1.0
+    return PairScore(
+        model.images[i],
+        model.images[j],
+        int(shared[i, j]),
+        angle,
+        1.0,
+        abs(float(pose.translation[2])) / length,
+        Rigid(pose.rotation, pose.translation / length),
+        "chosen",
+    )

@@ -88,16 +88,18 @@ SEED = 1
 MAX_REPROJECTION_PX = 4.0  # largest reprojection error of an observation in the model (COLMAP's filter)
 MIN_AGREEMENT = 0.5  # share of the circles seen at least twice that a model must contain
 LOG_ERRORS_ONLY = 3
+SHOW_BOTH = "photograph faces and board together"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapping:
-    """Result of mapping one group."""
+    """Result of mapping one group in any way."""
 
-    model: WorldModel
+    model: WorldModel  # without the outliers
     outliers: tuple[Outlier, ...]  # observations with a large reprojection error
     left_out: dict[str, str]  # reason by image name
-    seeded: str  # how the initial pair was registered
+    seeded: str  # how the initial pair was registered, or the faces placed
+    remedy: str  # for images with too few circles in the model
 
 
 def map_group(
@@ -143,12 +145,10 @@ def map_group(
             f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
             "check that the camera file belongs to the images, and that nothing but the camera moved",
         )
-    return Mapping(model, outliers, left_out(group, model), seeded)
+    return Mapping(model, outliers, left_out(group, model), seeded, SHOW_BOTH)
 
 
-def left_out(
-    group: list[ImageObservations], model: WorldModel, remedy: str = "photograph faces and board together"
-) -> dict[str, str]:
+def left_out(group: Sequence[ImageObservations], model: WorldModel, remedy: str = SHOW_BOTH) -> dict[str, str]:
     """Returns why images of the group are not in the model, by image name; ``remedy`` for too few circles in it."""
     reasons = {}
     for image in group:

@@ -23,7 +23,7 @@ from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
-from stcal.sfm.mapping.placed import LENS, place_and_find_camera, unknown_lens
+from stcal.sfm.mapping.body import LENS, place_and_find_camera, unknown_lens
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.transaction import RunFolder
 
