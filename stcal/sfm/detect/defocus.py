@@ -10,12 +10,9 @@ from stcal.geometry.robust import huber_weights, ratio_limit, robust_sigma
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import Pattern, planar_pose
 
-MIN_PLANE = 5
-"""Smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check."""
-MIN_CIRCLES = 12
-"""Smallest number of circles of an image for its law of blur, which has three parameters."""
-BY_CHANCE = 1e-6
-"""Share of images with even blur of which a law is found by chance."""
+MIN_PLANE = 5  # smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check.
+MIN_CIRCLES = 12  # smallest number of circles of an image for its law of blur, which has three parameters
+BY_CHANCE = 1e-6  # share of images with even blur of which a law is found by chance
 RESPONSE, RESPONSE_OF_BLUR2 = 0.51, 5.8
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
 square of the blur over the smaller radius: from 3751 circles that were rendered through points of a pupil."""
@@ -25,8 +22,7 @@ FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5
 """Largest scatter of the squared blur about its law, as a share of its scatter about their mean, that is not told."""
-TOLD_PX = 0.3
-"""Smallest variation of the blur, px, that is told if depth does not explain it."""
+TOLD_PX = 0.3  # smallest variation of the blur, px, that is told if depth does not explain it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,10 +196,8 @@ def _fitted(
     return coefficients, inverse, scatter
 
 
-ROUNDS = 6
-"""Number of rounds of the robust fit: weights are settled to a per cent after four."""
-HUBER = 2.0
-"""Residual, in σ, beyond which the weight falls (Huber 1964)."""
+ROUNDS = 6  # number of rounds of the robust fit: weights are settled to a per cent after four
+HUBER = 2.0  # residual, in σ, beyond which the weight falls (Huber 1964)
 LEAST_PX2 = 1e-6
 """Scatter of the squared blur, px², that counts as none."""
 

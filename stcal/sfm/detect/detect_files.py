@@ -46,14 +46,12 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 CACHE_VERSION = 11
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
-PHOTOGRAPHS = "the photographs"
-"""Where a camera that was found is from, for messages."""
+PHOTOGRAPHS = "the photographs"  # where a camera that was found is from, for messages
 LOSSY = (".jpg", ".jpeg")
 COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)
 """Additions of file managers to the name of a second copy."""
 SAME_PLACE_PX = 4.0
-SAME_SHARE = 0.6
-"""Share of an image's circles that lie within the same squares of that side in another form of it."""
+SAME_SHARE = 0.6  # share of an image's circles that lie within the same squares of that side in another form of it
 
 P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]

@@ -14,21 +14,14 @@ from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, matc
 from stcal.sfm.detect.sightings import BoardSighting
 
 NEIGHBOURS = 20
-STEP_TOLERANCE = 0.3
-"""Largest distance of a dot from its place predicted by its neighbours, in steps."""
-DIAGONAL = 1.22
-"""Limit between the lengths of a step along a row, 1, and along a diagonal, √2."""
-MIN_SHARE = 0.35
-"""Smallest share of the board's dots that makes a board."""
+STEP_TOLERANCE = 0.3  # largest distance of a dot from its place predicted by its neighbours, in steps
+DIAGONAL = 1.22  # limit between the lengths of a step along a row, 1, and along a diagonal, √2
+MIN_SHARE = 0.35  # smallest share of the board's dots that makes a board
 MAX_BOARDS = 3
-MAX_COSINE = 0.35
-"""Largest cosine of the angle between the two first steps in the board plane; 45° has 0.7."""
-MIN_LINKS = 3
-"""Smallest number of neighbours of a dot that starts a grid."""
-NEARLY_ALL = 0.9
-"""Share of the board that ends the search for a larger grid."""
-MIN_SIDE = 3
-"""Smallest number of rows and columns."""
+MAX_COSINE = 0.35  # largest cosine of the angle between the two first steps in the board plane; 45° has 0.7
+MIN_LINKS = 3  # smallest number of neighbours of a dot that starts a grid
+NEARLY_ALL = 0.9  # share of the board that ends the search for a larger grid
+MIN_SIDE = 3  # smallest number of rows and columns
 CORNER_MARGIN = 0.4
 """A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
 MAX_UNEXPLAINED = 2
@@ -230,8 +223,7 @@ RING_SHARES = (0.15, 0.75, 1.25)
 """Radii of the circles on which the middle of a dot, its body and the board about it are sampled, in its radii."""
 HOLE_SHARE = 0.5
 """Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
-MOST_WRONG = 1
-"""Largest number of dots whose hole is missed, or seen where none is."""
+MOST_WRONG = 1  # largest number of dots whose hole is missed, or seen where none is
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:

@@ -14,22 +14,16 @@ from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches
 from stcal.sfm.detect.sightings import FaceSighting, OpenFace
 
-MIN_NAMING = 6
-"""Smallest number of circles that can name a face: four determine a homography, two more confirm it."""
+MIN_NAMING = 6  # smallest number of circles that can name a face: four determine a homography, two more confirm it
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
-PAIR_TOLERANCE = 0.3
-"""Relative tolerance of distance and size of a pair after the map of one ellipse to a circle."""
-SUPPORT = 5
-"""Number of nearest circles that are predicted from a pair."""
-MIN_SUPPORT = 2
-"""Number of the predicted circles that must be present before the hypothesis is grown."""
-FIRST_HYPOTHESES = 300
-"""Number of the best supported hypotheses of an image that are all grown, so that rivals compete."""
+PAIR_TOLERANCE = 0.3  # relative tolerance of distance and size of a pair after the map of one ellipse to a circle
+SUPPORT = 5  # number of nearest circles that are predicted from a pair
+MIN_SUPPORT = 2  # number of the predicted circles that must be present before the hypothesis is grown
+FIRST_HYPOTHESES = 300  # number of the best supported hypotheses of an image that are all grown, so that rivals compete
 MAX_TRIES = 8
 """Number of further hypotheses grown from each outline without a reading: a dim face ranks behind all clutter."""
-AT_ONCE = 32
-"""Number of hypotheses that are grown side by side, ahead of their turn."""
+AT_ONCE = 32  # number of hypotheses that are grown side by side, ahead of their turn
 MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MAX_SIZE_RATIO = 1.25

@@ -22,10 +22,8 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 NO_CENTRES = Centres.without_rims(*np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))
-FAINT = 0.25
-"""Share of the required contrast that is used if an image shows too little with the full one."""
-MAX_FREE = 400
-"""Number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130."""
+FAINT = 0.25  # share of the required contrast that is used if an image shows too little with the full one
+MAX_FREE = 400  # number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -65,8 +65,7 @@ Named = tuple[str, str, ImageDetection]
 """Name and group of an image, and what it shows."""
 
 
-MIN_POSE_CIRCLES = 5
-"""Smallest number of circles for a pose. Four determine it, a fifth allows a check."""
+MIN_POSE_CIRCLES = 5  # smallest number of circles for a pose. Four determine it, a fifth allows a check.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +129,7 @@ def likely_views(readings: list[Readings]) -> list[Readings]:
 
 MAX_SHIFT_PITCHES = 0.3
 """Largest deviation of a plane from its place in an image's first pose, in steps; a wrong numbering deviates by one."""
-MAX_SEEDS = 8
-"""Largest number of start images, until one explains everything."""
+MAX_SEEDS = 8  # largest number of start images, until one explains everything
 MAX_OFF_PITCHES = 0.12
 """Largest median deviation of a reading's circles after the adjustment, in steps: 3 mm for the reference target."""
 
@@ -538,8 +536,7 @@ def _open_face_note(circles: int, faces: Collection[str]) -> str:
     )
 
 
-STEEP_RAD = np.radians(85)
-"""Largest tilt of circles of the first look that are compared with their places."""
+STEEP_RAD = np.radians(85)  # largest tilt of circles of the first look that are compared with their places
 
 
 def label_images(
@@ -727,8 +724,7 @@ def detect_circles(
     return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
 
 
-CLEAR_RAD = np.radians(20.0)
-"""Smallest difference of the camera's rotation between the best numbering and the next one."""
+CLEAR_RAD = np.radians(20.0)  # smallest difference of the camera's rotation between the best numbering and the next one
 
 
 def is_board_alone(detection: DetectionResult) -> bool:

@@ -20,10 +20,8 @@ CACHE_VERSION = 2
 QUALITY = 82
 MIN_WIDTH_PX = 1000
 LEFT_OUT = "left out of the adjustment"
-LEAST_CROSS_PX = 15
-"""Size of the cross on a circle that was left out, at least."""
-MIN_LABEL_GAP = 70.0
-"""Smallest distance between numbered dots, px at text size 1."""
+LEAST_CROSS_PX = 15  # size of the cross on a circle that was left out, at least
+MIN_LABEL_GAP = 70.0  # smallest distance between numbered dots, px at text size 1
 NAME_ROOM = 100.0
 """Distance of a face's name from the nearest centre, in units of its letters, from which on it has room there."""
 

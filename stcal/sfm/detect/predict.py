@@ -29,8 +29,7 @@ from stcal.sfm.detect.circles.fits import MIN_SIGMA
 
 MAX_STRETCH = 1.15
 """Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end."""
-MAX_BLUR = 1.0
-"""Largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side."""
+MAX_BLUR = 1.0  # largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side
 MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
@@ -208,8 +207,7 @@ def _by_plane(reasons: dict[Label, str], what: str) -> list[str]:
 
 HUBER_PX = 1.5
 """Residual beyond which an observation loses weight: such residuals are of printed planes, not of centres."""
-BUNDLE_SETTLED = 1e-4
-"""Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
+BUNDLE_SETTLED = 1e-4  # relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient.
 BUNDLE_STEPS = 30
 
 
@@ -251,14 +249,12 @@ def adjusted_planes(
 
 MIN_LIMIT_PX = 0.5
 """Largest deviation that never counts as outlying. Centres are good to hundredths, designs to tenths."""
-BEYOND = 4.0
-"""Factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000."""
+BEYOND = 4.0  # factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000
 BEYOND_SIGMA = 5.0
 """Smallest outlying distance in σ of the centre; one normal error in 270 000 is larger (two coordinates)."""
 MIN_USUAL = 6
 """Least number of circles for a plane's own pose and median; those of other planes are judged by the median of all."""
-ALIKE = 0.5
-"""Relative difference up to which a circle's deviation in another image counts as the same."""
+ALIKE = 0.5  # relative difference up to which a circle's deviation in another image counts as the same
 MAX_ROUNDS = 10
 
 
@@ -331,14 +327,10 @@ def _placed(cameras: Poses, planes: Poses, image, plane, xyz: np.ndarray) -> tup
     return camera_from_plane @ xyz, camera_from_plane.rotation
 
 
-SEARCH = 5.0
-"""Search range about the predicted places, in mean radii of the circles, to each side."""
-COARSE_RADIUS_PX = 2.5
-"""Radius of the circles in the small picture that the common shift is measured in."""
-CORRELATED = 0.3
-"""Smallest significant correlation. Below it the shift is ignored."""
-LEVEL_PX = 9
-"""Side of the square in the small picture whose mean is subtracted."""
+SEARCH = 5.0  # search range about the predicted places, in mean radii of the circles, to each side
+COARSE_RADIUS_PX = 2.5  # radius of the circles in the small picture that the common shift is measured in
+CORRELATED = 0.3  # smallest significant correlation. Below it the shift is ignored.
+LEVEL_PX = 9  # side of the square in the small picture whose mean is subtracted
 
 
 def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles) -> tuple[tuple[Label, ...], Centres]:

@@ -35,19 +35,14 @@ from stcal.sfm.detect.dot_grid import find_boards
 from stcal.sfm.detect.image import image_corners
 from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
 
-SMOOTHING_PX = 5
-"""Side of the Gaussian filter, px."""
-EQUAL_SIGMA_PX = 0.05
-"""σ of every centre. Its value does not matter, as it is equal for all."""
+SMOOTHING_PX = 5  # side of the Gaussian filter, px
+EQUAL_SIGMA_PX = 0.05  # σ of every centre. Its value does not matter, as it is equal for all.
 MIN_OUTLINE_PX = 6
-AREA_RATIO = 2.0
-"""Largest ratio of areas of equal circles in one pattern, due to perspective."""
-STEP_RATIO = 1.4
-"""Largest ratio of distances between neighbouring circles, due to perspective."""
+AREA_RATIO = 2.0  # largest ratio of areas of equal circles in one pattern, due to perspective
+STEP_RATIO = 1.4  # largest ratio of distances between neighbouring circles, due to perspective
 ZERO_COSINE = float(np.sin(np.radians(22.5)))
 """Largest cosine of directions that count as perpendicular: half way to those 45° off."""
-MAX_MISFIT = 0.25
-"""Largest distance of a circle from its place in the face's plane, in radii."""
+MAX_MISFIT = 0.25  # largest distance of a circle from its place in the face's plane, in radii
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,7 @@ from stcal.design import FaceDesign
 from stcal.labels import BOARD, CircleLabel
 from stcal.sfm.data.group_model import Centres
 
-SECOND_BOARD_SHARE = 0.8
-"""Smallest number of dots of a second board, as a share of the dots of the first."""
+SECOND_BOARD_SHARE = 0.8  # smallest number of dots of a second board, as a share of the dots of the first
 
 
 @dataclass(frozen=True, slots=True, eq=False)

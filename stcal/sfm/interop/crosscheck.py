@@ -19,8 +19,7 @@ from stcal.sfm.interop.export_database import Exported, write_copy
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.interop.native import NativeColmap, faces_from_models, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import find_schema, schema_of_version
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged

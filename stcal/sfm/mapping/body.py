@@ -32,7 +32,7 @@ from stcal.sfm.mapping.incremental import (
     widest_angle_rad,
 )
 from stcal.sfm.mapping.models import assemble
-from stcal.sfm.mapping.pairs import PairScore
+from stcal.sfm.mapping.pairs import PairScore, ray_angle_rad
 
 BY_FACES = "faces of known shape, placed together"
 SHOW_MORE = "show two faces of it at once, or one by more corners"
@@ -53,8 +53,7 @@ LEAST_PAIRS, ROBUST_SIZES = 2, 10
 """Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
 MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 """Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
-LEAST_SIGMA_OFF = 0.02
-"""σ of such a logarithm that the reflections of views and a rough camera leave to any."""
+LEAST_SIGMA_OFF = 0.02  # σ of such a logarithm that the reflections of views and a rough camera leave to any
 LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
 BETTER = 0.2  # share by which another pose of a face must fit its corners better
 BY_CHANCE = 0.01  # number of sound corners in a run that may be taken for gross errors
@@ -631,17 +630,7 @@ def pair_of_model(model: WorldModel) -> PairScore:
     i, j = np.unravel_index(int(shared.argmax()), shared.shape)
     pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
     both = model.xyz_model[sees[i] & sees[j]]
-    towards = [both - model.camera_from_model[k].inverse().translation for k in (i, j)]
-    cosine = (towards[0] * towards[1]).sum(1) / np.prod([np.linalg.norm(ray, axis=1) for ray in towards], axis=0)
-    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1)))) if len(both) else 0.0
+    angle = ray_angle_rad(*(both - model.camera_from_model[k].inverse().translation for k in (i, j)))
     length = float(np.linalg.norm(pose.translation)) or 1.0
-    return PairScore(
-        model.images[i],
-        model.images[j],
-        int(shared[i, j]),
-        angle,
-        1.0,
-        abs(float(pose.translation[2])) / length,
-        Rigid(pose.rotation, pose.translation / length),
-        "chosen",
-    )
+    pair, forward = (model.images[i], model.images[j], int(shared[i, j])), abs(float(pose.translation[2])) / length
+    return PairScore(*pair, angle, 1.0, forward, Rigid(pose.rotation, pose.translation / length), "chosen")

@@ -13,13 +13,11 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
 from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import CAMERA_ID, unwritable
+from stcal.sfm.mapping.database import CAMERA_ID, pycolmap, unwritable
 from stcal.sfm.mapping.models import assemble, points_by_votes, rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 
-MIN_SHARE = 0.25
-"""Smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)."""
+MIN_SHARE = 0.25  # smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)
 MIN_RAY_ANGLE_RAD = np.radians(0.5)
 """Smallest value of the largest angle between the rays of a new point. Below it the depth is too uncertain."""
 
@@ -68,15 +66,13 @@ def rays_of(
     """Returns by label the rays on which placed images see it: projection centres, (k, 3), and directions, (k, 3)."""
     rays: dict[Label, list[tuple[np.ndarray, np.ndarray]]] = {}
     for image in images:
-        pose = poses[image.name]
-        for k, label in enumerate(image.labels):
+        world_from_camera = poses[image.name].inverse()
+        directions = np.pad(image.centre, ((0, 0), (0, 1)), constant_values=1.0) @ world_from_camera.rotation.T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        for label, direction in zip(image.labels, directions, strict=True):
             if label in labels:
-                direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
-                rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
-    return {
-        label: (np.array([centre for centre, _ in seen]), np.array([direction for _, direction in seen]))
-        for label, seen in rays.items()
-    }
+                rays.setdefault(label, []).append((world_from_camera.translation, direction))
+    return {label: (rows[:, 0], rows[:, 1]) for label, rows in ((label, np.array(r)) for label, r in rays.items())}
 
 
 def widest_angle_rad(direction: np.ndarray) -> float:
@@ -248,13 +244,9 @@ def labelled_model(
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     is_outlier = residual > MAX_REPROJECTION_PX
-    outliers = [
-        Outlier(
-            model.images[model.image_index[k]],
-            model.labels[model.point_index[k]],
-            float(residual[k]),
-            MAX_REPROJECTION_PX,
-        )
-        for k in np.flatnonzero(is_outlier)
-    ]
-    return model.without(is_outlier), tuple(outliers)
+    rows = np.column_stack([model.image_index, model.point_index])[is_outlier]
+    outliers = tuple(
+        Outlier(model.images[i], model.labels[p], float(off), MAX_REPROJECTION_PX)
+        for (i, p), off in zip(rows, residual[is_outlier], strict=True)
+    )
+    return model.without(is_outlier), outliers

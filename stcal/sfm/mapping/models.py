@@ -19,8 +19,7 @@ from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.io.poses.programs import image_lines
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, M, MetricModel, WorldModel
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
+from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, pycolmap, to_colmap_px
 
 LOG_NOTHING = 4  # level of COLMAP's log that prints nothing. Errors are raised as exceptions.
 KEYPOINT_TOLERANCE_PX = 0.002

@@ -15,32 +15,26 @@ from stcal.geometry.plane import apply_homography, fit_homographies, homography_
 from stcal.io.images import percentiles, shrunk
 from stcal.sfm.data.group_model import CircleRows
 
-WINDOWS_PX = (41, 193)
-"""Sides of the windows whose mean is the threshold, on every level of the pyramid."""
+WINDOWS_PX = (41, 193)  # sides of the windows whose mean is the threshold, on every level of the pyramid
 WINDOW_OVER_DIAMETER = 3.0
 """Smallest ratio of window to blob. In a smaller window the blob pulls the mean towards itself."""
 HALF_SCALE_FROM_PX = 8_000_000
 """Images of more pixels start the pyramid at half scale, unless smaller circles are required …"""
-MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0
-"""Smallest default diameter at half scale."""
-MIN_DIAMETER_PX = 4.5
-"""Smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7."""
+MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0  # smallest default diameter at half scale
+MIN_DIAMETER_PX = 4.5  # smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7
 DOUBLE_SCALE_BELOW_PX = 1_500_000
 """Images of fewer pixels start at double scale: the outline of a small ellipse is coarse."""
 REACH_PX = 11
-OUTLINE_LEVEL = 0.45
-"""Outlines run at this fraction of the highest value within reach."""
+OUTLINE_LEVEL = 0.45  # outlines run at this fraction of the highest value within reach
 MIN_LEVEL_DIAMETER_PX = 3.0
 MIN_COARSE_DIAMETER_PX = 24.0
 """Smallest diameter on coarse levels. Smaller ellipses are found on finer levels, where outlines are more accurate."""
 MAX_OUTLINE_DEVIATION = 0.025
 """RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
-MAX_OUTLINE_DEVIATION_PX = 0.45
-"""Additional deviation by pixels and noise."""
+MAX_OUTLINE_DEVIATION_PX = 0.45  # additional deviation by pixels and noise
 MAX_AREA_ERROR = 0.15
 """Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
-MIN_THRESHOLD = 4.0
-"""Smallest threshold, in grey values of the 8-bit image."""
+MIN_THRESHOLD = 4.0  # smallest threshold, in grey values of the 8-bit image
 
 OPTION_RANGES = {
     "min_diameter_px": (1.0, 1e6),
@@ -229,12 +223,9 @@ def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return table[:, :2], shape
 
 
-MAX_POSITION_ERROR = 0.15
-"""Largest distance between a pattern's prediction and a candidate, in radii of the circle."""
-MAX_POSITION_ERROR_PX = 1.5
-"""Lower bound of that distance, px: candidates before centring are good to a few tenths."""
-MAX_AXIS_RATIO = 1.45
-"""Largest ratio between the predicted and the found ellipse along any direction."""
+MAX_POSITION_ERROR = 0.15  # largest distance between a pattern's prediction and a candidate, in radii of the circle
+MAX_POSITION_ERROR_PX = 1.5  # lower bound of that distance, px: candidates before centring are good to a few tenths
+MAX_AXIS_RATIO = 1.45  # largest ratio between the predicted and the found ellipse along any direction
 MIN_HOMOGRAPHY_POINTS = 4
 
 

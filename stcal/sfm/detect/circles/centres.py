@@ -95,10 +95,8 @@ PIXELS_AT_ONCE = 30_000
 SECTORS = 16
 MIN_RIM = 0.8
 """Smallest share of the rim's sectors that follow the model. With less, the circle is partly hidden or cut off."""
-MAX_RIM_RESIDUAL = 0.15
-"""Largest RMS residual of a sector that follows the model, as a fraction of the contrast."""
-UNTRUSTED = 0.2
-"""Largest share of the shift by uneven brightness that the correction leaves, which is added to σ."""
+MAX_RIM_RESIDUAL = 0.15  # largest RMS residual of a sector that follows the model, as a fraction of the contrast
+UNTRUSTED = 0.2  # largest share of the shift by uneven brightness that the correction leaves, which is added to σ
 
 
 def measure_centres(

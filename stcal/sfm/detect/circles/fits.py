@@ -9,8 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
 from stcal.sfm.detect.circles.candidates import Ellipses
 
-BAND_PX = 4.0
-"""Half width of the band of pixels around the rim, at first and at least."""
+BAND_PX = 4.0  # half width of the band of pixels around the rim, at first and at least
 RIM_CLEARANCE_PX = 1.5
 
 
@@ -92,30 +91,21 @@ def near_rim(
     return rows, columns
 
 
-BAND_BLURS = 4.0
-"""Half width of the band of pixels, in units of the blur."""
+BAND_BLURS = 4.0  # half width of the band of pixels, in units of the blur
 START_BLUR_PX = 0.8
 BLUR_LIMITS_PX = (0.25, 12.0)
 STEPS = 12
-RESELECTIONS = 4
-"""Number of first steps in which the band of pixels may be selected again."""
+RESELECTIONS = 4  # number of first steps in which the band of pixels may be selected again
 RESELECT_PX = 0.3
-RESELECT_BAND = 0.15
-"""Change of the centre, and of the width of the band, beyond which the band is selected again."""
+RESELECT_BAND = 0.15  # change of the centre, and of the width of the band, beyond which the band is selected again
 PARAMETERS = 12
 MIN_PIXELS = 30
-CONVERGED_PX = 2e-3
-"""Size of the last step. The next one is at most a tenth of it, which is far below any σ."""
-ROBUST_WIDTH = 5.0
-"""Residuals beyond this many standard deviations lose weight (Geman–McClure)."""
-MAX_SHIFT = 0.35
-"""Largest move of the centre from its candidate, in mean radii (plus one pixel)."""
-MIN_SIGMA = 0.4
-"""Smallest σ of a pixel, in grey values: quantisation noise and a little more."""
-WAVES = (1, 2, 3)
-"""Harmonics around the rim of brightness that the planes do not describe."""
-UNEVEN = 0.004
-"""Amplitude of the third harmonic from which it matters, as a share of the contrast."""
+CONVERGED_PX = 2e-3  # size of the last step. The next one is at most a tenth of it, which is far below any σ.
+ROBUST_WIDTH = 5.0  # residuals beyond this many standard deviations lose weight (Geman–McClure)
+MAX_SHIFT = 0.35  # largest move of the centre from its candidate, in mean radii (plus one pixel)
+MIN_SIGMA = 0.4  # smallest σ of a pixel, in grey values: quantisation noise and a little more
+WAVES = (1, 2, 3)  # harmonics around the rim of brightness that the planes do not describe
+UNEVEN = 0.004  # amplitude of the third harmonic from which it matters, as a share of the contrast
 UNEVEN_CHI2 = 23.0
 """χ² of the third harmonic (two freedoms) from which it is significant: a false alarm in one of 100 000 circles."""
 WAVE_STEPS = 8
