@@ -27,7 +27,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, images_px
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
+from stcal.sfm.detect.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
 from stcal.sfm.detect.face_patterns import MIN_NAMING, FaceFinder, in_common
 from stcal.sfm.planning.advise import expected_noise
 from stcal.sfm.planning.session import Plan, PlanOptions, plan

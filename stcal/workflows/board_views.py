@@ -50,7 +50,7 @@ from stcal.sfm.camera.calibrate import (
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
+from stcal.sfm.detect.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image

@@ -13,7 +13,7 @@ from stcal.drawing.net import _is_clear, net_part
 from stcal.drawing.parts import Disc, Text
 from stcal.drawing.sheets import one_sheet
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import tag_body

@@ -18,7 +18,7 @@ from stcal.drawing.draw import draw
 from stcal.drawing.parts import Area, Disc, parts_of
 from stcal.drawing.sheets import one_sheet
 from stcal.geometry.plane import apply_homography
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
 from stcal.synthetic.designs import second_design

@@ -27,7 +27,7 @@ from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, co
 from stcal.sfm.budget.sources import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.body import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.measure_images import Tracker

@@ -10,8 +10,7 @@ from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, DetectionError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian, singular_values
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern
-from stcal.sfm.detect.sightings import BoardSighting
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, BoardSighting, Candidates, match_pattern
 
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3  # largest distance of a dot from its place predicted by its neighbours, in steps

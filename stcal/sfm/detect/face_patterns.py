@@ -2,6 +2,7 @@
 which is extended to all circles of a face. A face is named only if one reading explains more circles than every other.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -11,8 +12,7 @@ import numpy as np
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian, singular_values
 from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches
-from stcal.sfm.detect.sightings import FaceSighting, OpenFace
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, FaceSighting, OpenFace, grow_matches
 
 MIN_NAMING = 6  # smallest number of circles that can name a face: four determine a homography, two more confirm it
 NEIGHBOURS_IN_DESIGN = 3
@@ -79,15 +79,15 @@ class _Starts:
         """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
         matched = np.flatnonzero(index >= 0)
         keys = zip(matched.tolist(), index[matched].tolist(), strict=True)
-        same = [self.rows[face, *key] for key in keys if (face, *key) in self.rows]
-        count = np.bincount(np.concatenate([*same, np.zeros(0, int)]), minlength=len(self.origin))
+        same = [self.rows.get((face, *key), np.zeros(0, int)) for key in keys]
+        count = np.bincount(np.concatenate([np.zeros(0, int), *same]), minlength=len(self.origin))
         return np.flatnonzero(count >= 2)
 
-    def index(self, rank: int, width: int | None = None) -> np.ndarray:
-        """Returns the candidate of each circle of the hypothesis's face, −1 if there is none; ``width`` : length."""
-        index = np.full(int(self.circles.max(initial=0)) + 1 if width is None else width, -1)
-        matched = self.candidates[rank] >= 0
-        index[self.circles[rank][matched]] = self.candidates[rank][matched]
+    def index(self, ranks: list[int], width: int) -> np.ndarray:
+        """Returns the candidate of each circle of the hypotheses' faces, (ranks, width), −1 if there is none."""
+        index = np.full((len(ranks), width), -1)
+        row, column = np.nonzero(self.candidates[ranks] >= 0)
+        index[row, self.circles[ranks][row, column]] = self.candidates[ranks][row, column]
         return index
 
     def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
@@ -96,7 +96,7 @@ class _Starts:
         left[:rank], left[rank] = False, True
         while len(chosen) < AT_ONCE and left.any():
             chosen.append(int(left.argmax()))
-            index = self.index(chosen[-1])
+            index = self.index(chosen[-1:], int(self.circles.max(initial=0)) + 1)[0]
             left[self.agree(int(self.face[chosen[-1]]), index)] = False
             left[chosen[-1]] = False
         return chosen
@@ -104,31 +104,31 @@ class _Starts:
 
 @lru_cache(maxsize=8)
 def _pairs(target: TargetDesign) -> _Pairs:
-    most = max(len(face.ids) for face in target.faces)
+    faces, most = target.faces, max(len(face.ids) for face in target.faces)
     width = min(SUPPORT + 2, most)
-    xy, radii_of_face = np.zeros((len(target.faces), most, 2)), np.zeros((len(target.faces), most))
-    occurrences: dict[tuple, list] = {}
-    for number, face in enumerate(target.faces):
-        n = len(face.ids)
-        xy[number], xy[number, :n], radii_of_face[number, :n] = face.xy_mm[0], face.xy_mm, face.radius_mm
+    uses_of: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+    for number, face in enumerate(faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
-        for row in np.argsort(distance, axis=1, kind="stable"):
-            nearest = row[:width]
-            offset, radius = face.xy_mm[nearest] - face.xy_mm[nearest[0]], face.radius_mm[nearest]
-            same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
+        for nearest in np.argsort(distance, axis=1, kind="stable")[:, :width]:
+            offset = np.round(face.xy_mm[nearest] - face.xy_mm[nearest[0]], 6)
+            same = (*offset.ravel(), *np.round(face.radius_mm[nearest], 6))
             for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
-                occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, nearest))
-    p = len(occurrences)
-    offsets, radii, exists = np.zeros((p, width, 2)), np.ones((p, width)), np.zeros((p, width), bool)
-    for i, (offset, radius, _) in enumerate(occurrences.values()):
-        offsets[i, : len(radius)], radii[i, : len(radius)], exists[i, : len(radius)] = offset, radius, True
-    uses = [use for _, _, uses in occurrences.values() for use in uses]
-    circles = np.full((len(uses), width), -1)
-    for i, (_, nearest) in enumerate(uses):
-        circles[i, : len(nearest)] = nearest
-    seconds, starts = [second for second, *_ in occurrences], [len(of_pair) for _, _, of_pair in occurrences.values()]
-    of_uses = np.cumsum([0, *starts]), np.array([number for number, _ in uses], int), circles
-    return _Pairs(offsets, radii, exists, np.array(seconds, int), *of_uses, xy, radii_of_face)
+                uses_of.setdefault((second, *same), []).append((number, nearest))
+    firsts = [(faces[number], nearest, width - len(nearest)) for (number, nearest), *_ in uses_of.values()]
+    every = [
+        (number, np.pad(c, (0, width - len(c)), constant_values=-1)) for use in uses_of.values() for number, c in use
+    ]
+    return _Pairs(
+        np.array([np.pad(f.xy_mm[c] - f.xy_mm[c[0]], ((0, more), (0, 0))) for f, c, more in firsts]),
+        np.array([np.pad(f.radius_mm[c], (0, more), constant_values=1.0) for f, c, more in firsts]),
+        np.array([np.arange(width) < len(c) for _, c, _ in firsts]),
+        np.array([second for second, *_ in uses_of], int),
+        np.cumsum([0, *map(len, uses_of.values())]),
+        np.array([number for number, _ in every], int),
+        np.array([circles for _, circles in every]),
+        np.array([np.pad(f.xy_mm, ((0, most - len(f.ids)), (0, 0)), "wrap") for f in faces]),
+        np.array([np.pad(f.radius_mm, (0, most - len(f.ids))) for f in faces]),
+    )
 
 
 class FaceFinder:
@@ -170,7 +170,7 @@ class FaceFinder:
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
         """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
         circles, face = _pairs(self.target), starts.face[ranks]
-        index = np.stack([starts.index(rank, circles.face_radius.shape[1]) for rank in ranks])
+        index = starts.index(ranks, circles.face_radius.shape[1])
         found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
         grown = zip(ranks, *found, size, strict=True)
@@ -272,8 +272,7 @@ def _decide(readings: list[FaceSighting], target: TargetDesign) -> FaceFinding:
         settled |= used
         rivals = [r for r in readings if used & set(r.rows) and len(r.rows) >= len(reading.rows)]
         ambiguous = [r for r in rivals if _read(r) != _read(reading)]
-        face = target.face(reading.face)
-        if ambiguous or not is_named(face, np.isin(np.arange(len(face.ids)), reading.circles), target):
+        if ambiguous or not is_named(target.face(reading.face), reading.circles.tolist(), target):
             refused.append((reading, *ambiguous))
         else:
             named.append(reading)
@@ -300,10 +299,10 @@ def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> in
     return max(map(len, found), default=0)
 
 
-def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
-    """Returns whether the circles found (mask) name the face, as no other reading explains them all."""
-    circles = frozenset(np.flatnonzero(found).tolist())
-    return not any(circles <= rival for rival in confusable(face, target))
+def is_named(face: FaceDesign, circles: Iterable[int], target: TargetDesign) -> bool:
+    """Returns whether the circles found name the face, as no other reading explains them all."""
+    found = frozenset(circles)
+    return not any(found <= rival for rival in confusable(face, target))
 
 
 def likeness_notes(target: TargetDesign) -> list[str]:
@@ -320,23 +319,10 @@ def likeness_notes(target: TargetDesign) -> list[str]:
             f"another, or from itself turned (the least is {face}:{circle} against {rival}, {gap:.1f} mm); where it is "
             "hidden, the face has no name"
         )
-    alike = mirror_images(target)
-    if pairs := {tuple(sorted((face, other))) for face, others in alike.items() for other in others}:
+    alike = mirror_images(target).items()
+    if pairs := {tuple(sorted((face, other))) for face, others in alike for other in others}:
         listed = ", ".join(f"{a} of itself" if a == b else f"{a} and {b}" for a, b in sorted(pairs))
         notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
-    partly = [
-        (len(pairs), face.id, other.id, len(other.ids))
-        for face, other in product(target.faces, target.faces)
-        if other.id not in alike.get(face.id, ())
-        for pairs in mirrored_as(face, other)
-        if len(pairs) >= MIN_NAMING and is_named(other, np.isin(np.arange(len(other.ids)), pairs[:, 1]), target)
-    ]
-    if partly:
-        common, face, other, count = max(partly)
-        notes.append(
-            f"target {target.name}: a reflection of face {face} shows {common} of the {count} circles of "
-            f"{'that face' if face == other else f'face {other}'} itself; where the others are hidden, it passes for it"
-        )
     return notes
 
 
@@ -360,11 +346,7 @@ def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
     """Returns by face the faces that its mirror image looks like, whole and with its radii; others have no entry."""
     found: dict[str, tuple[str, ...]] = {}
     for face, other in product(target.faces, target.faces):
-        if any(len(face.ids) == len(other.ids) == len(pairs) for pairs in mirrored_as(face, other)):
+        pairs = mirrored_circles(face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)
+        if any(len(face.ids) == len(other.ids) == len(own) for own in pairs):
             found[face.id] = (*found.get(face.id, ()), other.id)
     return found
-
-
-def mirrored_as(face: FaceDesign, other: FaceDesign) -> list[np.ndarray]:
-    """Returns the circles of a face's mirror image that pass for circles of another."""
-    return mirrored_circles(face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)

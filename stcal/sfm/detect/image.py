@@ -14,11 +14,18 @@ from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.group_model import Centres
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
-from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
+from stcal.sfm.detect.candidates import (
+    BoardSighting,
+    Candidates,
+    EllipseOptions,
+    Ellipses,
+    FaceSighting,
+    ImageDetection,
+    find_ellipses,
+)
+from stcal.sfm.detect.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.dot_grid import by_rings, find_boards
 from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 NO_CENTRES = Centres.without_rims(*np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))

@@ -42,7 +42,7 @@ from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of, planar_pose
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions, ImageDetection
 from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.detect_files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.face_patterns import MIN_NAMING
@@ -56,7 +56,6 @@ from stcal.sfm.detect.predict import (
     outlying_circles,
     predict_circles,
 )
-from stcal.sfm.detect.sightings import ImageDetection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

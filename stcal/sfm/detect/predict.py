@@ -17,15 +17,14 @@ from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
-from stcal.sfm.detect.circles.candidates import (
+from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
     MAX_POSITION_ERROR_PX,
     MIN_DIAMETER_PX,
     EllipseOptions,
     Ellipses,
 )
-from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.circles.fits import MIN_SIGMA
+from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, measure_centres
 
 MAX_STRETCH = 1.15
 """Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end."""

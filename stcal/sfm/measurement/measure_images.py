@@ -26,7 +26,7 @@ from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target

@@ -12,7 +12,7 @@ from stcal.io.toml import LEAST
 from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.data.as_drawn import faces_in_name
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 
 Compare = Literal["paper"]

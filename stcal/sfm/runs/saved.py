@@ -40,7 +40,7 @@ from stcal.sfm.adjust.joint import Adjusted, adjusted
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.adjust.uncertainty import with_differences
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
-from stcal.sfm.detect.circles.candidates import Ellipses
-from stcal.sfm.detect.circles.centres import measure_centres
+from stcal.sfm.detect.candidates import Ellipses
+from stcal.sfm.detect.centres import measure_centres
 from tests.support import degrade
 
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])

@@ -10,11 +10,17 @@ from scipy.spatial.transform import Rotation
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
+from stcal.sfm.detect.candidates import (
+    BoardSighting,
+    Candidates,
+    EllipseOptions,
+    Ellipses,
+    ImageDetection,
+    find_ellipses,
+)
 from stcal.sfm.detect.dot_grid import by_rings, find_boards
 from stcal.sfm.detect.face_patterns import FaceFinder, confusable, is_named, mirror_images
 from stcal.sfm.detect.image import image_corners
-from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
 from tests.sfm.detect.test_arrangement import centres_of
 from tests.support.circle_images import circle_conic, ellipse_of_conic
@@ -177,10 +183,8 @@ def test_a_mirrored_image_is_told_by_a_face_without_a_mirror_image(face_id):
 
 def test_which_circles_name_a_face():
     face = TARGET.face("2")
-    found = np.ones(10, bool)
-    assert is_named(face, found, TARGET)
-    found[face.ids.index("c")] = False
-    assert not is_named(face, found, TARGET)
+    assert is_named(face, range(10), TARGET)
+    assert not is_named(face, set(range(10)) - {face.ids.index("c")}, TARGET)
     assert all(max(map(len, confusable(face, TARGET))) == 9 for face in TARGET.faces)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import read_image
 from tests.levels import sampled
 from tests.sfm.detect.degraded import KINDS

@@ -9,7 +9,7 @@ from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet
 

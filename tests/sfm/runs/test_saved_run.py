@@ -14,7 +14,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run, uncertainty_budget
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.known_target import read_target
 from stcal.sfm.runs.run_options import RunOptions, unknown_faces
