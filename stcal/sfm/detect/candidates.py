@@ -194,18 +194,13 @@ def _ellipse(
         return None
     if abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1) > MAX_AREA_ERROR:
         return None
-    deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
-    return None if deviation > 1 else (cx, cy, d1, d2, angle)
-
-
-def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
-    """Returns the RMS distance of the outline from the ellipse divided by its limit."""
-    angle = np.radians(angle_deg)
-    c, s = np.cos(angle), np.sin(angle)
-    dx, dy = points[:, 0] - cx, points[:, 1] - cy
-    rho = np.hypot((c * dx + s * dy) * 2 / max(d1, 1e-6), (c * dy - s * dx) * 2 / max(d2, 1e-6))
-    size = np.sqrt(d1 * d2) / 2
-    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size))
+    turn, (x, y) = np.radians(angle), (contour[:, 0, :] - [cx, cy]).T
+    along, across = np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x
+    rho = np.hypot(along * 2 / max(d1 - 1, 1e-6), across * 2 / max(d2 - 1, 1e-6))
+    size = np.sqrt((d1 - 1) * (d2 - 1)) / 2
+    deviation = np.sqrt(np.mean((rho - 1) ** 2)) * size  # RMS distance of the outline from the ellipse
+    within = deviation <= MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size
+    return (cx, cy, d1, d2, angle) if within else None
 
 
 def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -296,7 +291,10 @@ def grow_matches(
     homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
     active = np.arange(len(index))
     for turn in range(rounds):
-        active = active[_spread_out(index[active] >= 0, xy_plane[active])]
+        matched = index[active] >= 0
+        low, high = (np.where(matched[..., None], xy_plane[active], far) for far in (np.inf, -np.inf))
+        spread = (high.max(1) > low.min(1)).all(1)  # not all in one row or column
+        active = active[(matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & spread]
         if not len(active):
             break
         xy, matched = xy_plane[active], index[active] >= 0
@@ -315,13 +313,6 @@ def grow_matches(
         index[active[~settled]] = again[~settled]
         active = active[~settled]
     return index, homography, holds
-
-
-def _spread_out(matched: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Returns whether four circles or more, not all in one row or column, are matched; (k,)."""
-    low = np.where(matched[..., None], xy, np.inf).min(1)
-    high = np.where(matched[..., None], xy, -np.inf).max(1)
-    return (matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & (high > low).all(1)
 
 
 SECOND_BOARD_SHARE = 0.8  # smallest number of dots of a second board, as a share of the dots of the first

@@ -14,11 +14,6 @@ BAND_PX = 4.0  # half width of the band of pixels around the rim, at first and a
 RIM_CLEARANCE_PX = 1.5
 
 
-def boxes(ellipses: Ellipses) -> np.ndarray:
-    """Returns half widths and heights, (n, 2) px, of the boxes that the rims may move in."""
-    return 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX
-
-
 def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns the monomials up to third degree, (10, ...)."""
     found = np.empty((10, *x.shape), x.dtype)
@@ -497,7 +492,7 @@ def measure_centres(
 
 def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> dict[str, np.ndarray]:
     """Fits circles of similar size side by side, as many as a processor's cache holds pixels; as :func:`_rims`."""
-    half = boxes(ellipses)
+    half = 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX  # of the boxes that the rims may move in
     to_ideal = local_ideal_maps(camera, ellipses.centre_px, half)
     masks = intruders(ellipses, neighbours, half)
     size = ellipses.radius_px()

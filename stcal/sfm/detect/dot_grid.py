@@ -37,7 +37,14 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     free = np.ones(len(candidates), bool)
     readings: list[BoardSighting] = []
     for _ in range(MAX_BOARDS):
-        cells = _largest_grid(candidates, links, steps, seeds, free, board)
+        cells: dict[int, tuple[int, int]] = {}  # of the largest grid
+        inside = np.zeros(len(candidates), int)
+        for seed in seeds:
+            # A dot that has been in two grids is not likely to start a better third one.
+            if free[seed] and inside[seed] < 2 and len(cells) < NEARLY_ALL * len(board.cells()):
+                grown = _grow(candidates, links, steps, seed, free, board)
+                inside[list(grown)] += 1
+                cells = max(cells, grown, key=len)
         if len(cells) < MIN_SHARE * len(board.cells()):
             break
         free[list(cells)] = False
@@ -46,22 +53,6 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
             free[reading.rows] = False
             readings.append(reading)
     return sorted(readings, key=lambda r: -len(r.rows))
-
-
-def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
-    """Returns the largest grid grown from any of the seeds; a complete one ends the search."""
-    best: dict[int, tuple[int, int]] = {}
-    inside = np.zeros(len(candidates), int)
-    for seed in seeds:
-        # A dot that has been in two grids is not likely to start a better third one.
-        if not free[seed] or inside[seed] >= 2:
-            continue
-        cells = _grow(candidates, links, steps, seed, free, board)
-        inside[list(cells)] += 1
-        best = max(best, cells, key=len)
-        if len(best) >= NEARLY_ALL * len(board.cells()):
-            break
-    return best
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:

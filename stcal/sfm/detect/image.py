@@ -59,14 +59,14 @@ def read_image(
 ) -> ImageReading:
     """Finds outlines in an 8-bit image, and boards and faces among them; fainter outlines if too few are recognised.
     ``aside``: (k, 2) px, polygon whose outlines are left out."""
-    reading = _read_once(grey, camera, target, board, options, aside)
-    wanted = min(len(target.faces), 1 if board is None else 2)
-    short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
-    if short and not reading.untried:
-        faint = replace(options, min_contrast=FAINT * options.min_contrast)
-        second = _read_once(grey, camera, target, board, faint, aside)
-        return max(reading, second, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
-    return reading
+    readings: list[ImageReading] = []
+    for share in (1.0, FAINT):
+        searched = replace(options, min_contrast=share * options.min_contrast)
+        readings.append(reading := _read_once(grey, camera, target, board, searched, aside))
+        enough = len(reading.face_ids()) >= min(len(target.faces), 1 if board is None else 2)
+        if reading.untried or (enough and (board is None or reading.boards)):
+            break
+    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
 
 
 def _read_once(grey, camera, target, board, options, aside) -> ImageReading:

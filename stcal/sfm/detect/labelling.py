@@ -48,11 +48,12 @@ from stcal.sfm.detect.detect_files import DetectedImage, DetectionResult, look_a
 from stcal.sfm.detect.face_patterns import MIN_NAMING
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import (
+    CONTRADICTED,
+    MISSED,
     PredictedCircles,
     adjusted_planes,
-    contradicted_notes,
     contradictions,
-    missed_notes,
+    notes_by_plane,
     outlying_circles,
     predict_circles,
 )
@@ -119,11 +120,6 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
         if all(views[:likely]):
             readings.append([*chain.from_iterable(views)])
     return [views for views in readings if views]
-
-
-def likely_views(readings: list[Readings]) -> list[Readings]:
-    """Returns the readings without those that require covered circles."""
-    return [[view for view in views if view.likely] for views in readings]
 
 
 MAX_SHIFT_PITCHES = 0.3
@@ -199,21 +195,17 @@ def across_groups(groups: Sequence[Arrangement], reach_mm: float) -> list[Arrang
     faces = [_as_faces(group) for group in groups]
     grown = (_grown(faces, i, view, reach_mm) for i, view in _seeds(faces))
     best = max((Arrangement({}, {}, {}), *grown), key=Arrangement.explained)
-    settled = []
-    for i, group in enumerate(groups):
-        if i in best.views:
-            agreed = {view.plane for view in best.views[i]}
-            others = group.group_from_plane.keys() - agreed - {BOARD}
-            if len(agreed) == 1 < len(groups) and (
-                others or any(why == FOREIGN for _, why in chain(*group.left.values()))
-            ):
-                settled.append(group.without(others | agreed))
-                continue
-            pose = best.camera_from_group[i]
-            known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
+    settled = list(groups)
+    for i, views in best.views.items():
+        group, pose, agreed = groups[i], best.camera_from_group[i], {view.plane for view in views}
+        others = group.group_from_plane.keys() - agreed - {BOARD}
+        foreign = others or any(why == FOREIGN for _, why in chain(*group.left.values()))
+        if len(agreed) == 1 < len(groups) and foreign:
+            settled[i] = group.without(others | agreed)
+        else:
+            known = {plane: pose @ target_from_face for plane, target_from_face in best.group_from_plane.items()}
             group = group.without(others)
-            group = replace(group, group_from_plane=known | group.group_from_plane)
-        settled.append(group)
+            settled[i] = replace(group, group_from_plane=known | group.group_from_plane)
     return settled
 
 
@@ -312,36 +304,29 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
     own, plane, camera = view.camera_from_plane, known[view.plane], camera_from_group
     turned = own.rotation - camera.rotation @ plane.rotation
     moved = own.translation - camera.rotation @ plane.translation - camera.translation
-    square = ((view.xy_mm @ turned[:, :2].T + moved) ** 2).sum(1)
-    square.sort()  # NumPy's median takes longer than all of the above, and this is asked thousands of times
-    n = len(square)
-    return float(np.sqrt(square[(n - 1) // 2]) + np.sqrt(square[n // 2])) / 2
+    return float(np.median(np.linalg.norm(view.xy_mm @ turned[:, :2].T + moved, axis=1)))
 
 
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
     """Poses of unknown planes that images name, each at the place with the largest area: a target in the background is
     smaller. Else that of the plane without a name that most images, two at least, have at one place."""
-    unknown: dict[bool, dict[str, list[tuple[int, PlaneView, Rigid]]]] = {True: {}, False: {}}
+    unknown: dict[tuple[bool, str], list[tuple[int, PlaneView, Rigid]]] = {}
     for i, (pose, agreed) in placed.items():
         for views in images[i]:
             for view in () if any(view is each for view in views for each in agreed) else views:
                 if view.plane not in known:
                     group_from_plane = pose.inverse() @ view.camera_from_plane
-                    unknown[view.named].setdefault(view.plane, []).append((i, view, group_from_plane))
-    new = {}
-    for plane, found in unknown[True].items():
-        support = _together(found, reach_mm) @ np.array([view.area for _, view, _ in found])
-        new[plane] = found[int(np.argmax(support))][2]
-    ranked = []
-    for plane, found in unknown[False].items() if not new else ():
-        by_image = np.array([i for i, _, _ in found])
-        support = [len(np.unique(by_image[row])) for row in _together(found, reach_mm)]
-        k = int(np.argmax(support))
-        ranked.append((support[k], plane, found[k][2]))
-    ranked.sort(key=lambda each: -each[0])
-    if ranked and ranked[0][0] >= 2 and (len(ranked) == 1 or ranked[1][0] < ranked[0][0]):
-        new[ranked[0][1]] = ranked[0][2]
-    return new
+                    unknown.setdefault((view.named, view.plane), []).append((i, view, group_from_plane))
+    named, others = {}, []
+    for (is_named, plane), found in unknown.items():
+        together, image = _together(found, reach_mm), np.array([i for i, _, _ in found])
+        if is_named:
+            named[plane] = found[int(np.argmax(together @ np.array([view.area for _, view, _ in found])))][2]
+        else:
+            support = [len(np.unique(image[row])) for row in together]
+            others.append((max(support), plane, found[int(np.argmax(support))][2]))
+    (most, plane, pose), *rivals = sorted(others, key=lambda each: -each[0]) or [(0, "", Rigid())]
+    return named or ({plane: pose} if most >= 2 and all(rival[0] < most for rival in rivals) else {})
 
 
 def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.ndarray:
@@ -452,7 +437,7 @@ def label_groups(
     step_mm = board.pitch_mm if board is not None else float(np.median(steps)) if len(steps) else 0.0
     alone: list[Arrangement] = []
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
-    likely = [[likely_views(own) for own in group] for group in readings]
+    likely = [[[[v for v in r if v.likely] for r in own] for own in group] for group in readings]
     for group, likely_ones in zip(readings, likely, strict=True):
         found = arrange(likely_ones, step_mm, focal_px)
         if any(why == ELSEWHERE for _, why in chain.from_iterable(found.left.values())):
@@ -562,7 +547,7 @@ def label_images(
                 predict_circles(pose, planes, seen.labels, sought, camera, tilt) for tilt in (MAX_TILT_RAD, STEEP_RAD)
             )
             wrong = contradictions(steep, seen, camera)
-            group[i] = group[i].without(wrong, contradicted_notes(wrong))
+            group[i] = group[i].without(wrong, notes_by_plane(wrong, CONTRADICTED))
             if predicted.wanted.any():
                 jobs.append((files[seen.name], predicted))
         first_looks.append((group, arrangement))
@@ -571,7 +556,7 @@ def label_images(
     for group, arrangement in first_looks:
         for i, image in enumerate(group):
             if look := looks.get(image.observations.name):
-                group[i] = image.plus(look.labels, look.centres, missed_notes(look.missed))
+                group[i] = image.plus(look.labels, look.centres, notes_by_plane(look.missed, MISSED))
         labelled += _without_outlying(group, arrangement, patterns, focal_px)[0]
     sharp = without_defocus(labelled, camera, patterns)
     return [_with_corners(image, files[image.observations.name].detection, target) for image in sharp]
@@ -611,7 +596,7 @@ def _without_outlying(
     seen = [group[i].observations for i in cameras]
     *poses, outlying = outlying_circles(Poses.of(cameras.values()), planes, seen, patterns, focal_px)
     for i, reasons in zip(cameras, outlying, strict=True):
-        images[i] = group[i].without(reasons, contradicted_notes(reasons))
+        images[i] = group[i].without(reasons, notes_by_plane(reasons, CONTRADICTED))
     return images, arrangement.moved(*poses)
 
 
@@ -739,8 +724,9 @@ def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardD
     """Returns the labelled dots of all images, in the order of their groups."""
     labelled = []
     for images in _groups(detection):
-        boards = [likely_views([r for r in readings_of(d, target, board) if r[0].plane == BOARD]) for _, _, d in images]
-        numbered = _numbered([max(each, key=lambda v: len(v[0].rows), default=[]) for each in boards])
+        every = [[r for r in readings_of(d, target, board) if r[0].plane == BOARD] for _, _, d in images]
+        largest = (max(boards, key=lambda views: len(views[0].rows), default=[]) for boards in every)
+        numbered = _numbered([[view for view in views if view.likely] for views in largest])
         for (name, group, found), choice in zip(images, numbered, strict=True):
             why = "a board without a pose; left out, show the whole board, or a face with it" if found.board else ""
             note = choice if isinstance(choice, str) and choice else why

@@ -183,23 +183,17 @@ def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray,
     return contrast, MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
 
 
-def missed_notes(missed: dict[Label, str]) -> list[str]:
-    """Returns notes on circles that were expected in view and not measured."""
-    return _by_plane(missed, "should be in view and not measured")
+MISSED = "should be in view and not measured"
+CONTRADICTED = "left out, partly hidden or something else"
 
 
-def contradicted_notes(found: dict[Label, str]) -> list[str]:
-    """Returns notes on circles that contradict the others."""
-    return _by_plane(found, "left out, partly hidden or something else")
-
-
-def _by_plane(reasons: dict[Label, str], what: str) -> list[str]:
-    """Returns one note for each face, and one for the board, on circles with the reason of the first one."""
+def notes_by_plane(reasons: Mapping[Label, str], what: str) -> list[str]:
+    """Returns one note for each face, and one for the board, on circles with the reason of the first one; ``what`` :
+    :data:`MISSED` or :data:`CONTRADICTED`."""
     notes = []
     for plane in dict.fromkeys(label.plane for label in reasons):
-        place = "board" if plane == BOARD else f"face {plane}"
         first, *more = [label for label in reasons if label.plane == plane]
-        others = f" and {len(more)} more" if more else ""
+        place, others = "board" if plane == BOARD else f"face {plane}", f" and {len(more)} more" if more else ""
         notes.append(f"{place}: {first}{others} {what}; {first}: {reasons[first]}")
     return notes
 

@@ -141,16 +141,26 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
 
 
 def place_body(corners: Corners, camera: Camera) -> Body:
-    """Returns start values of all poses for a given camera."""
-    views = _Views.of(corners, camera)
+    """Returns start values of all poses for a given camera, linked by what most images agree on."""
+    views, count = _Views.of(corners, camera), len(corners.faces)
     edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
-            f"target: {len(corners.faces)} faces of known shape, but no image shows two of them; add images that show "
-            "neighbouring faces with at least four corners each",
+            f"target: {count} faces of known shape, but no image shows two of them; add images that show neighbouring "
+            "faces with at least four corners each",
         )
-    body_from_face, placed_faces = _tree(views, edges, len(corners.faces))
+    seen = np.bincount(views.face, minlength=count)
+    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
+    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
+        a, b = max(open_edges, key=lambda edge: edges[edge][1])
+        a_from_b = edges[a, b][0]
+        if a in poses:
+            poses[b] = poses[a] @ a_from_b
+        else:
+            poses[a] = poses[b] @ a_from_b.inverse()
+    placed_faces = np.isin(np.arange(count), list(poses))
+    body_from_face = Poses.of(poses.get(face, Rigid()) for face in range(count))
     camera_from_body, placed_images = _images(views, corners, body_from_face, placed_faces, camera)
     return Body(body_from_face, camera_from_body, camera, placed_faces, placed_images)
 
@@ -228,33 +238,24 @@ class _Relative:
     b_place: np.ndarray  # (4p, 3)
     of_pair: np.ndarray  # (4p,)
     excess: np.ndarray  # (4p,) cost over that of the best pose of the image
+    turned_alike: np.ndarray  # (4p, 4p) whether two have the same rotation
 
     @classmethod
     def of(cls, pairs: list[tuple[int, int]], views: _Views) -> "_Relative":
         """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
         pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
-        both = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)])
-        a, b = both.T
-        back = np.swapaxes(views.poses.rotation[a], 1, 2)
+        a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
+        back, place = np.swapaxes(views.poses.rotation[a], 1, 2), views.poses.translation[..., None]
+        rotation = back @ views.poses.rotation[b]
         cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
-        return cls(
-            back @ views.poses.rotation[b],
-            (back @ views.poses.translation[a, :, None])[..., 0],
-            (back @ views.poses.translation[b, :, None])[..., 0],
-            np.repeat(np.arange(len(pairs)), 4),
-            (cost - cost.min(1, keepdims=True)).ravel(),
-        )
-
-    def turned_alike(self) -> np.ndarray:
-        """Returns whether two poses have the same rotation, (4p, 4p)."""
-        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2, -1, 1))
-        return turned < SAME_TURN_RAD
+        excess = (cost - cost.min(1, keepdims=True)).ravel()
+        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
+        places = ((back @ place[k])[..., 0] for k in (a, b))
+        return cls(rotation, *places, np.repeat(np.arange(len(pairs)), 4), excess, turned < SAME_TURN_RAD)
 
     def best(self, agrees: np.ndarray) -> tuple[int, int]:
         """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
-        votes = np.zeros(len(self.rotation))
-        for p in range(len(self.rotation) // 4):
-            votes += agrees[:, self.of_pair == p].any(1)
+        votes = agrees.reshape(len(agrees), -1, 4).any(2).sum(1)
         # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
         best = int(np.lexsort((self.excess, -votes))[0])
         return best, int(votes[best])
@@ -265,7 +266,7 @@ def _edge(pairs: list[tuple[int, int]], views: _Views) -> tuple[Rigid, int]:
     poses = _Relative.of(pairs, views)
     translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
-    agrees = poses.turned_alike() & (apart < SAME_PLACE)
+    agrees = poses.turned_alike & (apart < SAME_PLACE)
     best, votes = poses.best(agrees)
     near = np.flatnonzero(agrees[best])
     mean = Rotation.from_matrix(poses.rotation[near]).mean().as_matrix()
@@ -282,8 +283,7 @@ def wrong_sizes(corners: Corners, camera: Camera) -> tuple[dict[int, float], int
         if len(pairs) < LEAST_PAIRS:
             continue
         poses = _Relative.of(pairs, views)
-        agrees = poses.turned_alike()
-        near = np.flatnonzero(agrees[poses.best(agrees)[0]])
+        near = np.flatnonzero(poses.turned_alike[poses.best(poses.turned_alike)[0]])
         near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
         if len(near) < LEAST_PAIRS:
             continue
@@ -325,21 +325,6 @@ def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, f
         far = np.flatnonzero(np.abs(away_of) > np.maximum(MOST_OFF, sure))
         off |= {int(own[k]): float(np.exp(away_of[k])) for k in far}
     return off
-
-
-def _tree(views: _Views, edges: dict[tuple[int, int], tuple[Rigid, int]], faces: int) -> tuple[Poses, np.ndarray]:
-    """Returns body_from_face along the edges that most images agree on, and a mask of the linked faces."""
-    seen = np.bincount(views.face, minlength=faces)
-    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
-    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
-        a, b = max(open_edges, key=lambda edge: edges[edge][1])
-        a_from_b = edges[a, b][0]
-        if a in poses:
-            poses[b] = poses[a] @ a_from_b
-        else:
-            poses[a] = poses[b] @ a_from_b.inverse()
-    placed = np.array([face in poses for face in range(faces)])
-    return Poses.of(poses.get(face, Rigid()) for face in range(faces)), placed
 
 
 def _images(
@@ -452,8 +437,8 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
         return []
     usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
     _, corner = np.unique(np.column_stack([used.face, used.corner]), axis=0, return_inverse=True)
-    for k in range(corner.max() + 1):
-        usual[corner == k] = np.maximum(usual[corner == k], robust_sigma(length[corner == k], 2))
+    for own in (corner == k for k in range(corner.max() + 1)):
+        usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
     limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
     return [
         Outlier(
@@ -494,19 +479,17 @@ def plain_lens(camera: Camera) -> Camera:
     """Returns a camera of this focal length with a tenth of the σ of :func:`unknown_lens` about no distortion and a
     principal point in the middle: for images that do not tell these."""
     middle = np.array([camera.width - 1, camera.height - 1]) / 2
-    lens = unknown_lens(replace(camera, centre=middle, distortion=np.zeros_like(camera.distortion)))
-    assert lens.covariance is not None
-    share = np.where(np.arange(len(lens.covariance)) < 2, 1.0, 0.1)
-    return replace(lens, covariance=lens.covariance * np.outer(share, share))
+    return unknown_lens(replace(camera, centre=middle, distortion=np.zeros_like(camera.distortion)), 0.1)
 
 
-def unknown_lens(camera: Camera) -> Camera:
-    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values."""
-    side = max(camera.width, camera.height)
-    reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
+def unknown_lens(camera: Camera, share: float = 1.0) -> Camera:
+    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values; ``share`` : factor on
+    the σ of distortion and principal point."""
+    side, focal = max(camera.width, camera.height), float(camera.focal.mean())
+    reach = float(np.hypot(camera.width, camera.height) / 2 / focal)
     radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach
-    sigma = np.concatenate([[1.0, 1.0], [SIGMA_CENTRE * side] * 2, radial, [tangential] * 2])
-    covariance, focal = np.diag(sigma**2), float(camera.focal.mean())
+    sigma = share * np.array([0.0, 0.0, *[SIGMA_CENTRE * side] * 2, *radial, *[tangential] * 2])
+    covariance = np.diag(sigma**2)
     covariance[:2, :2] = focal**2 * (SIGMA_FOCAL**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 / 2 * np.eye(2))
     return Camera.of(camera, LENS, covariance)
 

@@ -4,6 +4,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -109,18 +110,20 @@ def map_group(
 ) -> Mapping:
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
-    names, pair, reconstruction = [image.name for image in group if image.name in skeleton], pairs[0], None
+    names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
     first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
+    own = partial(_own_mapping, database, names, ids, pair)
+    ways = {
+        "our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own,
+        "COLMAP's estimate of the chosen pair": lambda: seeded_mapping(
+            database, scratch, names, (ids[first.name], ids[second.name])
+        ),
+        "our relative pose of the chosen pair (COLMAP's gates refused its own)": own,
+    }
     try:
-        if share_board_alone(first, second):
-            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
-            reconstruction = _own_mapping(database, names, ids, pair)
-        if reconstruction is None:
-            seeded = "COLMAP's estimate of the chosen pair"
-            reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
-        if reconstruction is None:
-            seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
-            reconstruction = _own_mapping(database, names, ids, pair)
+        tried = [*ways.items()][not share_board_alone(first, second) :]
+        found = ((seeded, model) for seeded, way in tried if (model := way()) is not None)
+        seeded, reconstruction = next(found, ("", None))
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise

@@ -156,17 +156,9 @@ def read_model(
         if not image.has_pose:
             continue
         if image.name not in index_of_name:
-            is_cut = any(" " in name and name.split()[0] == image.name for name in index_of_name)
-            remedy = (
-                "COLMAP reads names in texts up to a space: write the model as binary"
-                if is_cut
-                else "give the run that the model's database came from"
-            )
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
-                f"{observations[-1].name}); {remedy}",
-            )
+            listed = f"{observations[0].name} … {observations[-1].name}"
+            cut = "; names with spaces need a binary model" if any(" " in name for name in index_of_name) else ""
+            raise _of_another_run(path, f"image {image.name} is not of this run ({listed}{cut})")
         i = index_of_name[image.name]
         tolerance_px = CORRECTION_TOLERANCE_PX if corrected_again else KEYPOINT_TOLERANCE_PX
         xy = require_keypoints(path, image, observations[i].labels, corrected_px[i], tolerance_px)
@@ -259,6 +251,11 @@ def _require_whole(file: Path) -> None:
         raise ValueError(f"{file.name}: {len(data)} bytes, {at} by its own counts")
 
 
+def _of_another_run(path: Path, fault: str) -> InputError:
+    remedy = "give the run that the model's database came from"
+    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; {remedy}")
+
+
 def require_keypoints(
     path: Path,
     image: pycolmap.Image,
@@ -269,19 +266,12 @@ def require_keypoints(
     """Returns the model's keypoints (k, 2), which must be the run's: only then do they determine labels."""
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN",
-            f"model {path}: image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}; "
-            "give the run that the model's database came from",
-        )
+        raise _of_another_run(path, f"image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}")
     off = np.abs(xy - corrected_px).max(axis=1, initial=0.0)
     if not (off <= tolerance_px).all():
         k = int(np.argmax(off))
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN",
-            f"model {path}: image {image.name}: keypoint {k} ({labels[k]}) is {off[k]:.4f} px off the run's, "
-            f"{tolerance_px:g} allowed; give the run that the model's database came from",
-        )
+        off_by = f"{off[k]:.4f} px off the run's, {tolerance_px:g} allowed"
+        raise _of_another_run(path, f"image {image.name}: keypoint {k} ({labels[k]}) is {off_by}")
     return xy
 
 

@@ -32,13 +32,14 @@ from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, siz
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
 from stcal.sfm.detect.predict import (
+    CONTRADICTED,
+    MISSED,
     PredictedCircles,
     common_shift,
-    contradicted_notes,
     contradictions,
     measure_near,
     measure_predicted,
-    missed_notes,
+    notes_by_plane,
     predict_circles,
 )
 from stcal.sfm.measurement.known_target import TargetCircles, read_target
@@ -214,12 +215,12 @@ class Tracker:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
         wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
-        seen = seen.without(wrong, contradicted_notes(wrong))
+        seen = seen.without(wrong, notes_by_plane(wrong, CONTRADICTED))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
         measured = measure_predicted(image, camera, predicted, self.ellipses)
-        missed = missed_notes(measured.missed)
+        missed = notes_by_plane(measured.missed, MISSED)
         if not measured.labels:
             return replace(seen, notes=(*seen.notes, *missed))
         return seen.plus(measured.labels, measured.centres, missed)
