@@ -175,24 +175,20 @@ def by_rings(
 ) -> BoardSighting:
     """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates.
     DetectionError: it shows as many holes as are stated, at other places by any numbering."""
-    angle = np.arange(0, 2 * np.pi, np.pi / 8)
-    around = np.column_stack([np.cos(angle), np.sin(angle)])
-    cells = board.cells()
+    angle, size = np.arange(0, 2 * np.pi, np.pi / 8), np.array(grey.shape[::-1])
+    around, cells = np.column_stack([np.cos(angle), np.sin(angle)]), board.cells()
     rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
     middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
+    circles_mm = np.stack([middles + share * board.radius_mm * around for share in RING_SHARES])
     wrong: list[int] = []
     seen: list[np.ndarray] = []
     for numbering in reading.numberings:
         xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
-        homography = fit_homography(xy_mm, xy[reading.rows])
-        values = []
-        for share in RING_SHARES:
-            rim = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
-            px = camera.project(np.column_stack([rim, np.ones(len(rim))]))
-            sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
-            values.append(sampled.reshape(len(cells), -1).mean(1))
-        inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
-        middle, body, outside = values
+        points = apply_homography(fit_homography(xy_mm, xy[reading.rows]), circles_mm.reshape(-1, 2))
+        px = camera.project(np.pad(points, ((0, 0), (0, 1)), constant_values=1))
+        sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
+        middle, body, outside = sampled.reshape(circles_mm.shape[:3]).mean(2)
+        inside = ((px > 0) & (px < size - 1)).reshape(circles_mm.shape)[-1].all((1, 2))
         holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
         wrong.append(int((holes != rings)[inside].sum()))
         seen.append(holes & inside)

@@ -112,11 +112,12 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
         faces = [(each, target.face(each.face)) for each in sightings]
         views = [view(f.id, each.labels(f), f.xy_mm[each.circles], each.rows, named=named) for each, f in faces]
         readings.append([*chain.from_iterable(views)])
-    for each in () if board is None or BOARD in detection.repeated else detection.boards:
+    boards = () if board is None or BOARD in detection.repeated else detection.boards
+    for each, places_mm in ((each, board.places_mm) for each in boards if board is not None):
         likely, views = len(each.numberings), []
         for k, cells in enumerate((*each.numberings, *each.unlikely)):
             labels = [DotLabel(*cell) for cell in cells.tolist()]
-            views.append(view(BOARD, labels, board.places_mm(labels)[:, :2], each.rows, likely=k < likely))
+            views.append(view(BOARD, labels, places_mm(labels)[:, :2], each.rows, likely=k < likely))
         if all(views[:likely]):
             readings.append([*chain.from_iterable(views)])
     return [views for views in readings if views]

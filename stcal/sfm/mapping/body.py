@@ -250,8 +250,9 @@ class _Relative:
         cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
         excess = (cost - cost.min(1, keepdims=True)).ravel()
         turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
-        places = ((back @ place[k])[..., 0] for k in (a, b))
-        return cls(rotation, *places, np.repeat(np.arange(len(pairs)), 4), excess, turned < SAME_TURN_RAD)
+        a_place, b_place = ((back @ place[k])[..., 0] for k in (a, b))
+        of_pair = np.repeat(np.arange(len(pairs)), 4)
+        return cls(rotation, a_place, b_place, of_pair, excess, turned < SAME_TURN_RAD)
 
     def best(self, agrees: np.ndarray) -> tuple[int, int]:
         """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""

@@ -121,10 +121,8 @@ class ReadModel:
 def find_models(folder: str | Path) -> list[Path]:
     """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …)."""
     folder = Path(folder)
-    models = []
-    if folder.is_dir():
-        candidates = sorted([folder, *folder.glob("*"), *folder.glob("*/*")])
-        models = [p for p in candidates if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
+    places = sorted([folder, *folder.glob("*"), *folder.glob("*/*")]) if folder.is_dir() else []
+    models = [p for p in places if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
     if not models:
         raise InputError(
             "E-MODEL-UNREADABLE",
@@ -238,17 +236,18 @@ def _end_of(kind: str, data: bytes, at: int) -> int:
 
 def _require_whole(file: Path) -> None:
     """Checks the counts in a file: pycolmap reads past its end, for hours and until memory is full."""
-    data, at = read_bytes(file, MODEL_BYTES), 8
+    data, at, fault = read_bytes(file, MODEL_BYTES), 8, "ends too soon"
     try:
         for _ in range(struct.unpack_from("<Q", data)[0]):
-            at = _end_of(file.stem, data, at)
-            if at > len(data):
-                raise ValueError("ends too soon")
-    except (ValueError, struct.error) as error:
-        reason = "ends too soon" if isinstance(error, struct.error) else error
-        raise ValueError(f"{file.name}, {len(data)} bytes: {reason}") from error
-    if at != len(data):
-        raise ValueError(f"{file.name}: {len(data)} bytes, {at} by its own counts")
+            if (at := _end_of(file.stem, data, at)) > len(data):
+                break
+        fault = fault if at > len(data) else "" if at == len(data) else f"{at} by its own counts"
+    except struct.error:
+        pass
+    except ValueError as error:
+        fault = str(error)
+    if fault:
+        raise ValueError(f"{file.name}, {len(data)} bytes: {fault}")
 
 
 def _of_another_run(path: Path, fault: str) -> InputError:
@@ -306,16 +305,14 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
 
 def _labelled_points(reconstruction: pycolmap.Reconstruction, observations: dict[str, ImageObservations]) -> set[int]:
     """Returns the ids of the points all of whose keypoints have one label; dots of two groups are different ones."""
-    labelled = set()
-    for point_id, point in reconstruction.points3D.items():
-        names = set()
-        for element in point.track.elements:
-            image = observations[reconstruction.image(element.image_id).name]
-            label = image.labels[element.point2D_idx]
-            names.add((image.group if isinstance(label, DotLabel) else "", label))
-        if len(names) == 1:
-            labelled.add(point_id)
-    return labelled
+
+    def label_of(element: pycolmap.TrackElement) -> tuple[str, Label]:
+        image = observations[reconstruction.image(element.image_id).name]
+        label = image.labels[element.point2D_idx]
+        return image.group if isinstance(label, DotLabel) else "", label
+
+    tracks = {i: point.track.elements for i, point in reconstruction.points3D.items()}
+    return {i for i, elements in tracks.items() if len({label_of(element) for element in elements}) == 1}
 
 
 def points_by_votes(

@@ -278,15 +278,13 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
     """Returns pairs of the group's other images with skeleton images: the nearest, and those their circles need."""
-    pairs = set()
-    skeleton = indices[chosen]
+    pairs, skeleton = set(), indices[chosen]
     for k in np.setdiff1d(np.arange(len(indices)), chosen):
         i = indices[k]
         near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
         order = skeleton[np.argsort(-near, kind="stable")]
         order = order[shared[i, order] >= MIN_SHARED]
-        picked = list(order[:NEIGHBOURS])
-        candidates = list(order[NEIGHBOURS:])
+        picked, candidates = list(order[:NEIGHBOURS]), list(order[NEIGHBOURS:])
         open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
         while open_labels.any():
             best = max(candidates, key=lambda j: int((seen[j] & open_labels).sum()))
