@@ -88,10 +88,7 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
     """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
     threshold = contrast_threshold(image, options)
     found = [_rows(*level, polarity, threshold, options) for level in _levels(image, options)]
-    centre, shape = distinct(np.concatenate(found))
-    contrast = contrast_of(image, polarity, centre, shape)
-    keep = contrast > threshold
-    return Ellipses(centre[keep], shape[keep], contrast[keep])
+    return distinct(image, polarity, np.concatenate(found), threshold)
 
 
 def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> float:
@@ -125,18 +122,16 @@ def _levels(image: np.ndarray, options: EllipseOptions) -> Iterator[tuple[np.nda
         image = shrunk(image, 0.5)
 
 
-def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
+def _contrast(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Returns the median grey value in the middle minus that around, (n,); with opposite sign for dark circles."""
-    angle = np.arange(16) * (np.pi / 8)
-    unit = np.column_stack([np.cos(angle), np.sin(angle)])
-
-    def sample(factor: float, margin_px: float) -> np.ndarray:
-        wide = factor * shape + margin_px * np.eye(2)
-        at = np.round(centre[:, None] + np.einsum("nij,kj->nki", wide, unit)).astype(int)
+    angle, inner, outer = np.arange(16) * (np.pi / 8), 0.4 * shape, 1.25 * shape + 2.0 * np.eye(2)
+    median = []
+    for wide in (inner, outer):
+        rim = np.einsum("nij,kj->nki", wide, np.column_stack([np.cos(angle), np.sin(angle)]))
+        at = np.round(centre[:, None] + rim).astype(int)
         x, y = (np.clip(at[..., k], 0, image.shape[1 - k] - 1) for k in range(2))
-        return np.median(image[y, x], axis=1) if len(at) else np.zeros(0)
-
-    return (sample(0.4, 0.0) - sample(1.25, 2.0)) * (1 if polarity == "bright" else -1)
+        median.append(np.median(image[y, x], axis=1) if len(at) else np.zeros(0))
+    return (median[0] - median[1]) * (1 if polarity == "bright" else -1)
 
 
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
@@ -203,21 +198,21 @@ def _ellipse(
     return (cx, cy, d1, d2, angle) if within else None
 
 
-def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
-    if not len(table):
-        return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
-    pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-    smaller, larger = np.sort(radius[pairs], axis=1).T
-    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
-    keep = np.ones(len(table), bool)
-    keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
-    table = table[keep]
+def distinct(image: np.ndarray, polarity: Polarity, table: np.ndarray, threshold: float) -> Ellipses:
+    """Returns the ellipses of rows (x, y, full axes 1 and 2, angle of axis 1 in deg) of enough contrast. Of coincident
+    rows the first, from the finest level, is kept."""
+    if len(table):
+        centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
+        pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
+        smaller, larger = np.sort(radius[pairs], axis=1).T
+        near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+        table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
     angle = np.radians(table[:, 4])
     axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
     shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
-    return table[:, :2], shape
+    contrast = _contrast(image, polarity, table[:, :2], shape)
+    keep = contrast > threshold
+    return Ellipses(table[keep, :2], shape[keep], contrast[keep])
 
 
 MAX_POSITION_ERROR = 0.15  # largest distance between a pattern's prediction and a candidate, in radii of the circle

@@ -26,7 +26,6 @@ from stcal.sfm.detect.candidates import (
     Ellipses,
     FaceSighting,
     ImageDetection,
-    contrast_of,
     contrast_threshold,
     diameter_limits_px,
     distinct,
@@ -165,10 +164,7 @@ def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptio
         (x, y), (d1, d2), angle_deg = cv2.fitEllipse(contour)
         if np.isfinite([x, y, d1, d2]).all() and min(d1, d2) >= options.min_axis_ratio * max(d1, d2) > 0:
             rows.append((x, y, d1 + 1, d2 + 1, angle_deg))  # a contour runs through the outermost pixels' centres
-    centre, shape = distinct(np.array(rows).reshape(-1, 5))
-    contrast = contrast_of(grey, polarity, centre, shape)
-    keep = contrast > contrast_threshold(grey, options)
-    return Ellipses(centre[keep], shape[keep], contrast[keep])
+    return distinct(grey, polarity, np.array(rows).reshape(-1, 5), contrast_threshold(grey, options))
 
 
 class _Rules:
