@@ -1,6 +1,7 @@
 """Labels of all circles: what a pattern may be is decided by its image, its group, and all groups.
 
-One score decides throughout: the number of circles that a rigid arrangement of faces and board explains.
+The score is the number of circles that a rigid arrangement of faces and board explains. Within one image the number of
+planes goes before it, as a board has more dots than all faces.
 
 1. An image offers readings, a pose each: of a face that it names one, of a pattern that fits several faces one each, of
    a board one for each numbering. A pattern in view twice has none: one of the two may be a reflection.
@@ -258,7 +259,8 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
 
 
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
-    """Pose of an image with the most planes, then faces, and the readings that agree; None if several fit."""
+    """Returns the pose of an image with the most planes, then faces, then circles, and the readings that agree with it;
+    None if several fit."""
     best, best_score, rivals = None, (0, 0, 0), 0
     for views in readings:
         others = [v for v in readings if v is not views]
