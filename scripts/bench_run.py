@@ -36,7 +36,7 @@ from stcal.robot.kinematics.robot_model import Robot, Tree
 from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.sfm import MeasureOptions, Tracker, measure, read_target
 from stcal.sfm.adjust.faces_file import TargetCircles
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -85,7 +85,7 @@ def state():
 def work(fails=False):
     with kept_processes(2):
         dict(run_parallel(pow, [(2, 3)] * 4))
-        import stcal.sfm.mapping.colmap
+        import stcal.sfm.mapping.database
         if fails:
             raise ValueError
 def in_threads():

@@ -39,7 +39,7 @@ from stcal.sfm.adjust.refine import Refined
 from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files
 from stcal.sfm.detect.labelling import label_images
 from stcal.sfm.planning.forecast import observe, true_models

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stcal.design import BoardDesign
     from stcal.geometry.rigid import Order
     from stcal.io.table import Table
-    from stcal.sfm.detect.circles.candidates import EllipseOptions
+    from stcal.sfm.detect.candidates import EllipseOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,7 @@ def load_ahead(workers: int | None) -> None:
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
     """Returns the detection options for circles of these sizes."""
-    from stcal.sfm.detect.circles.candidates import EllipseOptions
+    from stcal.sfm.detect.candidates import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(
@@ -386,7 +386,7 @@ def designs_told(
     the context name the designs."""
     from stcal.boards.target_file import target_of
     from stcal.design import reference_board, reference_target
-    from stcal.sfm.detect.sightings import likeness_notes
+    from stcal.sfm.detect.face_patterns import likeness_notes
 
     assumed = []
     if target is not None:

@@ -26,9 +26,8 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, images_px
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
-from stcal.sfm.detect.face_patterns import FaceFinder
-from stcal.sfm.detect.sightings import MIN_NAMING, in_common
+from stcal.sfm.detect.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
+from stcal.sfm.detect.face_patterns import MIN_NAMING, FaceFinder, in_common
 from stcal.sfm.planning.advise import expected_noise
 from stcal.sfm.planning.session import Plan, PlanOptions, plan
 from stcal.synthetic.designs import Body, face_of_drawing, tag_body
@@ -201,9 +200,9 @@ def unnamed_cases(
     for done, (face, hidden_rows) in enumerate(cases, 1):
         visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
         readings = finder.find(Candidates.of(ellipses[face.id].select(visible), camera)).faces
-        right = [reading for reading in readings if reading.face is face and len(readings) == 1]
-        named = {(i, int(row)) for r in right for i, row in enumerate(r.index) if row >= 0}
-        if named != {(int(circle), row) for row, circle in enumerate(visible)}:
+        right = [reading for reading in readings if reading.face == face.id and len(readings) == 1]
+        named = {pair for r in right for pair in zip(r.circles.tolist(), r.rows.tolist(), strict=True)}
+        if named != {(circle, row) for row, circle in enumerate(visible.tolist())}:
             failed.append((face.id, tuple(face.ids[i] for i in hidden_rows)))
         if progress is not None and (done % 20 == 0 or done == len(cases)):
             progress(done, len(cases))

@@ -28,7 +28,7 @@ from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
 from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
-from stcal.sfm.mapping.placed import plain_lens
+from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
 from stcal.sfm.runs.comparisons import Answer, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run

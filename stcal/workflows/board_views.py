@@ -38,7 +38,7 @@ from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import CameraCalibration, Found, calibrated
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
+from stcal.sfm.detect.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image

@@ -11,7 +11,7 @@ from stcal.design import TargetDesign, reference_target
 from stcal.drawing.draw import draw, net_text, one_sheet
 from stcal.drawing.parts import Disc, Text, _is_clear, net_part
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import tag_body

@@ -17,7 +17,7 @@ from stcal.design import BoardDesign, TargetDesign, reference_target
 from stcal.drawing.draw import draw, one_sheet
 from stcal.drawing.parts import Disc, Outline, parts_of
 from stcal.geometry.plane import apply_homography
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
 from stcal.synthetic.designs import second_design

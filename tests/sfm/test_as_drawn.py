@@ -12,8 +12,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
-from stcal.sfm.mapping.body import Corners, wrong_sizes
-from stcal.sfm.mapping.placed import place_with_camera
+from stcal.sfm.mapping.body import Corners, place_with_camera, wrong_sizes
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.run_options import RunOptions

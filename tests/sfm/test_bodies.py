@@ -26,9 +26,9 @@ from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, co
 from stcal.sfm.budget.combine import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
+from stcal.sfm.mapping.body import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.planning.session import PlanOptions, plan, plan_text, planned_photographs
 from stcal.sfm.report.compare import compare

@@ -11,7 +11,7 @@ import pytest
 from stcal.design import BoardDesign, reference_target
 from stcal.geometry.camera import Camera
 from stcal.sfm import RunOptions, run
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.interop.crosscheck import crosscheck
 from stcal.sfm.report.compare import compare

@@ -63,7 +63,7 @@ def test_a_signal_after_the_answer_changes_no_exit_code(number):
 def test_colmaps_bindings_leave_the_signals_as_they_were():
     begin = (
         "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(7));"
-        "import stcal.sfm.mapping.colmap; print('on', flush=True); signal.pause()"
+        "import stcal.sfm.mapping.database; print('on', flush=True); signal.pause()"
     )
     process = subprocess.Popen([sys.executable, "-P", "-c", begin], stdout=-1, stderr=-1, text=True)
     assert process.stdout.readline() == "on\n"

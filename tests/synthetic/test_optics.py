@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.optics import ThinLens, blur_evenly

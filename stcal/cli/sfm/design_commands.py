@@ -274,7 +274,7 @@ def draw(
     from stcal.design import TargetDesign
     from stcal.drawing.draw import draw as drawn
     from stcal.drawing.draw import drawn_text, load_design
-    from stcal.sfm.detect.sightings import likeness_notes
+    from stcal.sfm.detect.face_patterns import likeness_notes
 
     if isinstance(target := load_design(design), TargetDesign):
         print_each("note", likeness_notes(target))
@@ -310,7 +310,7 @@ def design(
     dodecahedron of tags. Forecast its σ."""
     from stcal.drawing.draw import net_text
     from stcal.io.cameras.read import read_camera
-    from stcal.sfm.detect.sightings import likeness_notes
+    from stcal.sfm.detect.face_patterns import likeness_notes
     from stcal.sfm.make import DesignOptions, design_tag_body, design_target, faces_of, made_text, size_of
     from stcal.sfm.planning.session import PlanOptions, plan_text
     from stcal.synthetic.designs import made_text as body_text

@@ -36,7 +36,7 @@ from stcal.sfm.camera.intrinsics import (
 )
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import DetectionResult, detect_files
 

@@ -324,8 +324,8 @@ NOT_AS_DRAWN = "not-as-drawn"
 GROUP_LEFT_OUT = "group-left-out"
 BOARD_LEFT_OUT = "board-left-out"
 """A whole board in an image, not single dots."""
-ELSEWHERE, SINGLE = "face-elsewhere", "face-single"
-"""Faces that were read in an image and left out: not where others see them, or in no other image."""
+ELSEWHERE = "face-elsewhere"
+"""Faces that were read in an image and left out: not where others see them."""
 BEGINNINGS = {NOT_AS_DRAWN: "not as drawn: ", GROUP_LEFT_OUT: "left out whole: "}
 
 

@@ -10,12 +10,9 @@ from stcal.geometry.robust import huber_weights, ratio_limit, robust_sigma
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import Pattern, planar_pose
 
-MIN_PLANE = 5
-"""Smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check."""
-MIN_CIRCLES = 12
-"""Smallest number of circles of an image for its law of blur, which has three parameters."""
-BY_CHANCE = 1e-6
-"""Share of images with even blur of which a law is found by chance."""
+MIN_PLANE = 5  # smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check.
+MIN_CIRCLES = 12  # smallest number of circles of an image for its law of blur, which has three parameters
+BY_CHANCE = 1e-6  # share of images with even blur of which a law is found by chance
 RESPONSE, RESPONSE_OF_BLUR2 = 0.51, 5.8
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
 square of the blur over the smaller radius: from 3751 circles that were rendered through points of a pupil."""
@@ -25,8 +22,11 @@ FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5
 """Largest scatter of the squared blur about its law, as a share of its scatter about their mean, that is not told."""
-TOLD_PX = 0.3
-"""Smallest variation of the blur, px, that is told if depth does not explain it."""
+TOLD_PX = 0.3  # smallest variation of the blur, px, that is told if depth does not explain it
+ROUNDS = 6  # number of rounds of the robust fit: weights are settled to a per cent after four
+HUBER = 2.0  # residual, in σ, beyond which the weight falls (Huber 1964)
+LEAST_PX2 = 1e-6
+"""Scatter of the squared blur, px², that counts as none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +52,37 @@ class _Blurs:
     response: np.ndarray  # of the centre, as a share, as its ``sigma``
     sigma: np.ndarray
 
+    @classmethod
+    def of(cls, image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> "_Blurs":
+        """Returns the circles with a blur, of planes that have enough of them for a pose."""
+        planes = np.array(
+            [label.plane if blur > 0 else "" for label, blur in zip(image.labels, image.blur_px, strict=True)]
+        )
+        rows, inverse_depth, gradient = [np.zeros(0, int)], [np.zeros(0)], [np.zeros((0, 2))]
+        for plane in (plane for plane in dict.fromkeys(planes.tolist()) if plane in patterns):
+            members, place = (
+                np.flatnonzero(planes == plane),
+                {label: k for k, label in enumerate(patterns[plane].labels)},
+            )
+            xy_mm, xy = patterns[plane].xy_mm[[place[image.labels[i]] for i in members]], image.centre[members]
+            pose = planar_pose(xy_mm, xy) if len(members) >= MIN_PLANE else None
+            if pose is not None:
+                normal = pose.rotation[:, 2] / (pose.rotation[:, 2] @ pose.translation)
+                rows.append(members)
+                inverse_depth.append(np.pad(xy, ((0, 0), (0, 1)), constant_values=1) @ normal)
+                gradient.append(np.tile(normal[:2] / focal_px, (len(xy), 1)))
+        chosen = np.concatenate(rows)
+        blur2 = image.blur_px[chosen] ** 2
+        wide2 = blur2 / (np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px) ** 2
+        return cls(
+            chosen,
+            np.concatenate(inverse_depth),
+            np.concatenate(gradient),
+            blur2,
+            RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0),
+            np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Law:
@@ -66,24 +97,42 @@ class _Law:
     plain: float  # the same about a constant
     significant: bool  # whether depth explains the blur better than a constant does
 
+    @classmethod
+    def of(cls, own: _Blurs, unit: float, curvature: tuple[float, float] | None = None) -> "_Law":
+        """Returns the law of one image by robust least squares; ``curvature`` : mean and variance of that of others."""
+        about = float(own.inverse_depth.mean())
+        rows = np.vander((own.inverse_depth - about) / unit, 3, increasing=True)
+        coefficients, inverse, scatter = _fitted(rows, own.blur2, curvature)
+        from_median = np.abs(own.blur2 - np.median(own.blur2))
+        plain = float(robust_sigma(from_median))
+        residual = np.minimum(np.abs(own.blur2 - rows @ coefficients), 3 * max(scatter, 1e-12))
+        freedom, square = len(rows) - 3, float((residual**2).sum())
+        gain = float((np.minimum(from_median, 3 * max(plain, 1e-12)) ** 2).sum()) - square
+        significant = gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * square / freedom
+        return cls(coefficients, inverse, about, unit, scatter, plain, bool(significant))
+
     def slope(self, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the derivative of the squared blur by the inverse depth, px²·mm, and its σ."""
         u = (inverse_depth - self.about) / self.unit
         by = np.stack([np.zeros_like(u), np.ones_like(u), 2 * u], axis=1) / self.unit
         return by @ self.coefficients, np.sqrt(np.einsum("ni,ij,nj->n", by, self.covariance, by))
 
-    def blur2(self, inverse_depth: np.ndarray) -> np.ndarray:
-        """Returns the squared blur, px²."""
-        u = (inverse_depth - self.about) / self.unit
-        return self.coefficients @ np.stack([np.ones_like(u), u, u * u])
-
-    def focused_mm(self) -> float | None:
-        """Returns the depth of least blur; None if the blur does not show one in front of the camera."""
-        _, slope, curvature = self.coefficients
-        if curvature <= 3 * np.sqrt(self.covariance[2, 2]):
-            return None
-        inverse = self.about - self.unit * slope / (2 * curvature)
-        return float(1 / inverse) if inverse > 0 else None
+    def focus(self, image: str, own: _Blurs, shift_px: float) -> Focus:
+        """Returns the blur of the image in depth, with the largest correction of a centre."""
+        (_, slope, curvature), sigma = self.coefficients, float(np.sqrt(self.covariance[2, 2]))
+        near, far = own.inverse_depth.max(), own.inverse_depth.min()
+        u = (np.array([near, far]) - self.about) / self.unit
+        first, last = np.sqrt(np.maximum(np.vander(u, 3, increasing=True) @ self.coefficients, 0.0)).tolist()
+        spread, note = float(np.ptp(np.percentile(np.sqrt(own.blur2), [5, 95]))), ""
+        odd = self.significant and curvature < -3 * sigma
+        if spread > TOLD_PX and (odd or self.scatter > MAX_UNEXPLAINED * self.plain):
+            why = "motion, a curved plane of focus or dirt on the lens; centres may be off by more than their σ"
+            note = f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: {why}"
+        sharpest = (
+            self.about - self.unit * slope / (2 * curvature) if self.significant and curvature > 3 * sigma else 0.0
+        )
+        focused_mm = float(1 / sharpest) if sharpest > 0 else None
+        return Focus(image, focused_mm, (1 / float(near), 1 / float(far)), (first, last), shift_px, note)
 
 
 def correct_defocus(
@@ -93,66 +142,28 @@ def correct_defocus(
     Out of focus, blur varies across a tilted circle, and its fit with one blur moves towards the blurrier side.
     ``patterns``: of the faces and the board, by the plane of a label."""
     focal_px = float(np.sqrt(camera.focal.prod()))
-    views = [_views_of(image, patterns, focal_px) for image in images]
-    laws = _laws(views)
+    views = [_Blurs.of(image, patterns, focal_px) for image in images]
     corrected, focus = list(images), []
-    for i, (image, own, law) in enumerate(zip(images, views, laws, strict=True)):
+    for i, (image, own, law) in enumerate(zip(images, views, _laws(views), strict=True)):
         if law is not None:
             corrected[i], shift_px = _moved(image, own, law, camera, focal_px) if law.significant else (image, 0.0)
-            focus.append(_focus(image.name, own, law, shift_px))
+            focus.append(law.focus(image.name, own, shift_px))
     return corrected, tuple(focus)
-
-
-def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> _Blurs:
-    planes: dict[str, list[int]] = {}
-    for i, label in enumerate(image.labels):
-        if image.blur_px[i] > 0:
-            planes.setdefault(label.plane, []).append(i)
-    rows: list[int] = []
-    inverse_depth, gradient = [np.zeros(0)], [np.zeros((0, 2))]
-    for plane, members in planes.items():
-        if len(members) < MIN_PLANE or plane not in patterns:
-            continue
-        pattern = patterns[plane]
-        place = {label: k for k, label in enumerate(pattern.labels)}
-        xy_mm, xy = pattern.xy_mm[[place[image.labels[i]] for i in members]], image.centre[members]
-        pose = planar_pose(xy_mm, xy)
-        if pose is None:
-            continue
-        normal = pose.rotation[:, 2] / (pose.rotation[:, 2] @ pose.translation)
-        rows += members
-        inverse_depth.append(np.column_stack([xy, np.ones(len(xy))]) @ normal)
-        gradient.append(np.tile(normal[:2] / focal_px, (len(xy), 1)))
-    chosen = np.array(rows, int)
-    blur2 = image.blur_px[chosen] ** 2
-    smaller = np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px
-    wide2 = blur2 / smaller**2
-    return _Blurs(
-        chosen,
-        np.concatenate(inverse_depth),
-        np.concatenate(gradient),
-        blur2,
-        RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0),
-        np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA),
-    )
 
 
 def _laws(views: Sequence[_Blurs]) -> list[_Law | None]:
     """Returns the law of each image, None of those with too few circles. Each a² is drawn towards the mean of all by as
     much as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7)."""
-    enough = [circles for circles in views if len(circles.rows) >= MIN_CIRCLES]
-    if not enough:
-        return [None] * len(views)
-    unit = float(np.median([np.ptp(circles.inverse_depth) for circles in enough]))
+    enough = {i: circles for i, circles in enumerate(views) if len(circles.rows) >= MIN_CIRCLES}
+    unit = float(np.median([np.ptp(circles.inverse_depth) for circles in enough.values()])) if enough else 1.0
     unit = unit if unit > 0 else 1.0
-    alone = [_law(circles, unit) for circles in enough]
-    curvature = np.array([law.coefficients[2] for law in alone])
-    variance = np.array([law.covariance[2, 2] for law in alone])
+    laws = {i: _Law.of(circles, unit) for i, circles in enough.items()}
+    curvature = np.array([law.coefficients[2] for law in laws.values()])
+    variance = np.array([law.covariance[2, 2] for law in laws.values()])
     if len(enough) >= 3 and (variance > 0).all():
         prior = _mean_and_variance(curvature, variance)
-        alone = [_law(circles, unit, prior) for circles in enough]
-    laws = iter(alone)
-    return [next(laws) if len(circles.rows) >= MIN_CIRCLES else None for circles in views]
+        laws = {i: _Law.of(circles, unit, prior) for i, circles in enough.items()}
+    return [laws.get(i) for i in range(len(views))]
 
 
 def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float, float]:
@@ -163,21 +174,6 @@ def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float
     between = max(0.0, excess / (weight.sum() - (weight**2).sum() / weight.sum()))
     weight = 1 / (variances + between)
     return float((weight * values).sum() / weight.sum()), between + 1 / float(weight.sum())
-
-
-def _law(own: _Blurs, unit: float, curvature: tuple[float, float] | None = None) -> _Law:
-    """Returns the law of one image by robust least squares, with mean and variance of the ``curvature`` of others."""
-    about = float(own.inverse_depth.mean())
-    u = (own.inverse_depth - about) / unit
-    rows = np.stack([np.ones_like(u), u, u * u], axis=1)
-    coefficients, inverse, scatter = _fitted(rows, own.blur2, curvature)
-    plain = float(robust_sigma(np.abs(own.blur2 - np.median(own.blur2))))
-    residual = np.minimum(np.abs(own.blur2 - rows @ coefficients), 3 * max(scatter, 1e-12))
-    deviation = np.minimum(np.abs(own.blur2 - np.median(own.blur2)), 3 * max(plain, 1e-12))
-    freedom = len(u) - 3
-    gain = float((deviation**2).sum() - (residual**2).sum())
-    significant = gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * float((residual**2).sum()) / freedom
-    return _Law(coefficients, inverse, about, unit, scatter, plain, bool(significant))
 
 
 def _fitted(
@@ -200,14 +196,6 @@ def _fitted(
     return coefficients, inverse, scatter
 
 
-ROUNDS = 6
-"""Number of rounds of the robust fit: weights are settled to a per cent after four."""
-HUBER = 2.0
-"""Residual, in σ, beyond which the weight falls (Huber 1964)."""
-LEAST_PX2 = 1e-6
-"""Scatter of the squared blur, px², that counts as none."""
-
-
 def _moved(
     image: ImageObservations, own: _Blurs, law: _Law, camera: Camera, focal_px: float
 ) -> tuple[ImageObservations, float]:
@@ -225,16 +213,3 @@ def _moved(
     covariance[own.rows] += variance[:, None, None] * by_slope[:, :, None] * by_slope[:, None, :]
     moved = replace(image, centre=centre, centre_px=centre_px, covariance_px2=covariance)
     return moved, float(np.linalg.norm(shift, axis=1).max())
-
-
-def _focus(image: str, own: _Blurs, law: _Law, shift_px: float) -> Focus:
-    near, far = own.inverse_depth.max(), own.inverse_depth.min()
-    ends = np.sqrt(np.maximum(law.blur2(np.array([near, far])), 0.0))
-    spread = float(np.ptp(np.percentile(np.sqrt(own.blur2), [5, 95])))
-    odd = law.significant and law.coefficients[2] < -3 * np.sqrt(law.covariance[2, 2])
-    note = ""
-    if spread > TOLD_PX and (odd or law.scatter > MAX_UNEXPLAINED * law.plain):
-        why = "motion, a curved plane of focus or dirt on the lens; centres may be off by more than their σ"
-        note = f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: {why}"
-    focused = law.focused_mm() if law.significant else None
-    return Focus(image, focused, (1 / float(near), 1 / float(far)), (float(ends[0]), float(ends[1])), shift_px, note)

@@ -1,4 +1,9 @@
-"""Detection in all images, from files or memory, in parallel. Results are cached by content of image and options."""
+"""Detection in all images, from files or memory, in parallel, and what is remembered of it.
+
+A folder keeps what was detected in an image, under a hash of its content and of all that detection depends on (camera,
+designs, options, versions), and what a second look measured, under a hash of the places that it searched. Commands that
+share the folder, as ``detect`` and ``run`` do, detect nothing twice, whatever the files are called.
+"""
 
 import hashlib
 import json
@@ -6,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
@@ -38,22 +44,18 @@ from stcal.io.images import (
 )
 from stcal.labels import parse_label, parse_labels
 from stcal.sfm.data.group_model import Centres
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import BoardSighting, EllipseOptions, FaceSighting, ImageDetection
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 CACHE_VERSION = 11
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
-PHOTOGRAPHS = "the photographs"
-"""Where a camera that was found is from, for messages."""
+PHOTOGRAPHS = "the photographs"  # where a camera that was found is from, for messages
 LOSSY = (".jpg", ".jpeg")
-COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)
-"""Additions of file managers to the name of a second copy."""
+COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)  # in names, by file managers
 SAME_PLACE_PX = 4.0
-SAME_SHARE = 0.6
-"""Share of an image's circles that lie within the same squares of that side in another form of it."""
+SAME_SHARE = 0.6  # share of an image's circles that lie within the same squares of that side in another form of it
 
 P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
@@ -98,16 +100,17 @@ def detect_files(
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
-    jobs = [(file, camera, size_from, (target, board, options), settings, detector, pictures) for file in files]
     outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
             outcomes[:] = pool.map(lambda file: _kept(file, settings, cache), files)
     pending = [i for i, each in enumerate(outcomes) if each is None]
+    step = progress or (lambda _: None)
     for file, each in zip(files, outcomes, strict=True):
-        if each is not None and progress:
-            progress(file.name)
-    for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
+        if each is not None:
+            step(file.name)
+    common = camera, size_from, (target, board, options), settings, detector or detect_image, pictures
+    for k, outcome in run_on_images(_detect_file, [(files[i], *common) for i in pending], workers, kept=True):
         i = pending[k]
         if isinstance(outcome, Skipped):
             outcomes[i] = outcome
@@ -117,8 +120,7 @@ def detect_files(
             outcomes[i] = _load(files[i], path, reused=False)
             if outcomes[i] is None:
                 raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
-        if progress:
-            progress(files[i].name)
+        step(files[i].name)
     grouped = forms and board is not None and board.rows > 0  # a board moves between groups
     images, skipped = _without_copies([f for f in outcomes if f is not None], forms, grouped)
     if not images:
@@ -177,7 +179,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
 
 
 def _detect_file(
-    file: ImageFile, camera: Camera, size_from: str, seen, settings: str, detector: Detector | None, pictures: bool
+    file: ImageFile, camera: Camera, size_from: str, seen, settings: str, detector: Detector, pictures: bool
 ) -> tuple[str, bytes] | Skipped:
     """Detects circles in one file; returns the key of the result and its content for the cache."""
     loaded = load_image(file, camera, size_from)
@@ -185,11 +187,9 @@ def _detect_file(
         return loaded
     data, image = loaded
     try:
-        detection = (detector or detect_image)(image, camera, *seen)
-    except ConvergenceError as error:
-        return Skipped(file.name, str(error), "distortion")
-    except DetectionError as error:
-        return Skipped(file.name, str(error))
+        detection = detector(image, camera, *seen)
+    except (ConvergenceError, DetectionError) as error:
+        return Skipped(file.name, str(error), *(["distortion"] if isinstance(error, ConvergenceError) else []))
     digest, key = _key(data, settings)
     picture, scale = thumbnail(grey_8bit(image)) if pictures else (np.zeros(0, np.uint8), 1.0)
     return key, _packed(detection, key, digest, picture, scale)
@@ -267,12 +267,11 @@ def look_again(
         for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
             hasher.update(values.tobytes())
         path = cache / f"again-{hasher.hexdigest()[:40]}.npz"
-        known = kept(path, _stored_look)
-        if known is None:
+        if known := kept(path, _stored_look):
+            looks[image.file.name] = known
+        else:
             pending.append((image.file, camera, predicted, options))
             paths.append(path)
-        else:
-            looks[image.file.name] = known
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
             keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": look.missed})
@@ -280,11 +279,9 @@ def look_again(
     return looks
 
 
-def _look_again(
-    file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
-) -> SecondLook | None:
+def _look_again(file: ImageFile, camera: Camera, *searched) -> SecondLook | None:
     loaded = load_image(file, camera, "")
-    return None if isinstance(loaded, Skipped) else measure_predicted(loaded[1], camera, predicted, options)
+    return None if isinstance(loaded, Skipped) else measure_predicted(loaded[1], camera, *searched)
 
 
 def _stored_look(stored, meta) -> SecondLook:
@@ -317,8 +314,11 @@ def _without_copies(
             copies |= {file.name: copy_of(file, first.name) for file in others}
     for pair in _in_two_forms([image for image in detected if image.file.name not in copies] if forms else []):
         first, second = sorted((image.file for image in pair), key=_plainness)
-        if not {first.name, second.name} & copies.keys() and _same_pixels(first, second):
-            copies[second.name] = copy_of(second, first.name, ", saved in another form")
+        with suppress(InputError, OSError):
+            if not {first.name, second.name} & copies.keys() and same_photograph(
+                *(decode(each.read(), each.name) for each in (first, second))
+            ):
+                copies[second.name] = copy_of(second, first.name, ", saved in another form")
     images = [image for image in detected if image.file.name not in copies]
     reasons = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
     return images, [reason for reason in reasons if reason is not None]
@@ -344,13 +344,6 @@ def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, 
     for (i, j), count in sorted(common.items()):
         if kinds[i] != kinds[j] and count >= SAME_SHARE * min(len(cells[i]), len(cells[j])):
             yield images[i], images[j]
-
-
-def _same_pixels(one: ImageFile, two: ImageFile) -> bool:
-    try:
-        return same_photograph(*(decode(each.read(), each.name) for each in (one, two)))
-    except (InputError, OSError):
-        return False
 
 
 def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None = None) -> None:

@@ -1,7 +1,7 @@
 """Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered. A
 plain board looks the same after half a turn: a reading carries every numbering that fits the image."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,40 +10,24 @@ from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, DetectionError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian, singular_values
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, BoardSighting, Candidates, match_pattern
 
 NEIGHBOURS = 20
-STEP_TOLERANCE = 0.3
-"""Largest distance of a dot from its place predicted by its neighbours, in steps."""
-DIAGONAL = 1.22
-"""Limit between the lengths of a step along a row, 1, and along a diagonal, √2."""
-MIN_SHARE = 0.35
-"""Smallest share of the board's dots that makes a board."""
+STEP_TOLERANCE = 0.3  # largest distance of a dot from its place predicted by its neighbours, in steps
+DIAGONAL = 1.22  # limit between the lengths of a step along a row, 1, and along a diagonal, √2
+MIN_SHARE = 0.35  # smallest share of the board's dots that makes a board
 MAX_BOARDS = 3
-MAX_COSINE = 0.35
-"""Largest cosine of the angle between the two first steps in the board plane; 45° has 0.7."""
-MIN_LINKS = 3
-"""Smallest number of neighbours of a dot that starts a grid."""
-NEARLY_ALL = 0.9
-"""Share of the board that ends the search for a larger grid."""
-MIN_SIDE = 3
-"""Smallest number of rows and columns."""
+MAX_COSINE = 0.35  # largest cosine of the angle between the two first steps in the board plane; 45° has 0.7
+MIN_LINKS = 3  # smallest number of neighbours of a dot that starts a grid
+NEARLY_ALL = 0.9  # share of the board that ends the search for a larger grid
+MIN_SIDE = 3  # smallest number of rows and columns
 CORNER_MARGIN = 0.4
 """A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
 MAX_UNEXPLAINED = 2
 """Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardReading:
-    """One board in one image."""
-
-    candidates: np.ndarray  # (n,) the dots found
-    numberings: np.ndarray  # (k, n, 2) row and column, by numbering that the image admits, the likeliest first
-    unlikely: np.ndarray  # (u, n, 2) further numberings, that hold where dots are covered
-
-
-def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
+def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardSighting]:
     """Finds the boards and returns the one with the most dots first; ``image_corners``: (4, 2) normalised, ideal."""
     if len(candidates) < MIN_SIDE**2:
         return []
@@ -51,33 +35,24 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     count = (links >= 0).sum(1)
     seeds = [int(i) for i in np.argsort(-count, kind="stable") if count[i] >= MIN_LINKS]
     free = np.ones(len(candidates), bool)
-    readings: list[BoardReading] = []
+    readings: list[BoardSighting] = []
     for _ in range(MAX_BOARDS):
-        cells = _largest_grid(candidates, links, steps, seeds, free, board)
+        cells: dict[int, tuple[int, int]] = {}  # of the largest grid
+        inside = np.zeros(len(candidates), int)
+        for seed in seeds:
+            # A dot that has been in two grids is not likely to start a better third one.
+            if free[seed] and inside[seed] < 2 and len(cells) < NEARLY_ALL * len(board.cells()):
+                grown = _grow(candidates, links, steps, seed, free, board)
+                inside[list(grown)] += 1
+                cells = max(cells, grown, key=len)
         if len(cells) < MIN_SHARE * len(board.cells()):
             break
         free[list(cells)] = False
         reading = _number(candidates, cells, board, image_corners)
         if reading is not None:
-            free[reading.candidates] = False
+            free[reading.rows] = False
             readings.append(reading)
-    return sorted(readings, key=lambda r: -len(r.candidates))
-
-
-def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
-    """Returns the largest grid grown from any of the seeds; a complete one ends the search."""
-    best: dict[int, tuple[int, int]] = {}
-    inside = np.zeros(len(candidates), int)
-    for seed in seeds:
-        # A dot that has been in two grids is not likely to start a better third one.
-        if not free[seed] or inside[seed] >= 2:
-            continue
-        cells = _grow(candidates, links, steps, seed, free, board)
-        inside[list(cells)] += 1
-        best = max(best, cells, key=len)
-        if len(best) >= NEARLY_ALL * len(board.cells()):
-            break
-    return best
+    return sorted(readings, key=lambda r: -len(r.rows))
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +132,7 @@ def _grow(candidates: Candidates, links, steps, seed: int, free, board: BoardDes
     return cells
 
 
-def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardReading | None:
+def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardSighting | None:
     """Fits the homography of the grown cells, matches all dots with it, and lists the numberings that fit."""
     index, uv = np.array(list(cells)), np.array(list(cells.values()))
     homography = _robust_homography(board.flat(uv), candidates, index)
@@ -192,32 +167,28 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     index = index[common]
     numberings = np.stack([cells[common] for _, cells in likely])
     further = [cells[common] for count, inside, cells in placements if count > most and inside[common].all()]
-    return BoardReading(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
+    return BoardSighting(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
 
 
 def by_rings(
-    reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
-) -> BoardReading:
+    reading: BoardSighting, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
+) -> BoardSighting:
     """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates.
     DetectionError: it shows as many holes as are stated, at other places by any numbering."""
-    angle = np.arange(0, 2 * np.pi, np.pi / 8)
-    around = np.column_stack([np.cos(angle), np.sin(angle)])
-    cells = board.cells()
+    angle, size = np.arange(0, 2 * np.pi, np.pi / 8), np.array(grey.shape[::-1])
+    around, cells = np.column_stack([np.cos(angle), np.sin(angle)]), board.cells()
     rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
     middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
+    circles_mm = np.stack([middles + share * board.radius_mm * around for share in RING_SHARES])
     wrong: list[int] = []
     seen: list[np.ndarray] = []
     for numbering in reading.numberings:
         xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
-        homography = fit_homography(xy_mm, xy[reading.candidates])
-        values = []
-        for share in RING_SHARES:
-            rim = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
-            px = camera.project(np.column_stack([rim, np.ones(len(rim))]))
-            sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
-            values.append(sampled.reshape(len(cells), -1).mean(1))
-        inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
-        middle, body, outside = values
+        points = apply_homography(fit_homography(xy_mm, xy[reading.rows]), circles_mm.reshape(-1, 2))
+        px = camera.project(np.pad(points, ((0, 0), (0, 1)), constant_values=1))
+        sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
+        middle, body, outside = sampled.reshape(circles_mm.shape[:3]).mean(2)
+        inside = ((px > 0) & (px < size - 1)).reshape(circles_mm.shape)[-1].all((1, 2))
         holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
         wrong.append(int((holes != rings)[inside].sum()))
         seen.append(holes & inside)
@@ -238,8 +209,7 @@ RING_SHARES = (0.15, 0.75, 1.25)
 """Radii of the circles on which the middle of a dot, its body and the board about it are sampled, in its radii."""
 HOLE_SHARE = 0.5
 """Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
-MOST_WRONG = 1
-"""Largest number of dots whose hole is missed, or seen where none is."""
+MOST_WRONG = 1  # largest number of dots whose hole is missed, or seen where none is
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:

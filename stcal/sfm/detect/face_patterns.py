@@ -2,31 +2,28 @@
 which is extended to all circles of a face. A face is named only if one reading explains more circles than every other.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian, singular_values
-from stcal.labels import CircleLabel
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches
-from stcal.sfm.detect.sightings import MIN_NAMING, is_named, mirror_images
+from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
+from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, FaceSighting, OpenFace, grow_matches
 
+MIN_NAMING = 6  # smallest number of circles that can name a face: four determine a homography, two more confirm it
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
-PAIR_TOLERANCE = 0.3
-"""Relative tolerance of distance and size of a pair after the map of one ellipse to a circle."""
-SUPPORT = 5
-"""Number of nearest circles that are predicted from a pair."""
-MIN_SUPPORT = 2
-"""Number of the predicted circles that must be present before the hypothesis is grown."""
-FIRST_HYPOTHESES = 300
-"""Number of the best supported hypotheses of an image that are all grown, so that rivals compete."""
+PAIR_TOLERANCE = 0.3  # relative tolerance of distance and size of a pair after the map of one ellipse to a circle
+SUPPORT = 5  # number of nearest circles that are predicted from a pair
+MIN_SUPPORT = 2  # number of the predicted circles that must be present before the hypothesis is grown
+FIRST_HYPOTHESES = 300  # number of the best supported hypotheses of an image that are all grown, so that rivals compete
 MAX_TRIES = 8
 """Number of further hypotheses grown from each outline without a reading: a dim face ranks behind all clutter."""
-AT_ONCE = 32
-"""Number of hypotheses that are grown side by side, ahead of their turn."""
+AT_ONCE = 32  # number of hypotheses that are grown side by side, ahead of their turn
 MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MAX_SIZE_RATIO = 1.25
@@ -34,31 +31,11 @@ MAX_SIZE_RATIO = 1.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FaceReading:
-    """One face in one image: ``index`` : (n circles,) into the candidates, −1 if missing."""
-
-    face: FaceDesign
-    index: np.ndarray
-
-    def count(self) -> int:
-        """Returns the number of circles found."""
-        return int((self.index >= 0).sum())
-
-    def used(self) -> np.ndarray:
-        """Returns the indices of the candidates of the face."""
-        return self.index[self.index >= 0]
-
-    def labels(self) -> list[CircleLabel]:
-        """Returns the labels of the circles found."""
-        return [label for label, i in zip(self.face.labels(), self.index, strict=True) if i >= 0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """Faces in one image; a face in view twice has two readings."""
+    """Faces in one image, by their candidates; a face in view twice occurs twice."""
 
-    faces: tuple[FaceReading, ...]  # unambiguously named
-    refused: tuple[tuple[FaceReading, ...], ...]  # readings of each pattern without a name
+    faces: tuple[FaceSighting, ...]  # unambiguously named
+    refused: tuple[OpenFace, ...]  # patterns without a name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,15 +79,15 @@ class _Starts:
         """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
         matched = np.flatnonzero(index >= 0)
         keys = zip(matched.tolist(), index[matched].tolist(), strict=True)
-        same = [self.rows[face, *key] for key in keys if (face, *key) in self.rows]
-        count = np.bincount(np.concatenate([*same, np.zeros(0, int)]), minlength=len(self.origin))
+        same = [self.rows.get((face, *key), np.zeros(0, int)) for key in keys]
+        count = np.bincount(np.concatenate([np.zeros(0, int), *same]), minlength=len(self.origin))
         return np.flatnonzero(count >= 2)
 
-    def index(self, rank: int, width: int | None = None) -> np.ndarray:
-        """Returns the candidate of each circle of the hypothesis's face, −1 if there is none; ``width`` : length."""
-        index = np.full(int(self.circles.max(initial=0)) + 1 if width is None else width, -1)
-        matched = self.candidates[rank] >= 0
-        index[self.circles[rank][matched]] = self.candidates[rank][matched]
+    def index(self, ranks: list[int], width: int) -> np.ndarray:
+        """Returns the candidate of each circle of the hypotheses' faces, (ranks, width), −1 if there is none."""
+        index = np.full((len(ranks), width), -1)
+        row, column = np.nonzero(self.candidates[ranks] >= 0)
+        index[row, self.circles[ranks][row, column]] = self.candidates[ranks][row, column]
         return index
 
     def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
@@ -119,7 +96,7 @@ class _Starts:
         left[:rank], left[rank] = False, True
         while len(chosen) < AT_ONCE and left.any():
             chosen.append(int(left.argmax()))
-            index = self.index(chosen[-1])
+            index = self.index(chosen[-1:], int(self.circles.max(initial=0)) + 1)[0]
             left[self.agree(int(self.face[chosen[-1]]), index)] = False
             left[chosen[-1]] = False
         return chosen
@@ -127,31 +104,31 @@ class _Starts:
 
 @lru_cache(maxsize=8)
 def _pairs(target: TargetDesign) -> _Pairs:
-    most = max(len(face.ids) for face in target.faces)
+    faces, most = target.faces, max(len(face.ids) for face in target.faces)
     width = min(SUPPORT + 2, most)
-    xy, radii_of_face = np.zeros((len(target.faces), most, 2)), np.zeros((len(target.faces), most))
-    occurrences: dict[tuple, list] = {}
-    for number, face in enumerate(target.faces):
-        n = len(face.ids)
-        xy[number], xy[number, :n], radii_of_face[number, :n] = face.xy_mm[0], face.xy_mm, face.radius_mm
+    uses_of: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+    for number, face in enumerate(faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
-        for row in np.argsort(distance, axis=1, kind="stable"):
-            nearest = row[:width]
-            offset, radius = face.xy_mm[nearest] - face.xy_mm[nearest[0]], face.radius_mm[nearest]
-            same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
+        for nearest in np.argsort(distance, axis=1, kind="stable")[:, :width]:
+            offset = np.round(face.xy_mm[nearest] - face.xy_mm[nearest[0]], 6)
+            same = (*offset.ravel(), *np.round(face.radius_mm[nearest], 6))
             for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
-                occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, nearest))
-    p = len(occurrences)
-    offsets, radii, exists = np.zeros((p, width, 2)), np.ones((p, width)), np.zeros((p, width), bool)
-    for i, (offset, radius, _) in enumerate(occurrences.values()):
-        offsets[i, : len(radius)], radii[i, : len(radius)], exists[i, : len(radius)] = offset, radius, True
-    uses = [use for _, _, uses in occurrences.values() for use in uses]
-    circles = np.full((len(uses), width), -1)
-    for i, (_, nearest) in enumerate(uses):
-        circles[i, : len(nearest)] = nearest
-    seconds, starts = [second for second, *_ in occurrences], [len(of_pair) for _, _, of_pair in occurrences.values()]
-    of_uses = np.cumsum([0, *starts]), np.array([number for number, _ in uses], int), circles
-    return _Pairs(offsets, radii, exists, np.array(seconds, int), *of_uses, xy, radii_of_face)
+                uses_of.setdefault((second, *same), []).append((number, nearest))
+    firsts = [(faces[number], nearest, width - len(nearest)) for (number, nearest), *_ in uses_of.values()]
+    every = [
+        (number, np.pad(c, (0, width - len(c)), constant_values=-1)) for use in uses_of.values() for number, c in use
+    ]
+    return _Pairs(
+        np.array([np.pad(f.xy_mm[c] - f.xy_mm[c[0]], ((0, more), (0, 0))) for f, c, more in firsts]),
+        np.array([np.pad(f.radius_mm[c], (0, more), constant_values=1.0) for f, c, more in firsts]),
+        np.array([np.arange(width) < len(c) for _, c, _ in firsts]),
+        np.array([second for second, *_ in uses_of], int),
+        np.cumsum([0, *map(len, uses_of.values())]),
+        np.array([number for number, _ in every], int),
+        np.array([circles for _, circles in every]),
+        np.array([np.pad(f.xy_mm, ((0, most - len(f.ids)), (0, 0)), "wrap") for f in faces]),
+        np.array([np.pad(f.radius_mm, (0, most - len(f.ids))) for f in faces]),
+    )
 
 
 class FaceFinder:
@@ -162,7 +139,7 @@ class FaceFinder:
 
     def find(self, candidates: Candidates) -> FaceFinding:
         """Finds all faces among the candidates; the mirror image of a face may look like another one."""
-        readings: list[FaceReading] = []
+        readings: list[FaceSighting] = []
         if len(candidates) < MIN_NAMING or not self.target.faces:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
@@ -171,7 +148,7 @@ class FaceFinder:
         for rank, first in enumerate(starts.origin.tolist()):
             if rank == FIRST_HYPOTHESES:
                 for reading in readings:
-                    explained[reading.used()] |= reading.count() >= needed_circles(reading.face)
+                    explained[reading.rows] |= len(reading.rows) >= needed_circles(self.target.face(reading.face))
             if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
                 continue
             tries[first] += rank >= FIRST_HYPOTHESES
@@ -185,25 +162,26 @@ class FaceFinder:
                 continue
             depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
             if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
-                readings.append(FaceReading(face, _of_one_size(candidates, face, *match)))
-                is_open[starts.agree(number, readings[-1].index)] = False
+                index = _of_one_size(candidates, face, *match)
+                readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
+                is_open[starts.agree(number, index)] = False
         return _decide(readings, self.target)
 
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
         """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
         circles, face = _pairs(self.target), starts.face[ranks]
-        index = np.stack([starts.index(rank, circles.face_radius.shape[1]) for rank in ranks])
+        index = starts.index(ranks, circles.face_radius.shape[1])
         found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
         grown = zip(ranks, *found, size, strict=True)
         return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
-    def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
-        """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""
-        if any(reading.face.id not in mirror_images(self.target) for reading in named):
+    def find_mirrored(self, candidates: Candidates, named: tuple[FaceSighting, ...]) -> tuple[str, ...]:
+        """Returns the ids of faces that appear mirrored; none if a ``named`` face shows that the image is not."""
+        alike = mirror_images(self.target)
+        if any(each.face not in alike for each in named):
             return ()
-        found = self.find(candidates.mirrored()).faces
-        return tuple(reading for reading in found if reading.face.id not in mirror_images(self.target))
+        return tuple(each.face for each in self.find(candidates.mirrored()).faces if each.face not in alike)
 
     def _hypotheses(self, candidates: Candidates) -> _Starts:
         """Returns all pairs of neighbouring outlines that may be a pair of the design, with their support."""
@@ -280,22 +258,95 @@ def needed_circles(face: FaceDesign) -> int:
     return min(MIN_NAMING, len(face.ids))
 
 
-def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
+def _decide(readings: list[FaceSighting], target: TargetDesign) -> FaceFinding:
     """Keeps the readings that explain more circles than every other reading of the same candidates."""
-    readings = [r for r in readings if r.count() >= needed_circles(r.face)]
-    readings.sort(key=lambda r: -r.count())
-    named: list[FaceReading] = []
-    refused: list[tuple[FaceReading, ...]] = []
+    readings = [r for r in readings if len(r.rows) >= needed_circles(target.face(r.face))]
+    readings.sort(key=lambda r: -len(r.rows))
+    named: list[FaceSighting] = []
+    refused: list[OpenFace] = []
     settled: set[int] = set()
     for reading in readings:
-        used = set(reading.used())
+        used = set(reading.rows)
         if settled & used:
             continue
         settled |= used
-        rivals = [r for r in readings if used & set(r.used()) and r.count() >= reading.count()]
-        ambiguous = [r for r in rivals if r.face is not reading.face or (r.index != reading.index).any()]
-        if ambiguous or not is_named(reading.face, reading.index >= 0, target):
+        rivals = [r for r in readings if used & set(r.rows) and len(r.rows) >= len(reading.rows)]
+        ambiguous = [r for r in rivals if _read(r) != _read(reading)]
+        if ambiguous or not is_named(target.face(reading.face), reading.circles.tolist(), target):
             refused.append((reading, *ambiguous))
         else:
             named.append(reading)
     return FaceFinding(tuple(named), tuple(refused))
+
+
+def _read(reading: FaceSighting) -> tuple[str, list[int], list[int]]:
+    return reading.face, reading.rows.tolist(), reading.circles.tolist()
+
+
+def confusable(face: FaceDesign, target: TargetDesign) -> set[frozenset[int]]:
+    """Returns the sets of a face's circles that another reading explains as well; such a set names no face."""
+    return set().union(
+        *(common_circles(face.xy_mm, face.radius_mm, o.xy_mm, o.radius_mm, o.id == face.id) for o in target.faces)
+    )
+
+
+def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
+    """Returns the largest number of circles that coincide with another face, or with the own after a turn; 0 below
+    ``MIN_COMMON``. The face is moved rigidly or, if ``mirrored``, turned over."""
+    xy = np.asarray(face.xy_mm) * [-1 if mirrored else 1, 1]
+    same = face.id == other.id and not mirrored
+    found = common_circles(xy, face.radius_mm, other.xy_mm, other.radius_mm, same)
+    return max(map(len, found), default=0)
+
+
+def is_named(face: FaceDesign, circles: Iterable[int], target: TargetDesign) -> bool:
+    """Returns whether the circles found name the face, as no other reading explains them all."""
+    found = frozenset(circles)
+    return not any(found <= rival for rival in confusable(face, target))
+
+
+def likeness_notes(target: TargetDesign) -> list[str]:
+    """Returns notes about faces that only one circle distinguishes, and mirror images; tags name themselves."""
+    target = target.with_faces(printed=False)
+    near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
+    notes = []
+    if near:
+        gap, face, other, circle = min(near)
+        faces = [each.id for each in target.faces if any(each.id in telling[1:3] for telling in near)]
+        rival = "the same face turned" if face == other else f"face {other}"
+        notes.append(
+            f"target {target.name}: face{'s' * (len(faces) > 1)} {', '.join(faces)}: one circle tells each from "
+            f"another, or from itself turned (the least is {face}:{circle} against {rival}, {gap:.1f} mm); where it is "
+            "hidden, the face has no name"
+        )
+    alike = mirror_images(target).items()
+    if pairs := {tuple(sorted((face, other))) for face, others in alike for other in others}:
+        listed = ", ".join(f"{a} of itself" if a == b else f"{a} and {b}" for a, b in sorted(pairs))
+        notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
+    return notes
+
+
+def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str, str]]:
+    """Returns single circles that distinguish a face from another one: distance in mm, both faces, and the circle."""
+    rival = other.xy_mm, other.radius_mm
+    telling = []
+    for common in common_circles(face.xy_mm, face.radius_mm, *rival, same=face is other):
+        if len(common) != len(face.ids) - 1:
+            continue
+        shared = np.array(sorted(common))
+        like = whole_likeness(face.xy_mm[shared], face.radius_mm[shared], *rival, shared if face is other else None)
+        if like is not None:
+            (alone,) = set(range(len(face.ids))) - common
+            gap = np.linalg.norm(like.moved(face.xy_mm[alone]) - other.xy_mm, axis=1).min()
+            telling.append((float(gap), face.id, other.id, face.ids[alone]))
+    return telling
+
+
+def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
+    """Returns by face the faces that its mirror image looks like, whole and with its radii; others have no entry."""
+    found: dict[str, tuple[str, ...]] = {}
+    for face, other in product(target.faces, target.faces):
+        pairs = mirrored_circles(face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)
+        if any(len(face.ids) == len(other.ids) == len(own) for own in pairs):
+            found[face.id] = (*found.get(face.id, ()), other.id)
+    return found

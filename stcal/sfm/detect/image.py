@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -15,17 +14,23 @@ from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.group_model import Centres
-from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
-from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.dot_grid import BoardReading, by_rings, find_boards
-from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding, FaceReading
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
+from stcal.sfm.detect.candidates import (
+    BoardSighting,
+    Candidates,
+    EllipseOptions,
+    Ellipses,
+    FaceSighting,
+    ImageDetection,
+    find_ellipses,
+)
+from stcal.sfm.detect.centres import MIN_RIM, measure_centres
+from stcal.sfm.detect.dot_grid import by_rings, find_boards
+from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
-FAINT = 0.25
-"""Share of the required contrast that is used if an image shows too little with the full one."""
-MAX_FREE = 400
-"""Number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130."""
+NO_CENTRES = Centres.without_rims(*np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))
+FAINT = 0.25  # share of the required contrast that is used if an image shows too little with the full one
+MAX_FREE = 400  # number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,15 +38,15 @@ class ImageReading:
     """Interpretation of the outlines in one image, before their centres are measured."""
 
     found: dict[Polarity, Ellipses]
-    boards: tuple[BoardReading, ...]  # the one with the most dots first
+    boards: tuple[BoardSighting, ...]  # the one with the most dots first
     free: Ellipses  # the largest ``MAX_FREE`` outlines of the target's polarity outside of boards
     faces: FaceFinding
-    mirrored: tuple[FaceReading, ...]
+    mirrored: tuple[str, ...]  # ids of faces
     untried: int = 0  # number of outlines beyond ``MAX_FREE``
 
     def face_ids(self) -> set[str]:
         """Returns the ids of the named faces."""
-        return {each.face.id for each in self.faces.faces}
+        return {each.face for each in self.faces.faces}
 
 
 def read_image(
@@ -54,14 +59,14 @@ def read_image(
 ) -> ImageReading:
     """Finds outlines in an 8-bit image, and boards and faces among them; fainter outlines if too few are recognised.
     ``aside``: (k, 2) px, polygon whose outlines are left out."""
-    reading = _read_once(grey, camera, target, board, options, aside)
-    wanted = min(len(target.faces), 1 if board is None else 2)
-    short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
-    if short and not reading.untried:
-        faint = replace(options, min_contrast=FAINT * options.min_contrast)
-        second = _read_once(grey, camera, target, board, faint, aside)
-        return max(reading, second, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
-    return reading
+    readings: list[ImageReading] = []
+    for share in (1.0, FAINT):
+        searched = replace(options, min_contrast=share * options.min_contrast)
+        readings.append(reading := _read_once(grey, camera, target, board, searched, aside))
+        enough = len(reading.face_ids()) >= min(len(target.faces), 1 if board is None else 2)
+        if reading.untried or (enough and (board is None or reading.boards)):
+            break
+    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
 
 
 def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
@@ -71,13 +76,13 @@ def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
         for polarity, found in outlines.items():
             inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
             outlines[polarity] = found.select(~np.array(inside, bool))
-    boards: list[BoardReading] = []
+    boards: list[BoardSighting] = []
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
         dots = Candidates.of(outlines[board.polarity], camera)
         for found in find_boards(dots, board, image_corners(camera)):
             boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
-            free[board.polarity][found.candidates] = False
+            free[board.polarity][found.rows] = False
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
@@ -111,7 +116,7 @@ def detect_image(
         return _detect_circles(image, camera, target, board, options, dots=dots)
     boards = {face.id: face.printed for face in printed.faces} | ({} if corners is None else {BOARD: corners.printed})
     views, notes = find_on_faces(image, "", boards, camera)  # type: ignore[arg-type]
-    detection = ImageDetection(_corners(np.zeros((0, 2)), np.zeros((0, 2, 2)), camera), ())
+    detection = ImageDetection(NO_CENTRES, ())
     if circles.faces or (board is not None and corners is None):
         aside = None
         if corners is not None and BOARD in views:  # circles are searched outside of the board and a step about it
@@ -157,57 +162,48 @@ def _detect_circles(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
-    grey, free = grey_fine(image), reading.free
-    named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards if dots else ()
+    free, named, refused = reading.free, reading.faces.faces, reading.faces.refused
     of_board = board.polarity if board else target.polarity
-    used = [np.unique(np.concatenate([reading.used() for reading in nameless])) for nameless in refused]
-    patterns: list[_Pattern] = [(target.polarity, free.select(face.used()), face.labels()) for face in named]
-    for own in used:
-        patterns.append((target.polarity, free.select(own), [NAMELESS] * len(own)))
-    for grid in boards:
-        patterns.append((of_board, reading.found[of_board].select(grid.candidates), [DOT] * len(grid.candidates)))
-    measured = _measured(grey, camera, patterns, reading.found)
+    patterns: list[_Pattern] = []
+    for face in named:
+        patterns.append((target.polarity, free, face.rows, face.labels(target.face(face.face)), (face,)))
+    for faces in refused:
+        rows = np.unique(np.concatenate([face.rows for face in faces]))
+        patterns.append((target.polarity, free, rows, [NAMELESS] * len(rows), faces))
+    for grid in reading.boards if dots else ():
+        patterns.append((of_board, reading.found[of_board], grid.rows, [DOT] * len(grid.rows), (grid,)))
+    measured = _measured(grey_fine(image), camera, patterns, reading.found)
     notes: list[str] = []
     if reading.untried:
         every, tried = len(free) + reading.untried, f"the {len(free)} largest were tried for faces"
         remedy = "keep fine patterns out of view, or raise --min-diameter"
         notes.append(f"{every} outlines like circles beside the board, {tried}; {remedy}")
-    for (_, _, names), centres in zip(patterns, measured, strict=True):
+    parts, sightings = [NO_CENTRES], []
+    for (_, ellipses, rows, names, own), centres in zip(patterns, measured, strict=True):
         for i in np.flatnonzero(~centres.ok).tolist():
             share = f"{100 * centres.rim[i]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
             why = f"{share}; partly hidden or disturbed, left out"
             if centres.rim[i] >= MIN_RIM:
                 why = "σ of its centre is not determined, left out; check the distortion in the camera file"
             notes.append(f"{names[i]}: {why}")
-    ends = np.cumsum([0, *(int(centres.ok.sum()) for centres in measured)])
-    rows = [(centres.ok, np.arange(*own)) for centres, own in zip(measured, pairwise(ends), strict=True)]
+        row = np.full(len(ellipses), -1)
+        row[rows[centres.ok]] = sum(map(len, parts)) + np.arange(centres.ok.sum())
+        parts.append(centres.select(centres.ok))
+        sightings.append(tuple(each.by(row) for each in own))
     first, second = len(named), len(named) + len(refused)
-    faces, open_faces = [], []
-    for face, (ok, own) in zip(named, rows[:first], strict=True):
-        faces.append(FaceSighting(face.face.id, own, np.flatnonzero(face.index >= 0)[ok]))
-    for nameless, candidates, (ok, own) in zip(refused, used, rows[first:second], strict=True):
-        row = np.full(len(free) + 1, -1)  # of each candidate among the centres; −1, as for none, if it is not measured
-        row[candidates[ok]] = own
-        sightings = []
-        for face in nameless:
-            circles = np.flatnonzero(row[face.index] >= 0)
-            sightings.append(FaceSighting(face.face.id, row[face.index[circles]], circles))
-        open_faces.append(tuple(sightings))
-    grids = zip(boards, rows[second:], strict=True)
-    none = measure_centres(grey, camera, free.select(np.zeros(0, int)), free)
     return ImageDetection(
-        Centres.concatenate([none, *(centres.select(np.flatnonzero(centres.ok)) for centres in measured)]),
-        tuple(faces),
-        tuple(BoardSighting(own, grid.numberings[:, ok], grid.unlikely[:, ok]) for grid, (ok, own) in grids),
-        tuple(face.face.id for face in reading.mirrored),
+        Centres.concatenate(parts),
+        tuple(face for (face,) in sightings[:first]),
+        tuple(grid for (grid,) in sightings[second:]),
+        reading.mirrored,
         tuple(notes),
         sum(len(e) for e in reading.found.values()),
-        tuple(open_faces),
+        tuple(sightings[first:second]),
     )
 
 
-_Pattern = tuple[Polarity, Ellipses, Sequence[Label | str]]
-"""Polarity of one face or board, its ellipses, and their names for notes."""
+_Pattern = tuple[Polarity, Ellipses, np.ndarray, Sequence[Label | str], tuple[FaceSighting | BoardSighting, ...]]
+"""Polarity of one face or board, candidates, its rows among them, names for notes, and what it may be."""
 
 
 def _measured(
@@ -218,10 +214,10 @@ def _measured(
     for polarity, every in found.items():
         members = [i for i, pattern in enumerate(patterns) if pattern[0] == polarity]
         if members:
-            groups = np.repeat(np.arange(len(members)), [len(patterns[i][1]) for i in members])
-            together = Ellipses.concatenate([patterns[i][1] for i in members])
-            centres = measure_centres(image, camera, together, every, groups)
-            measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(members)}
+            own = [patterns[i][1].select(patterns[i][2]) for i in members]
+            groups = np.repeat(np.arange(len(members)), [len(each) for each in own])
+            centres = measure_centres(image, camera, Ellipses.concatenate(own), every, groups)
+            measured |= {i: centres.select(groups == k) for k, i in enumerate(members)}
     return [measured[i] for i in range(len(patterns))]
 
 

@@ -20,10 +20,8 @@ CACHE_VERSION = 2
 QUALITY = 82
 MIN_WIDTH_PX = 1000
 LEFT_OUT = "left out of the adjustment"
-LEAST_CROSS_PX = 15
-"""Size of the cross on a circle that was left out, at least."""
-MIN_LABEL_GAP = 70.0
-"""Smallest distance between numbered dots, px at text size 1."""
+LEAST_CROSS_PX = 15  # size of the cross on a circle that was left out, at least
+MIN_LABEL_GAP = 70.0  # smallest distance between numbered dots, px at text size 1
 NAME_ROOM = 100.0
 """Distance of a face's name from the nearest centre, in units of its letters, from which on it has room there."""
 
@@ -101,13 +99,11 @@ def draw_overlay(
 def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLabel]:
     """Returns the numbered dots of the first row and column: the first and last, and all if there is room."""
     place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if isinstance(x, DotLabel)}
-    chosen = set()
-    for column in (True, False):
-        line = sorted((x for x in place if (x.column if column else x.row) == 0), key=lambda x: (x.row, x.column))
-        if line:
-            steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1)
-            roomy = len(line) > 1 and np.median(steps) > gap_px
-            chosen |= set(line if roomy else (line[0], line[-1]))
+    chosen: set[DotLabel] = set()
+    for side in ("row", "column"):
+        line = sorted((x for x in place if getattr(x, side) == 0), key=lambda x: (x.row, x.column))
+        steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1) if len(line) > 1 else np.zeros(1)
+        chosen |= set(line if np.median(steps) > gap_px else (*line[:1], *line[-1:]))
     return chosen
 
 

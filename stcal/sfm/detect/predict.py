@@ -1,4 +1,4 @@
-"""Search for circles at places predicted by an arrangement, or by the previous image."""
+"""Circles where an arrangement of planes predicts them: their search, and those that contradict the arrangement."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,29 +6,29 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from stcal.adjust.blocks import Huber
+from stcal.adjust.engine import Adjustment
 from stcal.design import Polarity
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import singular_values
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.plane import circle_image_offset, singular_values
+from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
-from stcal.sfm.detect.circles.candidates import (
+from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
     MAX_POSITION_ERROR_PX,
     MIN_DIAMETER_PX,
     EllipseOptions,
     Ellipses,
 )
-from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.circles.fits import MIN_SIGMA
+from stcal.sfm.detect.centres import MIN_RIM, MIN_SIGMA, measure_centres
 
 MAX_STRETCH = 1.15
 """Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end."""
-MAX_BLUR = 1.0
-"""Largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side."""
+MAX_BLUR = 1.0  # largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side
 MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
@@ -110,7 +110,7 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
     labels = [observed.labels[k] for k in rows]
     shapes_px = predicted.shape_px[np.array([place[label] for label in labels], int)]
-    widest, narrowest = _stretch(shapes_px, observed.shape[rows], observed.centre[rows], camera)
+    widest, narrowest = _stretch(shapes_px, observed.select(rows), camera)
     planes = np.array([label.plane for label in labels], str)
     reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
@@ -123,9 +123,9 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     return reasons
 
 
-def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
-    """Returns the largest and smallest ratio, in any direction, of measured ellipses (normalised) to expected ones."""
-    return singular_values(np.linalg.solve(shape_px, camera.pixel_jacobian(centre) @ shape))
+def _stretch(shape_px: np.ndarray, found: Centres | ImageObservations, camera: Camera) -> tuple[np.ndarray, ...]:
+    """Returns the largest and smallest ratio, in any direction, of measured ellipses to expected ones."""
+    return singular_values(np.linalg.solve(shape_px, camera.pixel_jacobian(found.centre) @ found.shape))
 
 
 def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> tuple[str, str]:
@@ -158,7 +158,7 @@ def measure_predicted(
     found = measure_centres(grey_fine(image), camera, expected, everything)
     contrast, needed = _contrast(found, [predicted.polarity[i] for i in wanted])
     off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
-    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
+    widest, narrowest = _stretch(expected.shape_px, found, camera)
     accepted = []
     for k, i in enumerate(wanted):
         kind, reason = "rim", f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
@@ -183,35 +183,147 @@ def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray,
     return contrast, MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
 
 
-def missed_notes(missed: dict[Label, str]) -> list[str]:
-    """Returns notes on circles that were expected in view and not measured."""
-    return _by_plane(missed, "should be in view and not measured")
+MISSED = "should be in view and not measured"
+CONTRADICTED = "left out, partly hidden or something else"
 
 
-def contradicted_notes(found: dict[Label, str]) -> list[str]:
-    """Returns notes on circles that contradict the others."""
-    return _by_plane(found, "left out, partly hidden or something else")
-
-
-def _by_plane(reasons: dict[Label, str], what: str) -> list[str]:
-    """Returns one note for each face, and one for the board, on circles with the reason of the first one."""
+def notes_by_plane(reasons: Mapping[Label, str], what: str) -> list[str]:
+    """Returns one note for each face, and one for the board, on circles with the reason of the first one; ``what`` :
+    :data:`MISSED` or :data:`CONTRADICTED`."""
     notes = []
     for plane in dict.fromkeys(label.plane for label in reasons):
-        place = "board" if plane == BOARD else f"face {plane}"
         first, *more = [label for label in reasons if label.plane == plane]
-        others = f" and {len(more)} more" if more else ""
+        place, others = "board" if plane == BOARD else f"face {plane}", f" and {len(more)} more" if more else ""
         notes.append(f"{place}: {first}{others} {what}; {first}: {reasons[first]}")
     return notes
 
 
-SEARCH = 5.0
-"""Search range about the predicted places, in mean radii of the circles, to each side."""
-COARSE_RADIUS_PX = 2.5
-"""Radius of the circles in the small picture that the common shift is measured in."""
-CORRELATED = 0.3
-"""Smallest significant correlation. Below it the shift is ignored."""
-LEVEL_PX = 9
-"""Side of the square in the small picture whose mean is subtracted."""
+HUBER_PX = 1.5
+"""Residual beyond which an observation loses weight: such residuals are of printed planes, not of centres."""
+BUNDLE_SETTLED = 1e-4  # relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient.
+BUNDLE_STEPS = 30
+
+
+def adjusted_planes(
+    cameras: Poses,
+    planes: Poses,
+    image: np.ndarray,
+    plane: np.ndarray,
+    xyz: np.ndarray,
+    seen: np.ndarray,
+    focal_px: float,
+) -> tuple[Poses, Poses]:
+    """Adjusts the poses camera_from_world of images and world_from_plane of planes, of which the first is fixed, to n
+    points: ``image``, ``plane`` (n,); ``xyz`` (n, 3) in the plane; ``seen`` (n, 2) measured, ideal px. Without
+    convergence the last state is returned, and the start where a point lies behind its camera: predictions are
+    verified anyway."""
+
+    def off(planes: Poses, cameras: Poses) -> np.ndarray:
+        xyz_camera = cameras[image] @ (planes[plane] @ xyz)
+        if (xyz_camera[:, 2] <= 0).any():
+            return np.full(seen.shape, np.inf)
+        return focal_px * perspective(xyz_camera)[0] - seen
+
+    def slopes(planes: Poses, cameras: Poses) -> tuple[np.ndarray, np.ndarray]:
+        turned = np.einsum("nij,nj->ni", planes.rotation[plane], xyz)
+        xyz_camera = cameras[image] @ (turned + planes.translation[plane])
+        by_point = focal_px * perspective(xyz_camera)[1]
+        placed = xyz_camera - cameras.translation[image]
+        return by_pose(by_point @ cameras.rotation[image], turned), by_pose(by_point, placed)
+
+    if not np.isfinite(off(planes, cameras)).all():
+        return cameras, planes
+    a = Adjustment()
+    on = [(a.block("planes", planes, fixed=[0]), plane), (a.block("cameras", cameras, eliminate=True), image)]
+    a.factor(off, on, derivatives=slopes, loss=Huber(HUBER_PX))
+    found = a.minimum(settled=BUNDLE_SETTLED, max_steps=BUNDLE_STEPS, damping=1e-3).state
+    return found["cameras"], found["planes"]
+
+
+MIN_LIMIT_PX = 0.5
+"""Largest deviation that never counts as outlying. Centres are good to hundredths, designs to tenths."""
+BEYOND = 4.0  # factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000
+BEYOND_SIGMA = 5.0
+"""Smallest outlying distance in σ of the centre; one normal error in 270 000 is larger (two coordinates)."""
+MIN_USUAL = 6
+"""Least number of circles for a plane's own pose and median; those of other planes are judged by the median of all."""
+ALIKE = 0.5  # relative difference up to which a circle's deviation in another image counts as the same
+MAX_ROUNDS = 10
+
+
+def outlying_circles(
+    cameras: Poses,
+    planes: Mapping[str, Rigid],
+    images: Sequence[ImageObservations],
+    patterns: Mapping[str, Pattern],
+    focal_px: float,
+) -> tuple[Poses, Poses, list[dict[Label, str]]]:
+    """Finds circles that contradict the others of their group; returns the poses of images and planes adjusted without
+    them, the given ones if there are none, and the reasons by label for each image."""
+    design = {
+        label: (k, *xyz, radius)
+        for k, pattern in enumerate(patterns[plane] for plane in planes)
+        for label, xyz, radius in zip(pattern.labels, pattern.xyz_mm(), pattern.radius_mm, strict=True)
+    }
+    labels: list[Label] = []
+    table: list[tuple[float, ...]] = []
+    for i, seen_in in enumerate(images):
+        for label, centre, sigma in zip(seen_in.labels, seen_in.centre, seen_in.sigma_px(), strict=True):
+            if label in design:
+                labels.append(label)
+                table.append((i, *design[label], *centre, sigma))
+    start, found = (cameras, Poses.of(planes.values())), [{} for _ in images]
+    if not labels:
+        return *start, found
+    numbers = np.array(table, float)
+    (image, plane), xyz, sigma_px = numbers[:, :2].astype(int).T, numbers[:, 2:5], numbers[:, 8]
+    poses = start
+    xyz_camera, rotation = _placed(*poses, image, plane, xyz)
+    offset = circle_image_offset(xyz_camera, rotation[:, :, 2], numbers[:, 5])
+    seen = focal_px * (numbers[:, 6:8] - perspective(offset)[0] + perspective(xyz_camera)[0])  # of the circles' centres
+    shown = np.array([len(np.unique(image[plane == p])) for p in range(len(planes))])
+    enough = np.bincount(plane)[plane] >= MIN_USUAL
+    alone = (shown[plane] == 1) & [label.plane != BOARD for label in labels] & enough
+    keep = np.ones(len(labels), bool)
+    for _ in range(MAX_ROUNDS):
+        if (use := keep & enough).any():
+            poses = adjusted_planes(*poses, image[use], plane[use], xyz[use], seen[use], focal_px)
+        xyz_camera, rotation = _placed(*poses, image, plane, xyz)
+        ideal, by_point = perspective(xyz_camera)
+        shift, by_place = seen - focal_px * ideal, focal_px * (by_point @ rotation[:, :, :2])
+        off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * sigma_px)
+        usual = np.full(len(off_px), np.median(off_px[keep]))
+        for p in np.unique(plane[keep & enough]):
+            usual[plane == p] = np.median(off_px[keep & (plane == p)])
+        limit = np.where(alone, limit, np.maximum(limit, BEYOND * usual))
+        outlying, moved_mm = keep & (off_px > limit), np.linalg.solve(by_place, shift[..., None])[..., 0]
+        for k in np.flatnonzero(outlying):  # what other images show alike is the design's
+            same = keep & (image != image[k]) & [label == labels[k] for label in labels]
+            apart_px = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
+            outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
+        if not outlying.any():
+            break
+        for i, p in {(image[k], plane[k]) for k in np.flatnonzero(outlying)}:  # the worst one alone: it biases others
+            own = np.flatnonzero(keep & (image == i) & (plane == p))
+            worst = own[np.argmax(np.where(outlying, off_px / limit, 0)[own])]
+            reason = f"{off_px[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
+            if alone[worst]:
+                reason = f"{labels[worst]} is {reason}, and no other image of the group tells which circles are right"
+            for k in own if alone[worst] else [worst]:
+                keep[k], found[i][labels[k]] = False, reason
+    return *(start if keep.all() else poses), found
+
+
+def _placed(cameras: Poses, planes: Poses, image, plane, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points of planes in the cameras' frames, (n, 3), and the rotations camera_from_plane, (n, 3, 3)."""
+    camera_from_plane = cameras[image] @ planes[plane]
+    return camera_from_plane @ xyz, camera_from_plane.rotation
+
+
+SEARCH = 5.0  # search range about the predicted places, in mean radii of the circles, to each side
+COARSE_RADIUS_PX = 2.5  # radius of the circles in the small picture that the common shift is measured in
+CORRELATED = 0.3  # smallest significant correlation. Below it the shift is ignored.
+LEVEL_PX = 9  # side of the square in the small picture whose mean is subtracted
 
 
 def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles) -> tuple[tuple[Label, ...], Centres]:

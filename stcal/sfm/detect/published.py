@@ -9,22 +9,23 @@ half of the 45° to the next name. Distances are measured in radii of the circle
 §1.2 does not mention, is found as everywhere in this package.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
+from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 from stcal.sfm.data.group_model import Centres
-from stcal.sfm.detect.circles.candidates import (
+from stcal.sfm.detect.candidates import (
     Candidates,
     EllipseOptions,
     Ellipses,
-    contrast_of,
+    FaceSighting,
+    ImageDetection,
     contrast_threshold,
     diameter_limits_px,
     distinct,
@@ -33,21 +34,15 @@ from stcal.sfm.detect.circles.candidates import (
 )
 from stcal.sfm.detect.dot_grid import find_boards
 from stcal.sfm.detect.image import image_corners
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-SMOOTHING_PX = 5
-"""Side of the Gaussian filter, px."""
-EQUAL_SIGMA_PX = 0.05
-"""σ of every centre. Its value does not matter, as it is equal for all."""
+SMOOTHING_PX = 5  # side of the Gaussian filter, px
+EQUAL_SIGMA_PX = 0.05  # σ of every centre. Its value does not matter, as it is equal for all.
 MIN_OUTLINE_PX = 6
-AREA_RATIO = 2.0
-"""Largest ratio of areas of equal circles in one pattern, due to perspective."""
-STEP_RATIO = 1.4
-"""Largest ratio of distances between neighbouring circles, due to perspective."""
+AREA_RATIO = 2.0  # largest ratio of areas of equal circles in one pattern, due to perspective
+STEP_RATIO = 1.4  # largest ratio of distances between neighbouring circles, due to perspective
 ZERO_COSINE = float(np.sin(np.radians(22.5)))
 """Largest cosine of directions that count as perpendicular: half way to those 45° off."""
-MAX_MISFIT = 0.25
-"""Largest distance of a circle from its place in the face's plane, in radii."""
+MAX_MISFIT = 0.25  # largest distance of a circle from its place in the face's plane, in radii
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,25 +134,22 @@ def detect_published(
     pattern = PublishedPattern.of(target)
     grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    ellipses = {polarity: contour_ellipses(grey, polarity, options) for polarity in sorted(polarities)}
-    counts = [len(of_polarity) for of_polarity in ellipses.values()]
-    start = dict(zip(ellipses, np.cumsum([0, *counts]).tolist(), strict=False))
-    candidates = {polarity: Candidates.of(of_polarity, camera) for polarity, of_polarity in ellipses.items()}
-    boards, free, own = [], np.ones(len(ellipses[target.polarity]), bool), candidates[target.polarity]
+    first, centres, candidates, boards, free = {}, [], {}, [], {}
+    for polarity in sorted(polarities):
+        every = contour_ellipses(grey, polarity, options)
+        own = candidates[polarity] = Candidates.of(every, camera)
+        first[polarity], free[polarity] = sum(map(len, centres)), np.ones(len(every), bool)
+        equal = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2))
+        centres.append(Centres.without_rims(every.centre_px, own.xy, own.shape, equal, every.contrast))
     if board is not None:
         for grid in find_boards(candidates[board.polarity], board, image_corners(camera)):
-            boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
-            if board.polarity == target.polarity:
-                free[grid.candidates] = False
-    faces, notes = _Rules(pattern, target, own, ellipses[target.polarity]).find(free)
-    centres = []
-    for polarity, every in ellipses.items():
-        equal, found = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2)), candidates[polarity]
-        centres.append(Centres.without_rims(every.centre_px, found.xy, found.shape, equal, every.contrast))
-    sightings = (FaceSighting(face, start[target.polarity] + rows, circles) for face, rows, circles in faces)
-    return ImageDetection(
-        Centres.concatenate(centres), tuple(sightings), tuple(boards), notes=tuple(notes), candidates=sum(counts)
-    )
+            boards.append(replace(grid, rows=first[board.polarity] + grid.rows))
+            free[board.polarity][grid.rows] = False
+    together = Centres.concatenate(centres)
+    own, start = target.polarity, first[target.polarity]
+    faces, notes = _Rules(pattern, target, candidates[own], together.centre_px[start:]).find(free[own])
+    sightings = tuple(replace(face, rows=start + face.rows) for face in faces)
+    return ImageDetection(together, sightings, tuple(boards), notes=tuple(notes), candidates=len(together))
 
 
 def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
@@ -172,22 +164,18 @@ def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptio
         (x, y), (d1, d2), angle_deg = cv2.fitEllipse(contour)
         if np.isfinite([x, y, d1, d2]).all() and min(d1, d2) >= options.min_axis_ratio * max(d1, d2) > 0:
             rows.append((x, y, d1 + 1, d2 + 1, angle_deg))  # a contour runs through the outermost pixels' centres
-    centre, shape = distinct(np.array(rows).reshape(-1, 5))
-    contrast = contrast_of(grey, polarity, centre, shape)
-    keep = contrast > contrast_threshold(grey, options)
-    return Ellipses(centre[keep], shape[keep], contrast[keep])
+    return distinct(grey, polarity, np.array(rows).reshape(-1, 5), contrast_threshold(grey, options))
 
 
 class _Rules:
     """§1.2 (3) on the ellipses of one image; directions are taken in the image without its distortion."""
 
-    def __init__(self, pattern: PublishedPattern, target: TargetDesign, candidates: Candidates, ellipses: Ellipses):
-        self.pattern, self.target, self.found, self.ellipses = pattern, target, candidates, ellipses
-        self.area = candidates.radius**2
+    def __init__(self, pattern: PublishedPattern, target: TargetDesign, found: Candidates, centre_px: np.ndarray):
+        self.pattern, self.target, self.found, self.centre_px = pattern, target, found, centre_px
+        self.area = found.radius**2
 
-    def find(self, free: np.ndarray) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[str]]:
-        """(face id, rows among the candidates, circles of the design) by face, and notes on rejected patterns."""
-        free = free.copy()
+    def find(self, free: np.ndarray) -> tuple[list[FaceSighting], list[str]]:
+        """Returns the faces among the ``free`` candidates, and notes on rejected patterns."""
         faces, notes = [], []
         for origin in np.argsort(-self.area, kind="stable").tolist():
             if not free[origin]:
@@ -198,14 +186,14 @@ class _Rules:
             if _cross(*(self.found.xy[beside] - self.found.xy[origin])) > 0:  # the image's y points down
                 beside.reverse()
             circles = {self.pattern.origin: origin, self.pattern.a: beside[0], self.pattern.b: beside[1]}
-            where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.ellipses.centre_px[origin])
+            where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.centre_px[origin])
             named = self._walk(circles, free) or self._name(circles, free)
             if isinstance(named, str):
                 notes.append(f"{where}: {named}; left out by the published rules")
                 continue
-            face, rows, note = named
-            free[rows] = False
-            faces.append((face.id, rows, np.arange(len(face.ids))))
+            face, note = named
+            free[face.rows] = False
+            faces.append(face)
             notes += [f"{where}: {note}"] if note else []
         return faces, notes
 
@@ -242,8 +230,8 @@ class _Rules:
                 direction = _fitted_direction(on_line, direction)
         return ""
 
-    def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceDesign, np.ndarray, str]:
-        """Face named by circle c, the rows of its circles in the design's order, and a note; or why there is none."""
+    def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceSighting, str]:
+        """Returns the face named by circle c, and a note; or why there is none."""
         pattern = self.pattern
         last = circles[pattern.last]
         labelled = set(circles.values())
@@ -261,12 +249,13 @@ class _Rules:
         places = [face.xy_mm[face.ids.index(pattern.c)] for face in self.target.faces]
         face = self.target.faces[int(np.linalg.norm(places - placed, axis=1).argmin())]
         rows = np.array([{**circles, pattern.c: beside[0]}[circle] for circle in face.ids])
+        sighting = FaceSighting(face.id, rows, np.arange(len(rows)))
         if published == face.id:
-            return face, rows, ""
+            return sighting, ""
         cosine = direction @ diagonal / np.linalg.norm(direction)
         said = f"(cosine {cosine:+.2f}) say {f'face {published}' if published else 'no face'}"
         broken = f"perspective breaks the published name: the products in the image {said}, its own plane says"
-        return face, rows, f"{broken} face {face.id}, which was taken"
+        return sighting, f"{broken} face {face.id}, which was taken"
 
     def _placed(self, circles: dict[str, int], c: int) -> np.ndarray | str:
         """Returns circle c in the plane of the face, mm, or the reason why the others are no face."""

@@ -1,7 +1,9 @@
-"""Placement of a body by its faces of known shape: poses of faces and images, and the camera if it is unknown. Of the
-two reflections of each view (Schweighofer & Pinz 2006) those are taken on which the images agree."""
+"""The way of mapping by faces of known shape: the poses of faces and images, of the whole body at once, and the camera
+if it is unknown. Of the two reflections of each view (Schweighofer & Pinz 2006) those are taken on which the images
+agree."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +14,35 @@ from scipy.spatial.transform import Rotation
 from stcal.adjust.blocks import Block, Huber, Vector
 from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign
-from stcal.errors import DegenerateError, MappingError
-from stcal.geometry.camera import Camera
+from stcal.errors import ConvergenceError, DegenerateError, MappingError
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Normal, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
-from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
+from stcal.sfm.mapping.incremental import (
+    MAX_REPROJECTION_PX,
+    MIN_RAY_ANGLE_RAD,
+    Mapping,
+    complete,
+    left_out,
+    rays_of,
+    widest_angle_rad,
+)
+from stcal.sfm.mapping.models import assemble
+from stcal.sfm.mapping.pairs import PairScore, ray_angle_rad
 
+BY_FACES = "faces of known shape, placed together"
+SHOW_MORE = "show two faces of it at once, or one by more corners"
+LENS = "OPENCV"  # model of an unknown camera
+SIGMA_FOCAL, SIGMA_SQUARE = 0.5, 2e-3
+"""Relative σ of the focal length of an unknown camera, and of the ratio of its two focal lengths."""
+SIGMA_CENTRE = 0.03  # σ of its principal point, in longer image sides
+SIGMA_RADIAL, SIGMA_TANGENTIAL = np.array([0.3, 0.1]), 0.003
+"""σ of its distortion, as shares of a corner's distance from the middle of the image: lenses of cameras have no more,
+and few or small faces would take noise for it."""
 MIN_CORNERS = 4  # smallest number of corners of a view of a face: they determine its homography
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 """Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
@@ -31,8 +53,7 @@ LEAST_PAIRS, ROBUST_SIZES = 2, 10
 """Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
 MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 """Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
-LEAST_SIGMA_OFF = 0.02
-"""σ of such a logarithm that the reflections of views and a rough camera leave to any."""
+LEAST_SIGMA_OFF = 0.02  # σ of such a logarithm that the reflections of views and a rough camera leave to any
 LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
 BETTER = 0.2  # share by which another pose of a face must fit its corners better
 BY_CHANCE = 0.01  # number of sound corners in a run that may be taken for gross errors
@@ -63,20 +84,17 @@ class Corners:
             label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
         }
         rows: list[tuple[int, int, int]] = []
-        pixels, covariances = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+        seen = [ImageObservations("", "", (), *np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))]
         for i, image in enumerate(observations):
-            own = [k for k, label in enumerate(image.labels) if label in place]
-            of_face = np.array([place[image.labels[k]][0] for k in own], int)
-            keep = [k for k, f in zip(own, of_face, strict=True) if (of_face == f).sum() >= MIN_CORNERS]
+            of_face = np.array([place.get(label, (-1,))[0] for label in image.labels], int)
+            keep = np.flatnonzero((of_face >= 0) & (np.sum(of_face[:, None] == of_face, axis=1) >= MIN_CORNERS))
             rows += [(i, *place[image.labels[k]]) for k in keep]
-            pixels.append(image.centre_px[keep])
-            covariances.append(image.covariance_px2[keep])
+            seen.append(image.select(keep))
         image, face, corner = np.array(rows, int).reshape(-1, 3).T
         xy = np.array([faces[f].xy_mm[k] for f, k in zip(face, corner, strict=True)]).reshape(-1, 2)
-        covariance = np.concatenate(covariances) + LEAST_SIGMA_PX**2 * np.eye(2)
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        names = tuple(each.name for each in observations)
-        return cls(names, tuple(faces), image, face, corner, xy, np.concatenate(pixels), root)
+        covariance = np.concatenate([each.covariance_px2 for each in seen]) + LEAST_SIGMA_PX**2 * np.eye(2)
+        root, xy_px = np.linalg.inv(np.linalg.cholesky(covariance)), np.concatenate([each.centre_px for each in seen])
+        return cls(tuple(each.name for each in observations), tuple(faces), image, face, corner, xy, xy_px, root)
 
     def select(self, keep: np.ndarray) -> "Corners":
         """Returns the corners of a mask."""
@@ -101,9 +119,8 @@ class Body:
 
     def xyz_camera(self, corners: Corners) -> np.ndarray:
         """Returns the corners in the frames of the cameras, (n, 3)."""
-        f, i = self.body_from_face, self.camera_from_body
-        body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
-        return np.einsum("nij,nj->ni", i.rotation[corners.image], body) + i.translation[corners.image]
+        xyz_body = self.body_from_face[corners.face] @ corners.xyz_face()
+        return self.camera_from_body[corners.image] @ xyz_body
 
     def lengths(self, corners: Corners) -> np.ndarray:
         """Returns the lengths of the residuals in σ, (n,); infinite behind a camera."""
@@ -124,16 +141,26 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
 
 
 def place_body(corners: Corners, camera: Camera) -> Body:
-    """Returns start values of all poses for a given camera."""
-    views = _Views.of(corners, camera)
+    """Returns start values of all poses for a given camera, linked by what most images agree on."""
+    views, count = _Views.of(corners, camera), len(corners.faces)
     edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
-            f"target: {len(corners.faces)} faces of known shape, but no image shows two of them; add images that show "
-            "neighbouring faces with at least four corners each",
+            f"target: {count} faces of known shape, but no image shows two of them; add images that show neighbouring "
+            "faces with at least four corners each",
         )
-    body_from_face, placed_faces = _tree(views, edges, len(corners.faces))
+    seen = np.bincount(views.face, minlength=count)
+    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
+    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
+        a, b = max(open_edges, key=lambda edge: edges[edge][1])
+        a_from_b = edges[a, b][0]
+        if a in poses:
+            poses[b] = poses[a] @ a_from_b
+        else:
+            poses[a] = poses[b] @ a_from_b.inverse()
+    placed_faces = np.isin(np.arange(count), list(poses))
+    body_from_face = Poses.of(poses.get(face, Rigid()) for face in range(count))
     camera_from_body, placed_images = _images(views, corners, body_from_face, placed_faces, camera)
     return Body(body_from_face, camera_from_body, camera, placed_faces, placed_images)
 
@@ -146,6 +173,10 @@ class _Views:
     face: np.ndarray
     poses: Poses  # (2v,) camera_from_face, both minima of each view one after the other
     cost: np.ndarray  # (v, 2)
+
+    def both(self, of: np.ndarray) -> Poses:
+        """Returns both poses of each of some views."""
+        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
 
     @classmethod
     def of(cls, corners: Corners, camera: Camera) -> "_Views":
@@ -207,33 +238,25 @@ class _Relative:
     b_place: np.ndarray  # (4p, 3)
     of_pair: np.ndarray  # (4p,)
     excess: np.ndarray  # (4p,) cost over that of the best pose of the image
+    turned_alike: np.ndarray  # (4p, 4p) whether two have the same rotation
 
     @classmethod
     def of(cls, pairs: list[tuple[int, int]], views: _Views) -> "_Relative":
         """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
         pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
-        both = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)])
-        a, b = both.T
-        back = np.swapaxes(views.poses.rotation[a], 1, 2)
+        a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
+        back, place = np.swapaxes(views.poses.rotation[a], 1, 2), views.poses.translation[..., None]
+        rotation = back @ views.poses.rotation[b]
         cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
-        return cls(
-            back @ views.poses.rotation[b],
-            (back @ views.poses.translation[a, :, None])[..., 0],
-            (back @ views.poses.translation[b, :, None])[..., 0],
-            np.repeat(np.arange(len(pairs)), 4),
-            (cost - cost.min(1, keepdims=True)).ravel(),
-        )
-
-    def turned_alike(self) -> np.ndarray:
-        """Returns whether two poses have the same rotation, (4p, 4p)."""
-        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2, -1, 1))
-        return turned < SAME_TURN_RAD
+        excess = (cost - cost.min(1, keepdims=True)).ravel()
+        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
+        a_place, b_place = ((back @ place[k])[..., 0] for k in (a, b))
+        of_pair = np.repeat(np.arange(len(pairs)), 4)
+        return cls(rotation, a_place, b_place, of_pair, excess, turned < SAME_TURN_RAD)
 
     def best(self, agrees: np.ndarray) -> tuple[int, int]:
         """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
-        votes = np.zeros(len(self.rotation))
-        for p in range(len(self.rotation) // 4):
-            votes += agrees[:, self.of_pair == p].any(1)
+        votes = agrees.reshape(len(agrees), -1, 4).any(2).sum(1)
         # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
         best = int(np.lexsort((self.excess, -votes))[0])
         return best, int(votes[best])
@@ -244,7 +267,7 @@ def _edge(pairs: list[tuple[int, int]], views: _Views) -> tuple[Rigid, int]:
     poses = _Relative.of(pairs, views)
     translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
-    agrees = poses.turned_alike() & (apart < SAME_PLACE)
+    agrees = poses.turned_alike & (apart < SAME_PLACE)
     best, votes = poses.best(agrees)
     near = np.flatnonzero(agrees[best])
     mean = Rotation.from_matrix(poses.rotation[near]).mean().as_matrix()
@@ -261,8 +284,7 @@ def wrong_sizes(corners: Corners, camera: Camera) -> tuple[dict[int, float], int
         if len(pairs) < LEAST_PAIRS:
             continue
         poses = _Relative.of(pairs, views)
-        agrees = poses.turned_alike()
-        near = np.flatnonzero(agrees[poses.best(agrees)[0]])
+        near = np.flatnonzero(poses.turned_alike[poses.best(poses.turned_alike)[0]])
         near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
         if len(near) < LEAST_PAIRS:
             continue
@@ -306,43 +328,36 @@ def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, f
     return off
 
 
-def _tree(views: _Views, edges: dict[tuple[int, int], tuple[Rigid, int]], faces: int) -> tuple[Poses, np.ndarray]:
-    """Returns body_from_face along the edges that most images agree on, and a mask of the linked faces."""
-    seen = np.bincount(views.face, minlength=faces)
-    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
-    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
-        a, b = max(open_edges, key=lambda edge: edges[edge][1])
-        a_from_b = edges[a, b][0]
-        if a in poses:
-            poses[b] = poses[a] @ a_from_b
-        else:
-            poses[a] = poses[b] @ a_from_b.inverse()
-    placed = np.array([face in poses for face in range(faces)])
-    return Poses.of(poses.get(face, Rigid()) for face in range(faces)), placed
-
-
 def _images(
     views: _Views, corners: Corners, body_from_face: Poses, placed_faces: np.ndarray, camera: Camera
 ) -> tuple[Poses, np.ndarray]:
     """Returns camera_from_body of each image: of what its views say, that which fits most of its corners best."""
-    count = len(corners.images)
-    rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
-    placed = np.zeros(count, bool)
-    f = body_from_face
-    body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
+    poses, placed = [Rigid(np.eye(3), [0.0, 0.0, 1.0]) for _ in corners.images], np.zeros(len(corners.images), bool)
+    xyz_body = body_from_face[corners.face] @ corners.xyz_face()
     for image in np.unique(views.image):
         own = np.flatnonzero((corners.image == image) & placed_faces[corners.face])
         if len(own) < MIN_POINTS:
             continue
-        part, candidates = corners.select(own), []
-        for v in np.flatnonzero((views.image == image) & placed_faces[views.face]):
-            for k in (2 * v, 2 * v + 1):
-                turn = views.poses.rotation[k] @ f.rotation[views.face[v]].T
-                candidates.append((turn, views.poses.translation[k] - turn @ f.translation[views.face[v]]))
-        costs = [_robust(_lengths(body[own] @ turn.T + shift, part, camera)) for turn, shift in candidates]
+        part, of = corners.select(own), np.flatnonzero((views.image == image) & placed_faces[views.face])
+        candidates = views.both(of) @ body_from_face[np.repeat(views.face[of], 2)].inverse()
+        costs = [_robust(_lengths(pose @ xyz_body[own], part, camera)) for pose in candidates]
         if min(costs, default=np.inf) < np.inf:
-            (rotation[image], translation[image]), placed[image] = candidates[int(np.argmin(costs))], True
-    return Poses(rotation, translation), placed
+            poses[image], placed[image] = candidates[int(np.argmin(costs))], True
+    return Poses.of(poses), placed
+
+
+def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
+    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
+    poses, camera_from_body = list(body.body_from_face), body.camera_from_body
+    for face in np.flatnonzero(body.placed_faces)[1:]:
+        part = corners.select((corners.face == face) & body.placed_images[corners.image])
+        of = np.flatnonzero((views.face == face) & body.placed_images[views.image])
+        candidates = [poses[face], *(camera_from_body[np.repeat(views.image[of], 2)].inverse() @ views.both(of))]
+        seen = (camera_from_body[part.image] @ (pose @ part.xyz_face()) for pose in candidates)
+        costs = np.array([_robust(_lengths(xyz, part, body.camera)) for xyz in seen])
+        costs[0] *= 1 - BETTER
+        poses[face] = candidates[int(np.argmin(costs))]
+    return Poses.of(poses)
 
 
 def adjust_body(
@@ -398,28 +413,6 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
     return at(*a.minimum(start, settled=1e-7, max_steps=MAX_STEPS).state.values())
 
 
-def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
-    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
-    rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
-    i = body.camera_from_body
-    for face in np.flatnonzero(body.placed_faces)[1:]:
-        own = np.flatnonzero((corners.face == face) & body.placed_images[corners.image])
-        part, xyz = corners.select(own), corners.xyz_face()[own]
-
-        candidates, costs = [(rotation[face].copy(), translation[face].copy())], []
-        for v in np.flatnonzero((views.face == face) & body.placed_images[views.image]):
-            back = i.rotation[views.image[v]].T
-            for k in (2 * v, 2 * v + 1):
-                shift = back @ (views.poses.translation[k] - i.translation[views.image[v]])
-                candidates.append((back @ views.poses.rotation[k], shift))
-        for turn, shift in candidates:
-            in_body = xyz @ turn.T + shift
-            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
-            costs.append(_robust(_lengths(seen, part, body.camera)) * (1.0 if costs else 1 - BETTER))
-        rotation[face], translation[face] = candidates[int(np.argmin(costs))]
-    return Poses(rotation, translation)
-
-
 def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
     """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
@@ -445,8 +438,8 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
         return []
     usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
     _, corner = np.unique(np.column_stack([used.face, used.corner]), axis=0, return_inverse=True)
-    for k in range(corner.max() + 1):
-        usual[corner == k] = np.maximum(usual[corner == k], robust_sigma(length[corner == k], 2))
+    for own in (corner == k for k in range(corner.max() + 1)):
+        usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
     limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
     return [
         Outlier(
@@ -461,3 +454,167 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
 def _robust(length: np.ndarray) -> float:
     """Returns the cost of residuals of these lengths, in σ, that hardly grows with gross ones."""
     return float((np.minimum(length, 1e3) ** 0.5).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBody:
+    """A body with the faces and images that are placed."""
+
+    body_from_face: dict[str, Rigid]
+    camera_from_body: dict[str, Rigid]
+    faces: tuple[FaceDesign, ...]
+    camera: Camera  # with the covariance of the assumptions about an unknown one
+    unlinked: tuple[str, ...]  # faces that are seen, and never with a placed one
+    contradictions: tuple[Outlier, ...]  # corners that lie elsewhere than the body has them
+
+    def unlinked_notes(self) -> list[str]:
+        """Returns a note for each face of known shape that no image shows together with one that is placed."""
+        return [
+            f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} "
+            "corners each; add one that does"
+            for face in self.unlinked
+        ]
+
+
+def plain_lens(camera: Camera) -> Camera:
+    """Returns a camera of this focal length with a tenth of the σ of :func:`unknown_lens` about no distortion and a
+    principal point in the middle: for images that do not tell these."""
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2
+    return unknown_lens(replace(camera, centre=middle, distortion=np.zeros_like(camera.distortion)), 0.1)
+
+
+def unknown_lens(camera: Camera, share: float = 1.0) -> Camera:
+    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values; ``share`` : factor on
+    the σ of distortion and principal point."""
+    side, focal = max(camera.width, camera.height), float(camera.focal.mean())
+    reach = float(np.hypot(camera.width, camera.height) / 2 / focal)
+    radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach
+    sigma = share * np.array([0.0, 0.0, *[SIGMA_CENTRE * side] * 2, *radial, *[tangential] * 2])
+    covariance = np.diag(sigma**2)
+    covariance[:2, :2] = focal**2 * (SIGMA_FOCAL**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 / 2 * np.eye(2))
+    return Camera.of(camera, LENS, covariance)
+
+
+def place_with_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
+) -> PlacedBody:
+    """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
+    corners = Corners.of(observations, faces)
+    _require_sizes(corners, camera)
+    body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
+    return _named(body, corners, camera)
+
+
+def place_and_find_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
+) -> PlacedBody:
+    """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
+    corners = Corners.of(observations, faces)
+    side, first = max(starts[0].width, starts[0].height), starts[0]
+    cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
+    _require_sizes(corners, first)
+    bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
+    best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
+    if best is None:
+        raise MappingError(
+            "E-BODY-NO-CAMERA",
+            f"camera: no focal length of {cameras[-1].focal[0]:.0f} px and less explains the views of the faces; check "
+            "the sizes in target.toml, or give a camera file with --camera",
+        )
+    lens = unknown_lens(best.camera)
+    assert lens.covariance is not None
+    basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
+    with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
+        best = settled_body(best, corners, basis, prior, lens)
+    return _named(best, corners, unknown_lens(best.camera))
+
+
+def _require_sizes(corners: Corners, camera: Camera) -> None:
+    """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
+    wrong, alike = wrong_sizes(corners, camera)
+    if not wrong:
+        return
+    names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
+    if alike < len(names):
+        told = (
+            f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+            f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states; measure the "
+            "side of each print"
+        )
+    else:
+        each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
+        told = (
+            f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other faces "
+            "agree with one another; measure the side of its print"
+        )
+    raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
+
+
+def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
+    """Returns the body with an adjusted focal length, None if there is none from this start."""
+    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
+    try:
+        for _ in range(2):  # the reflections are chosen again with the better camera
+            prior = np.array([[(2 * camera.focal[0]) ** -2]])
+            body = adjust_body(place_body(corners, camera), corners, basis, prior, camera)
+            camera = body.camera
+        return body
+    except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
+        return None
+
+
+def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
+    placed = np.flatnonzero(body.placed_faces).tolist()
+    return PlacedBody(
+        {corners.faces[f].id: body.body_from_face[f] for f in placed},
+        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
+        tuple(corners.faces[f] for f in placed),
+        camera,
+        tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
+        tuple(contradictions(body, corners)),
+    )
+
+
+def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:
+    """Returns the model of a group: placed images, points that two of them see, and what these determine further."""
+    placed = [image for image in group if image.name in body.camera_from_body]
+    if len(placed) < 2:
+        raise MappingError(
+            "E-BODY-FEW-IMAGES",
+            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, 2 "
+            "needed; add images that each show two faces",
+        )
+    designed: dict[Label, np.ndarray] = {
+        label: xyz
+        for face in body.faces
+        for label, xyz in zip(face.labels(), body.body_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+    }
+    rays = rays_of(placed, body.camera_from_body, designed)
+    xyz = {label: designed[label] for label, (_, ray) in rays.items() if widest_angle_rad(ray) > MIN_RAY_ANGLE_RAD}
+    poses = [body.camera_from_body[image.name] for image in placed]
+    model = assemble(WorldModel, group[0].group, placed, poses, xyz)
+    return complete(model, list(group), camera, MAX_REPROJECTION_PX)
+
+
+def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> Mapping:
+    """Maps one group by a body that its faces have placed, without the corners that contradict it."""
+    model = model_of_body(body, group, camera)
+    gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+    seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
+    is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+    missing = left_out(group, model, SHOW_MORE)
+    return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)
+
+
+def pair_of_model(model: WorldModel) -> PairScore:
+    """Returns the pair of images with most points in common: a report names one for each group."""
+    sees = np.zeros((len(model.images), len(model.labels)), bool)
+    sees[model.image_index, model.point_index] = True
+    shared = np.triu(sees.astype(int) @ sees.T.astype(int), 1)
+    i, j = np.unravel_index(int(shared.argmax()), shared.shape)
+    pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
+    both = model.xyz_model[sees[i] & sees[j]]
+    angle = ray_angle_rad(*(both - model.camera_from_model[k].inverse().translation for k in (i, j)))
+    length = float(np.linalg.norm(pose.translation)) or 1.0
+    pair, forward = (model.images[i], model.images[j], int(shared[i, j])), abs(float(pose.translation[2])) / length
+    return PairScore(*pair, angle, 1.0, forward, Rigid(pose.rotation, pose.translation / length), "chosen")

@@ -1,7 +1,9 @@
-"""The COLMAP database: one camera, one frame for each image, labelled keypoints, and matches."""
+"""COLMAP's bindings and its database: one camera, one frame for each image, labelled keypoints, and matches."""
 
+import ctypes
 import os
 import re
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,10 +14,28 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.io.table import csv_text
 from stcal.labels import CircleLabel
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.mapping.colmap import pycolmap
 
-CAMERA_ID = 1
-RIG_ID = 1
+# The bindings, imported only here, install signal handlers. The system's own are restored, of every signal and in any
+# thread: Python knows only some of them.
+_ROOM = 1024  # more bytes than the system's struct sigaction has anywhere
+_handlers: dict[int, ctypes.Array] = {}
+if os.name == "posix":
+    _system = ctypes.CDLL(None)
+    # They wait until the import ends: NumPy, which it may load, would make another error of an interrupt.
+    _blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    for _number in signal.valid_signals():
+        _before = ctypes.create_string_buffer(_ROOM)
+        if _system.sigaction(int(_number), None, _before) == 0:
+            _handlers[int(_number)] = _before
+try:
+    import pycolmap
+finally:
+    if os.name == "posix":
+        for _number, _before in _handlers.items():
+            _system.sigaction(_number, _before, None)
+        signal.pthread_sigmask(signal.SIG_SETMASK, _blocked)
+
+CAMERA_ID = RIG_ID = 1
 LOG_FATAL_ALONE = 3
 
 

@@ -4,6 +4,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,11 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
 from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import CAMERA_ID, unwritable
+from stcal.sfm.mapping.database import CAMERA_ID, pycolmap, unwritable
 from stcal.sfm.mapping.models import assemble, points_by_votes, rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 
-MIN_SHARE = 0.25
-"""Smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)."""
+MIN_SHARE = 0.25  # smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)
 MIN_RAY_ANGLE_RAD = np.radians(0.5)
 """Smallest value of the largest angle between the rays of a new point. Below it the depth is too uncertain."""
 
@@ -68,15 +67,13 @@ def rays_of(
     """Returns by label the rays on which placed images see it: projection centres, (k, 3), and directions, (k, 3)."""
     rays: dict[Label, list[tuple[np.ndarray, np.ndarray]]] = {}
     for image in images:
-        pose = poses[image.name]
-        for k, label in enumerate(image.labels):
+        world_from_camera = poses[image.name].inverse()
+        directions = np.pad(image.centre, ((0, 0), (0, 1)), constant_values=1.0) @ world_from_camera.rotation.T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        for label, direction in zip(image.labels, directions, strict=True):
             if label in labels:
-                direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
-                rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
-    return {
-        label: (np.array([centre for centre, _ in seen]), np.array([direction for _, direction in seen]))
-        for label, seen in rays.items()
-    }
+                rays.setdefault(label, []).append((world_from_camera.translation, direction))
+    return {label: (rows[:, 0], rows[:, 1]) for label, rows in ((label, np.array(r)) for label, r in rays.items())}
 
 
 def widest_angle_rad(direction: np.ndarray) -> float:
@@ -88,16 +85,18 @@ SEED = 1
 MAX_REPROJECTION_PX = 4.0  # largest reprojection error of an observation in the model (COLMAP's filter)
 MIN_AGREEMENT = 0.5  # share of the circles seen at least twice that a model must contain
 LOG_ERRORS_ONLY = 3
+SHOW_BOTH = "photograph faces and board together"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapping:
-    """Result of mapping one group."""
+    """Result of mapping one group in any way."""
 
-    model: WorldModel
+    model: WorldModel  # without the outliers
     outliers: tuple[Outlier, ...]  # observations with a large reprojection error
     left_out: dict[str, str]  # reason by image name
-    seeded: str  # how the initial pair was registered
+    seeded: str  # how the initial pair was registered, or the faces placed
+    remedy: str  # for images with too few circles in the model
 
 
 def map_group(
@@ -111,18 +110,20 @@ def map_group(
 ) -> Mapping:
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
-    names, pair, reconstruction = [image.name for image in group if image.name in skeleton], pairs[0], None
+    names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
     first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
+    own = partial(_own_mapping, database, names, ids, pair)
+    ways = {
+        "our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own,
+        "COLMAP's estimate of the chosen pair": lambda: seeded_mapping(
+            database, scratch, names, (ids[first.name], ids[second.name])
+        ),
+        "our relative pose of the chosen pair (COLMAP's gates refused its own)": own,
+    }
     try:
-        if share_board_alone(first, second):
-            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
-            reconstruction = _own_mapping(database, names, ids, pair)
-        if reconstruction is None:
-            seeded = "COLMAP's estimate of the chosen pair"
-            reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
-        if reconstruction is None:
-            seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
-            reconstruction = _own_mapping(database, names, ids, pair)
+        tried = [*ways.items()][not share_board_alone(first, second) :]
+        found = ((seeded, model) for seeded, way in tried if (model := way()) is not None)
+        seeded, reconstruction = next(found, ("", None))
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise
@@ -143,12 +144,10 @@ def map_group(
             f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
             "check that the camera file belongs to the images, and that nothing but the camera moved",
         )
-    return Mapping(model, outliers, left_out(group, model), seeded)
+    return Mapping(model, outliers, left_out(group, model), seeded, SHOW_BOTH)
 
 
-def left_out(
-    group: list[ImageObservations], model: WorldModel, remedy: str = "photograph faces and board together"
-) -> dict[str, str]:
+def left_out(group: Sequence[ImageObservations], model: WorldModel, remedy: str = SHOW_BOTH) -> dict[str, str]:
     """Returns why images of the group are not in the model, by image name; ``remedy`` for too few circles in it."""
     reasons = {}
     for image in group:
@@ -248,13 +247,9 @@ def labelled_model(
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     is_outlier = residual > MAX_REPROJECTION_PX
-    outliers = [
-        Outlier(
-            model.images[model.image_index[k]],
-            model.labels[model.point_index[k]],
-            float(residual[k]),
-            MAX_REPROJECTION_PX,
-        )
-        for k in np.flatnonzero(is_outlier)
-    ]
-    return model.without(is_outlier), tuple(outliers)
+    rows = np.column_stack([model.image_index, model.point_index])[is_outlier]
+    outliers = tuple(
+        Outlier(model.images[i], model.labels[p], float(off), MAX_REPROJECTION_PX)
+        for (i, p), off in zip(rows, residual[is_outlier], strict=True)
+    )
+    return model.without(is_outlier), outliers

@@ -19,8 +19,7 @@ from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.io.static_transforms import image_lines
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, M, MetricModel, WorldModel
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
+from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, pycolmap, to_colmap_px
 
 LOG_NOTHING = 4  # level of COLMAP's log that prints nothing. Errors are raised as exceptions.
 KEYPOINT_TOLERANCE_PX = 0.002
@@ -122,10 +121,8 @@ class ReadModel:
 def find_models(folder: str | Path) -> list[Path]:
     """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …)."""
     folder = Path(folder)
-    models = []
-    if folder.is_dir():
-        candidates = sorted([folder, *folder.glob("*"), *folder.glob("*/*")])
-        models = [p for p in candidates if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
+    places = sorted([folder, *folder.glob("*"), *folder.glob("*/*")]) if folder.is_dir() else []
+    models = [p for p in places if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
     if not models:
         raise InputError(
             "E-MODEL-UNREADABLE",
@@ -157,17 +154,9 @@ def read_model(
         if not image.has_pose:
             continue
         if image.name not in index_of_name:
-            is_cut = any(" " in name and name.split()[0] == image.name for name in index_of_name)
-            remedy = (
-                "COLMAP reads names in texts up to a space: write the model as binary"
-                if is_cut
-                else "give the run that the model's database came from"
-            )
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
-                f"{observations[-1].name}); {remedy}",
-            )
+            listed = f"{observations[0].name} … {observations[-1].name}"
+            cut = "; names with spaces need a binary model" if any(" " in name for name in index_of_name) else ""
+            raise _of_another_run(path, f"image {image.name} is not of this run ({listed}{cut})")
         i = index_of_name[image.name]
         tolerance_px = CORRECTION_TOLERANCE_PX if corrected_again else KEYPOINT_TOLERANCE_PX
         xy = require_keypoints(path, image, observations[i].labels, corrected_px[i], tolerance_px)
@@ -247,17 +236,23 @@ def _end_of(kind: str, data: bytes, at: int) -> int:
 
 def _require_whole(file: Path) -> None:
     """Checks the counts in a file: pycolmap reads past its end, for hours and until memory is full."""
-    data, at = read_bytes(file, MODEL_BYTES), 8
+    data, at, fault = read_bytes(file, MODEL_BYTES), 8, "ends too soon"
     try:
         for _ in range(struct.unpack_from("<Q", data)[0]):
-            at = _end_of(file.stem, data, at)
-            if at > len(data):
-                raise ValueError("ends too soon")
-    except (ValueError, struct.error) as error:
-        reason = "ends too soon" if isinstance(error, struct.error) else error
-        raise ValueError(f"{file.name}, {len(data)} bytes: {reason}") from error
-    if at != len(data):
-        raise ValueError(f"{file.name}: {len(data)} bytes, {at} by its own counts")
+            if (at := _end_of(file.stem, data, at)) > len(data):
+                break
+        fault = fault if at > len(data) else "" if at == len(data) else f"{at} by its own counts"
+    except struct.error:
+        pass
+    except ValueError as error:
+        fault = str(error)
+    if fault:
+        raise ValueError(f"{file.name}, {len(data)} bytes: {fault}")
+
+
+def _of_another_run(path: Path, fault: str) -> InputError:
+    remedy = "give the run that the model's database came from"
+    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; {remedy}")
 
 
 def require_keypoints(
@@ -270,19 +265,12 @@ def require_keypoints(
     """Returns the model's keypoints (k, 2), which must be the run's: only then do they determine labels."""
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN",
-            f"model {path}: image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}; "
-            "give the run that the model's database came from",
-        )
+        raise _of_another_run(path, f"image {image.name} has {len(xy)} keypoints, the run {len(corrected_px)}")
     off = np.abs(xy - corrected_px).max(axis=1, initial=0.0)
     if not (off <= tolerance_px).all():
         k = int(np.argmax(off))
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN",
-            f"model {path}: image {image.name}: keypoint {k} ({labels[k]}) is {off[k]:.4f} px off the run's, "
-            f"{tolerance_px:g} allowed; give the run that the model's database came from",
-        )
+        off_by = f"{off[k]:.4f} px off the run's, {tolerance_px:g} allowed"
+        raise _of_another_run(path, f"image {image.name}: keypoint {k} ({labels[k]}) is {off_by}")
     return xy
 
 
@@ -317,16 +305,14 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
 
 def _labelled_points(reconstruction: pycolmap.Reconstruction, observations: dict[str, ImageObservations]) -> set[int]:
     """Returns the ids of the points all of whose keypoints have one label; dots of two groups are different ones."""
-    labelled = set()
-    for point_id, point in reconstruction.points3D.items():
-        names = set()
-        for element in point.track.elements:
-            image = observations[reconstruction.image(element.image_id).name]
-            label = image.labels[element.point2D_idx]
-            names.add((image.group if isinstance(label, DotLabel) else "", label))
-        if len(names) == 1:
-            labelled.add(point_id)
-    return labelled
+
+    def label_of(element: pycolmap.TrackElement) -> tuple[str, Label]:
+        image = observations[reconstruction.image(element.image_id).name]
+        label = image.labels[element.point2D_idx]
+        return image.group if isinstance(label, DotLabel) else "", label
+
+    tracks = {i: point.track.elements for i, point in reconstruction.points3D.items()}
+    return {i for i, elements in tracks.items() if len({label_of(element) for element in elements}) == 1}
 
 
 def points_by_votes(

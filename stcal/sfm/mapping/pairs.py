@@ -1,8 +1,9 @@
 """Pairs of images: the initial pair by ray angle as in Zhang & Wei (2017), and the pairs that the database holds."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Literal
 
 import cv2
@@ -89,61 +90,51 @@ def rank_pairs(
 
 
 def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
-    prefix = f"group {group[0].group}: no initial pair"
+    angle, shared = (max((getattr(s, name) for s in scores), default=0) for name in ("median_angle_rad", "shared"))
+    least, limit = (f"{np.degrees(each):.0f}°" for each in (MIN_ANGLE_RAD, options.limit_rad()))
+    wrong = "check that the camera file belongs to the images"
     if not scores:
-        return f"{prefix}: 1 usable image, 2 needed; add photographs from other places"
-    angle = max(s.median_angle_rad for s in scores)
-    shared = max(s.shared for s in scores)
-    if shared < MIN_LABELS:
-        return f"{prefix}: at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
-    if angle < MIN_ANGLE_RAD:
-        return (
-            f"{prefix}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
-            f"{np.degrees(MIN_ANGLE_RAD):.0f}° needed); take the photographs from different places"
-        )
-    behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]
-    if behind:
+        why = ": 1 usable image, 2 needed; add photographs from other places"
+    elif shared < MIN_LABELS:
+        why = f": at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
+    elif angle < MIN_ANGLE_RAD:
+        moved = f"largest median ray angle {np.degrees(angle):.2f}°, {least} needed"
+        why = f": the camera did not move ({moved}); take the photographs from different places"
+    elif behind := [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]:
         best = max(behind, key=lambda s: s.in_front)
-        return (
-            f"{prefix}: {best.first}, {best.second}: {best.verdict}; check that the camera file belongs to the images, "
-            "and that nothing but the camera moved"
-        )
-    smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
-    return (
-        f"{prefix} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
-        f"{np.degrees(options.limit_rad()):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
-        "add views in between, raise --max-angle, or check that the camera file belongs to the images"
-    )
+        why = f": {best.first}, {best.second}: {best.verdict}; {wrong}, and that nothing but the camera moved"
+    else:
+        smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
+        measured = f"measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°"
+        remedy = f"add views in between, raise --max-angle, or {wrong}"
+        why = f" with a median ray angle of {least} to {limit} ({measured}); {remedy}"
+    return f"group {group[0].group}: no initial pair{why}"
 
 
 def _score(
     a: ImageObservations, b: ImageObservations, camera: Camera, options: PairOptions, board: BoardDesign | None
 ) -> PairScore:
     matches = match_labels(a, b)
-    n = len(matches)
-    if n < MIN_LABELS:
-        return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, f"{n} labels in common, {MIN_LABELS} needed")
+    n, pose = len(matches), None
     xy_a, xy_b = a.centre[matches[:, 0]], b.centre[matches[:, 1]]
-    if board is not None and share_board_alone(a, b):
-        xy_mm, pose = board.places_mm(a.labels[i] for i in matches[:, 0])[:, :2], None
+    if n >= MIN_LABELS and board is not None and share_board_alone(a, b):
+        xy_mm = board.places_mm(a.labels[i] for i in matches[:, 0])[:, :2]
         on_a, on_b = planar_pose(xy_mm, xy_a), planar_pose(xy_mm, xy_b)
         if on_a is not None and on_b is not None:
             b_from_a = on_b @ on_a.inverse()
             length = float(np.linalg.norm(b_from_a.translation))
             pose = Rigid(b_from_a.rotation, b_from_a.translation / length) if length > 0 else None
-    else:
+    elif n >= MIN_LABELS:
         pose = _relative_pose(xy_a, xy_b, RANSAC_PX / float(np.sqrt(camera.focal.prod())))
     if pose is None:
-        return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, "no essential matrix")
+        why = "no essential matrix" if n >= MIN_LABELS else f"{n} labels in common, {MIN_LABELS} needed"
+        return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, why)
     xyz, front = triangulate(xy_a, xy_b, pose)
-    to_a, to_b = xyz, xyz + pose.rotation.T @ pose.translation
-    cosine = (to_a * to_b).sum(1) / np.maximum(np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1), 1e-300)
-    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    angle = ray_angle_rad(xyz, xyz + pose.rotation.T @ pose.translation)
     in_front, forward = float(front.mean()), float(abs(pose.translation[2]))
     # If a rotation explains the pair, only noise determines the translation: angles and depths are meaningless.
-    rays_a, rays_b = (np.column_stack([xy, np.ones(n)]) for xy in (xy_a, xy_b))
-    rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
-    rays_b /= np.linalg.norm(rays_b, axis=1)[:, None]
+    rays_a, rays_b = (np.pad(xy, ((0, 0), (0, 1)), constant_values=1) for xy in (xy_a, xy_b))
+    rays_a, rays_b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (rays_a, rays_b))
     error = np.linalg.norm(rays_b - rays_a @ best_rotations(rays_b.T @ rays_a)[0].T, axis=1)
     if np.sqrt((error**2).mean()) * camera.focal.max() < RANSAC_PX:
         angle = min(angle, MIN_ANGLE_RAD / 2)
@@ -157,6 +148,13 @@ def _score(
     else:
         verdict = "usable"
     return PairScore(a.name, b.name, n, angle, in_front, forward, pose, verdict)
+
+
+def ray_angle_rad(to_a: np.ndarray, to_b: np.ndarray) -> float:
+    """Returns the median angle between the rays (n, 3) of n points; 0 without points."""
+    length = np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1)
+    cosine = (to_a * to_b).sum(1) / np.maximum(length, 1e-300)
+    return float(np.median(np.arccos(np.clip(cosine, -1, 1)))) if len(cosine) else 0.0
 
 
 def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigid | None:
@@ -235,14 +233,11 @@ def image_graph(
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:
     """Returns which image sees which circle, (images, circles) bool. Dots of two groups are different circles."""
-    column: dict[tuple[str, str], int] = {}
-    rows, columns = [], []
-    for i, image in enumerate(observations):
-        for label in image.labels:
-            columns.append(column.setdefault((image.group if isinstance(label, DotLabel) else "", label), len(column)))
-        rows += [i] * len(image)
+    seen = [[(i.group if isinstance(x, DotLabel) else "", x) for x in i.labels] for i in observations]
+    column = {circle: k for k, circle in enumerate(dict.fromkeys(chain.from_iterable(seen)))}
     sees = np.zeros((len(observations), len(column)), bool)
-    sees[rows, columns] = True
+    for row, circles in zip(sees, seen, strict=True):
+        row[[column[circle] for circle in circles]] = True
     return sees
 
 
@@ -250,15 +245,11 @@ def _direction(image: ImageObservations, board: BoardDesign) -> np.ndarray:
     """Returns the unit vector (3,) from the board's middle to the camera, board frame; nan if there is no pose."""
     dots = [k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)]
     if len(dots) >= MIN_DOTS:
-        design = board.places_mm(image.labels[k] for k in dots)[:, :2]
-        try:
+        design, xy = board.places_mm(image.labels[k] for k in dots)[:, :2], board.xy_mm()
+        with suppress(DegenerateError):
             camera_from_board = camera_from_plane(fit_homography(design, image.centre[dots]))
-        except DegenerateError:
-            return np.full(3, np.nan)
-        xy = board.xy_mm()
-        middle = np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
-        offset = camera_from_board.inverse().translation - middle
-        return offset / np.linalg.norm(offset)
+            offset = camera_from_board.inverse().translation - np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
+            return offset / np.linalg.norm(offset)
     return np.full(3, np.nan)
 
 
@@ -287,15 +278,13 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
     """Returns pairs of the group's other images with skeleton images: the nearest, and those their circles need."""
-    pairs = set()
-    skeleton = indices[chosen]
+    pairs, skeleton = set(), indices[chosen]
     for k in np.setdiff1d(np.arange(len(indices)), chosen):
         i = indices[k]
         near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
         order = skeleton[np.argsort(-near, kind="stable")]
         order = order[shared[i, order] >= MIN_SHARED]
-        picked = list(order[:NEIGHBOURS])
-        candidates = list(order[NEIGHBOURS:])
+        picked, candidates = list(order[:NEIGHBOURS]), list(order[NEIGHBOURS:])
         open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
         while open_labels.any():
             best = max(candidates, key=lambda j: int((seen[j] & open_labels).sum()))

@@ -24,11 +24,18 @@ from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.group_model import ImageObservations, by_group
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect import predict
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
+from stcal.sfm.detect.predict import (
+    CONTRADICTED,
+    MISSED,
+    contradictions,
+    measure_predicted,
+    notes_by_plane,
+)
 from stcal.sfm.measurement.pose import (
     PoseOptions,
     TargetPose,
@@ -184,15 +191,13 @@ class Tracker:
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
-        wrong = predict.contradictions(
-            self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera
-        )
-        seen = seen.without(wrong, predict.contradicted_notes(wrong))
+        wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
+        seen = seen.without(wrong, notes_by_plane(wrong, CONTRADICTED))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
-        measured = predict.measure_predicted(image, camera, predicted, self.ellipses)
-        missed = predict.missed_notes(measured.missed)
+        measured = measure_predicted(image, camera, predicted, self.ellipses)
+        missed = notes_by_plane(measured.missed, MISSED)
         if not measured.labels:
             return replace(seen, notes=(*seen.notes, *missed))
         return seen.plus(measured.labels, measured.centres, missed)

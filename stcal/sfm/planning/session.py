@@ -34,8 +34,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import with_edge_sigma
 from stcal.sfm.data.group_model import ImageObservations, MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
+from stcal.sfm.mapping.body import unknown_lens
 from stcal.sfm.mapping.models import assemble
-from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.planning.forecast import (
     FORECAST,
     MICRO,

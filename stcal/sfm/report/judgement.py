@@ -12,7 +12,7 @@ from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.document import sentence
 from stcal.report.text import join, number, significant
-from stcal.sfm.data.group_model import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
+from stcal.sfm.data.group_model import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN
 from stcal.sfm.report.check import CAUSE, SUSPICIOUS, Check, invalidated, ranked
 
 TAIL = 2.0
@@ -241,7 +241,7 @@ class _Run:
     def _seen(self, face: str) -> str:
         """Returns how a face that is not in the result was seen nevertheless; empty if it was not."""
         notes, left_out = self.report["left_out"]["notes"], self.report["left_out"]["circles"]
-        if images := {n["image"] for n in notes if n["code"] in (ELSEWHERE, SINGLE) and n["place"] == face}:
+        if images := {n["image"] for n in notes if n["code"] == ELSEWHERE and n["place"] == face}:
             return f"face {face} was read in {len(images)} image{'s' * (len(images) > 1)} and left out"
         if any(row["label"].startswith(f"{face}:") for row in [*self.report["residuals_by_label"], *left_out]):
             return f"face {face} is not in it: circles of it were seen, but they do not hold its frame"

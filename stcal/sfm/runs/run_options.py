@@ -16,7 +16,7 @@ from stcal.io.toml import LEAST
 from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.chain import FrameKind
 from stcal.sfm.data.group_model import faces_in_name
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 
 Compare = Literal["paper"]

@@ -44,7 +44,7 @@ from stcal.sfm.adjust.refine import ScaleSource, projection_jacobians, with_edge
 from stcal.sfm.adjust.uncertainty import with_differences
 from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, by_group
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.database import image_ids

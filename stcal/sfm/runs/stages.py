@@ -42,19 +42,18 @@ from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, 
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
-from stcal.sfm.mapping.body import MIN_CORNERS
-from stcal.sfm.mapping.database import image_ids, write_database
-from stcal.sfm.mapping.incremental import left_out, map_group
-from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
-from stcal.sfm.mapping.placed import (
-    BY_FACES,
+from stcal.sfm.mapping.body import (
     LENS,
-    model_of_body,
+    MIN_CORNERS,
+    map_body,
     pair_of_model,
     place_and_find_camera,
     place_with_camera,
     unknown_lens,
 )
+from stcal.sfm.mapping.database import image_ids, write_database
+from stcal.sfm.mapping.incremental import Mapping, left_out, map_group
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
 from stcal.sfm.report.check import Check
 from stcal.sfm.runs.run_options import RunOptions, is_vague, require_dots
 from stcal.sfm.runs.transaction import RunFolder
@@ -62,7 +61,6 @@ from stcal.sfm.runs.transaction import RunFolder
 CACHE_VERSION = 8
 LEAST_WITHOUT, MOST_WITHOUT = 3, 40
 """Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
-SHOW_MORE = "show two faces of it at once, or one by more corners"
 UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)
 """Errors by which one group has no solution, while others may."""
 LIKELY = "; the likely cause: "
@@ -465,9 +463,17 @@ def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
         refined = refine_or_explain(mapping.model, camera, group.target, board, group.eccentricity)
     except UNSOLVED as error:
         return error
-    missing = mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model)
-    outliers, ranked = (*mapping.outliers, *refined.outliers), [replace(p, second_from_first=None) for p in pairs]
-    return GroupSolution(tuple(ranked), refined.model, mapping.seeded, refined.rounds, missing, outliers)
+    return _solution(images, mapping, refined, [replace(p, second_from_first=None) for p in pairs])
+
+
+def _solution(
+    images: Sequence[ImageObservations], mapping: Mapping, refined: Refined, pairs: Sequence[PairScore]
+) -> GroupSolution:
+    """Returns the solution of a group that was mapped in any way."""
+    missing = left_out([i for i in images if i.name in mapping.model.images], refined.model, mapping.remedy)
+    outliers = *mapping.outliers, *refined.outliers
+    reasons = mapping.left_out | missing
+    return GroupSolution(tuple(pairs), refined.model, mapping.seeded, refined.rounds, reasons, outliers)
 
 
 def _save(path: Path, solution: GroupSolution) -> None:
@@ -499,17 +505,12 @@ def _solve_body(task: Task, groups: Groups) -> tuple[dict[str, GroupSolution], l
 
     def solved(name: str) -> GroupSolution:
         try:
-            model = model_of_body(body, images[name], camera)
-            gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
-            seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
-            is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
-            refined = refine_or_explain(model.without(is_gross), camera, task.target, board, eccentricity)
+            mapping = map_body(body, images[name], camera)
+            refined = refine_or_explain(mapping.model, camera, task.target, board, eccentricity)
             find_scale(refined.model, board)
         finally:
             step(None)
-        missing = left_out(images[name], refined.model, SHOW_MORE) | left_out(images[name], model, SHOW_MORE)
-        pair, outliers = pair_of_model(refined.model), (*gross.values(), *refined.outliers)
-        return GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers)
+        return _solution(images[name], mapping, refined, [pair_of_model(refined.model)])
 
     solutions, notes = _each_group(images, solved)
     return solutions, notes + body.unlinked_notes()

@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.rims import RadiusViews, Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board_checks import rim_check
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.planning.forecast import observe, true_models

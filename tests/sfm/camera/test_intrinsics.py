@@ -28,7 +28,7 @@ from stcal.sfm.camera.intrinsics import (
     start_camera,
 )
 from stcal.sfm.data.group_model import Centres, ImageObservations
-from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
+from stcal.sfm.detect.candidates import BoardSighting, ImageDetection
 from tests.outcome import fails_with
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])

@@ -9,7 +9,7 @@ from stcal.design import reference_board, reference_target
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.data.group_model import detections_csv
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files
 from stcal.sfm.detect.labelling import LabelledImage, label_images
 from tests.scripts import load_script

@@ -10,9 +10,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.sfm.data.group_model import Centres
 from stcal.sfm.data.patterns import patterns_of
+from stcal.sfm.detect.candidates import BoardSighting, FaceSighting, ImageDetection
 from stcal.sfm.detect.labelling import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
-from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 FOCAL_PX = 2787.0
 TARGET = reference_target()

@@ -8,7 +8,7 @@ import pytest
 from stcal.io.images import decode
 from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.data.patterns import patterns_of
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single

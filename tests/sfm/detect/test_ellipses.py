@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.sfm.detect.circles.candidates import EllipseOptions, find_ellipses
+from stcal.sfm.detect.candidates import EllipseOptions, find_ellipses
 
 
 def picture(size=(900, 1200), level=40):

@@ -11,7 +11,7 @@ from stcal.errors import InputNote
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import MAJORITY, find_images
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, detect_files, sized_by
 from tests.outcome import fails_with
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import read_image
 from tests.levels import sampled
 from tests.sfm.detect.degraded import KINDS
@@ -31,8 +31,8 @@ def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench, face)
     photo = bench.groups("12").photographs[0]
     (dark,) = [plane for plane in photo.faces if plane.name == face]
     reading = read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
-    assert {each.face.id: each.count() for each in reading.faces.faces} == {"1": 10, "2": 10}
-    assert [len(board.candidates) for board in reading.boards] == [63]
+    assert {each.face: len(each.rows) for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert [len(board.rows) for board in reading.boards] == [63]
 
 
 @pytest.mark.parametrize("factor", [3.0, 1 / 3])
@@ -46,8 +46,8 @@ def test_an_image_alone_reads_a_board_in_other_light_than_the_target(bench, fact
     darker = float(np.percentile(pixels[target], 99) / np.percentile(photo.grey[target], 99))
     assert after / before / darker == pytest.approx(factor, rel=0.02)  # light, not exposure
     reading = read(bench, pixels)
-    assert {each.face.id: each.count() for each in reading.faces.faces} == {"1": 10, "2": 10}
-    assert [len(board.candidates) for board in reading.boards] == [63]
+    assert {each.face: len(each.rows) for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert [len(board.rows) for board in reading.boards] == [63]
 
 
 @pytest.mark.parametrize("group", sampled(["12", "14", "15", "23"]))

@@ -8,7 +8,7 @@ from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.detect import image as stage
-from stcal.sfm.detect.circles.candidates import OPTION_RANGES, EllipseOptions
+from stcal.sfm.detect.candidates import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from tests.outcome import fails_with
 

@@ -13,9 +13,10 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
+from stcal.sfm.detect.candidates import BoardSighting
 from stcal.sfm.detect.detect_files import DetectedImage, require_upright
+from stcal.sfm.detect.face_patterns import mirror_images
 from stcal.sfm.detect.labelling import label_groups
-from stcal.sfm.detect.sightings import BoardSighting, mirror_images
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene

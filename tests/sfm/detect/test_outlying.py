@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stcal.geometry.plane import apply_homography, fit_homography
+from stcal.geometry.rigid import Poses
 from stcal.sfm.data.patterns import patterns_of
-from stcal.sfm.detect.group_geometry import MIN_LIMIT_PX, Arrangement, outlying_circles
-from stcal.sfm.detect.labelling import label_groups
+from stcal.sfm.detect.labelling import Arrangement, label_groups
+from stcal.sfm.detect.predict import MIN_LIMIT_PX, outlying_circles
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen
 
 
@@ -43,7 +44,10 @@ class Group:
                 self.images[i] = seen.select(rows)
 
     def outlying(self) -> tuple[Arrangement, dict]:
-        return outlying_circles(self.arrangement, self.images, self.patterns, FOCAL_PX)
+        known = self.arrangement
+        cameras, seen = Poses.of(known.camera_from_group.values()), [self.images[i] for i in known.camera_from_group]
+        *poses, found = outlying_circles(cameras, known.group_from_plane, seen, self.patterns, FOCAL_PX)
+        return known.moved(*poses), {i: own for i, own in zip(known.camera_from_group, found, strict=True) if own}
 
     def assert_out(self, expected):
         found = self.outlying()[1]
@@ -59,7 +63,8 @@ def group(scene, group):
 def test_what_is_in_its_place_stays_and_leaves_the_arrangement_as_it_is(group):
     arrangement, found = group.outlying()
     assert found == {}
-    assert arrangement is group.arrangement
+    for i, pose in group.arrangement.camera_from_group.items():
+        np.testing.assert_array_equal(arrangement.camera_from_group[i].matrix(), pose.matrix())
 
 
 @pytest.mark.parametrize(("by_px", "out"), [(0.6 * MIN_LIMIT_PX, False), (2.0 * MIN_LIMIT_PX, True), (30.0, True)])

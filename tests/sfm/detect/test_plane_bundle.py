@@ -3,7 +3,7 @@
 import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.sfm.detect.group_geometry import PlaneBundle
+from stcal.sfm.detect.predict import adjusted_planes
 
 FOCAL_PX = 1000.0
 GRID = np.array([[x, y, 0.0] for x in range(-40, 60, 20) for y in range(-40, 60, 20)])
@@ -20,10 +20,10 @@ def test_an_image_without_points_keeps_its_pose():
             plane += [k] * len(GRID)
             xyz.append(GRID)
             seen.append(FOCAL_PX * at[:, :2] / at[:, 2:])
-    bundle = PlaneBundle(np.array(image), np.array(plane), np.concatenate(xyz), np.concatenate(seen), FOCAL_PX)
     off = Rigid.exp([2e-3, -1e-3, 1e-3, 0.5, 0.3, 1.0])
     start = Poses.of(pose @ off for pose in poses)
-    found, world_from_plane = bundle.adjusted(start, Poses.of([planes[0], planes[1] @ off]))
+    points = np.array(image), np.array(plane), np.concatenate(xyz), np.concatenate(seen), FOCAL_PX
+    found, world_from_plane = adjusted_planes(start, Poses.of([planes[0], planes[1] @ off]), *points)
     for i in (0, 2):
         np.testing.assert_allclose(found[i].matrix(), poses[i].matrix(), atol=1e-6)
     np.testing.assert_array_equal(found[1].matrix(), (poses[1] @ off).matrix())

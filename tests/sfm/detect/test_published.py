@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX, PublishedPattern, detect_published
 from tests.outcome import fails_with
 from tests.sfm.detect.test_identity import CAMERA, TARGET, face_ellipses, pose

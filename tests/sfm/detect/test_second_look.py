@@ -1,5 +1,5 @@
-"""The second look: circles that are not as large as their plane asks for are taken out, those that are missing are
-measured where they must be, and a face that one image alone reads is held against the others."""
+"""The second look: circles that are not as large as their plane asks for are taken out, and those that are missing are
+measured where they must be."""
 
 import cv2
 import numpy as np
@@ -9,10 +9,8 @@ from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.group_model import ImageObservations
-from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.detect.labelling import _second, labelled_image
-from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, SecondLook, contradictions, measure_predicted
-from tests.sfm.detect.test_arrangement import centres_of
+from stcal.sfm.detect.candidates import EllipseOptions
+from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet
 
 CAMERA = Camera(1600, 1200, [2500.0, 2400.0], [799.5, 599.5], [-0.12, 0.08, 1e-3, -5e-4, 0, 0, 0, 0])
@@ -230,63 +228,3 @@ def test_circles_of_other_sizes_than_the_options_ask_for_are_not_measured():
     assert circles.look(shape_px=shape).missed == {
         "1:1": f"4.0 px across, 4.5 to 450 px asked for; {REMEDIES['small']}"
     }
-
-
-def centres(n):
-    return centres_of(np.ones((n, 2)), np.ones((n, 2)))
-
-
-def read(name, *faces):
-    """An image that has read all circles of these faces."""
-    labels = [label for face in faces for label in reference_target().face(face).labels()]
-    return labelled_image(name, "12", labels, centres(len(labels)), ("a note of its own",))
-
-
-def looked(face, found, missed):
-    """A second look for so many circles of a face that finds some."""
-    labels = reference_target().face(face).labels()
-    return SecondLook(labels[:found], centres(found), dict.fromkeys(labels[found : found + missed], "hidden"))
-
-
-def faces_of(images):
-    return [set(each.observations.face_ids()) for each in images]
-
-
-@pytest.mark.parametrize(("found", "missed"), [(0, 3), (0, 10), (1, 9), (1, 5)])
-def test_a_face_that_one_image_reads_and_others_do_not_show_goes_out_with_a_note(found, missed):
-    """In two others; less than a fifth of what they must show is there. What these found of it goes as well."""
-    group = [read("12/0", "1", "5"), read("12/1", "1"), read("12/2", "1")]
-    looks = {name: looked("5", found, missed) for name in ("12/1", "12/2")}
-    images = _second(group, looks)
-    assert faces_of(images) == [{"1"}] * 3
-    words = f"face 5: read in one image of the group alone, {2 * found} of {2 * (found + missed)} of its circles found"
-    assert images[0].notes[0] == "a note of its own"
-    assert images[0].notes[1].startswith(words)
-    assert len(images[0].notes) == 2
-    assert all(len(image.observations) >= 10 for image in images)
-
-
-@pytest.mark.parametrize(("found", "missed"), [(10, 0), (5, 5), (2, 8), (1, 4)])
-def test_a_face_that_one_image_reads_stays_where_the_others_confirm_it(found, missed):
-    """A fifth of its circles do."""
-    group = [read("12/0", "1", "5"), read("12/1", "1"), read("12/2", "1")]
-    images = _second(group, {name: looked("5", found, missed) for name in ("12/1", "12/2")})
-    assert faces_of(images) == [{"1", "5"}] * 3
-    assert len(images[0].observations) == 20
-    assert not any("read in one image" in note for image in images for note in image.notes)
-
-
-@pytest.mark.parametrize("missed", [0, 5])
-def test_a_face_that_others_need_not_show_stays(missed):
-    """They look from another side, or it leaves the image: fewer circles expected than name a face say nothing."""
-    group = [read("12/0", "1", "5"), read("12/1", "1")]
-    images = _second(group, {"12/1": looked("5", 0, missed)} if missed else {})
-    assert faces_of(images) == [{"1", "5"}, {"1"}]
-    assert not any("read in one image" in note for image in images for note in image.notes)
-
-
-def test_a_face_that_two_images_read_stays_whatever_a_third_misses():
-    group = [read("12/0", "1", "5"), read("12/1", "1", "5"), read("12/2", "1")]
-    images = _second(group, {"12/2": looked("5", 0, 10)})
-    assert faces_of(images) == [{"1", "5"}, {"1", "5"}, {"1"}]
-    assert any(note.startswith("face 5: 5:1 and 9 more should be in view") for note in images[2].notes)

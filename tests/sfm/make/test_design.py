@@ -12,7 +12,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.lookalikes import MIN_COMMON
 from stcal.sfm import make
-from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
+from stcal.sfm.detect.face_patterns import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import (
     HIDDEN,
     LARGE,
@@ -45,9 +45,7 @@ def test_each_face_is_named_with_any_three_circles_hidden(made):
     assert made.cases == 5 * 84
     for face in target.faces:
         for gone in combinations(range(len(face.ids)), HIDDEN):
-            found = np.ones(len(face.ids), bool)
-            found[list(gone)] = False
-            assert is_named(face, found, target)
+            assert is_named(face, set(range(len(face.ids))) - set(gone), target)
 
 
 @pytest.mark.slow

@@ -9,8 +9,7 @@ import pytest
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.labelling import _is_symmetry, _numbered
-from stcal.sfm.detect.sightings import PlaneView
+from stcal.sfm.detect.labelling import PlaneView, _numbered
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet
 from tests.sfm.runs.test_bad_input import blacken
@@ -84,20 +83,20 @@ def views(roll_deg: float) -> list[PlaneView]:
     return [PlaneView(**common, area=1.0, camera_from_plane=each) for each in (pose, pose @ half_turn)]
 
 
-def test_a_half_turn_is_a_symmetry_and_a_shift_is_none():
-    first, second = views(0)
-    assert _is_symmetry(first.camera_from_plane.inverse() @ second.camera_from_plane, BOARD)
-    assert not _is_symmetry(Rigid(np.eye(3), [30.0, 0, 0]), BOARD)
-    assert not _is_symmetry(Rigid.exp([0, 0, np.pi / 2, 0, 0, 0]), BOARD)
-
-
 def test_numberings_follow_the_camera_up_to_a_quarter_turn():
     """From each image to its nearest, over more than a quarter turn in all."""
     rolls = [0, 35, 70, 105]
-    chosen, reasons = _numbered([views(r)[::-1] if i % 2 else views(r) for i, r in enumerate(rolls)])
-    assert reasons == {}
-    for i, roll in enumerate(rolls):
-        assert np.allclose(chosen[i].camera_from_plane.matrix(), views(roll)[0].camera_from_plane.matrix())
-    chosen, reasons = _numbered([views(0), views(88)])
-    assert list(chosen) == [0]
-    assert "board numbered from either end: the camera is turned by 88° or 92° from the nearest image" in reasons[1]
+    chosen = _numbered([views(r)[::-1] if i % 2 else views(r) for i, r in enumerate(rolls)])
+    for view, roll in zip(chosen, rolls, strict=True):
+        assert np.allclose(view.camera_from_plane.matrix(), views(roll)[0].camera_from_plane.matrix())
+    first, second = _numbered([views(0), views(88)])
+    assert isinstance(first, PlaneView)
+    assert "2 numberings fit, the camera is turned by 88° or 92° from the nearest image" in second
+
+
+def test_a_covered_strip_leaves_a_board_without_numbers_unless_an_image_shows_it_whole():
+    """Numberings a pitch apart do not differ by the camera's turn."""
+    shifted = [replace(v, camera_from_plane=v.camera_from_plane @ Rigid(np.eye(3), [30.0, 0, 0])) for v in views(20)]
+    chosen = _numbered([[*views(20), *shifted], views(0)])
+    assert [isinstance(each, PlaneView) for each in chosen] == [False, True]
+    assert "4 numberings fit, the camera is turned by 20° or 20°" in chosen[0]

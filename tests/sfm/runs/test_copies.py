@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from stcal.io.images import ImageFile, same_photograph
-from stcal.sfm.detect.detect_files import _same_pixels
+from stcal.sfm.detect.candidates import ImageDetection
+from stcal.sfm.detect.detect_files import DetectedImage, _without_copies
 from tests.conftest import SMALL
+from tests.sfm.detect.test_arrangement import centres_of
 
 pytestmark = pytest.mark.usefixtures("no_page")
 NOISE = 2.5
@@ -69,8 +71,10 @@ def test_png_and_jpeg_of_one_photograph_are_one_view(stcal_sfm, small_set):
 @pytest.mark.parametrize("content", [b"", b"not an image", None])
 def test_what_cannot_be_read_again_is_no_copy(tmp_path, content):
     """A photograph that was there at its detection, and is spoiled or gone when its pixels are compared."""
-    kept, other = tmp_path / "a.png", tmp_path / "b.jpg"
-    cv2.imwrite(str(kept), np.zeros((40, 60), np.uint8))
+    seen = ImageDetection(centres_of(np.zeros((9, 2)), np.zeros((9, 2))), ())
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
     if content is not None:
-        other.write_bytes(content)
-    assert not _same_pixels(ImageFile(kept, "a.png", ""), ImageFile(other, "b.jpg", ""))
+        (tmp_path / "b.jpg").write_bytes(content)
+    files = [ImageFile(tmp_path / name, name, "") for name in ("a.png", "b.jpg")]
+    images, skipped = _without_copies([DetectedImage(f, seen, f.name, b"", 1.0, False) for f in files], True, False)
+    assert ([image.file.name for image in images], skipped) == (["a.png", "b.jpg"], [])

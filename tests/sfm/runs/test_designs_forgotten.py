@@ -6,7 +6,7 @@ import pytest
 
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_target
-from stcal.sfm.detect.sightings import likeness_notes
+from stcal.sfm.detect.face_patterns import likeness_notes
 from stcal.synthetic.designs import second_design
 
 pytestmark = pytest.mark.usefixtures("no_page")

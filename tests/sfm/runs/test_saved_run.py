@@ -15,7 +15,7 @@ from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run, uncertainty_budget
 from stcal.sfm.adjust.faces_file import read_target
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run

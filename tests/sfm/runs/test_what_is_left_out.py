@@ -14,7 +14,7 @@ from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.stages import Task, detect_with

@@ -1,46 +1,42 @@
-"""Candidates: blobs whose outline is an ellipse, over a pyramid of scales, and the test that one is a circle."""
+"""Candidates: blobs whose outline is an ellipse, over a pyramid of scales; their matches with patterns; and what is
+found in an image, before it is compared with its group."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.design import Polarity
+from stcal.design import FaceDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
-from stcal.sfm.data.group_model import CircleRows
+from stcal.labels import BOARD, CircleLabel
+from stcal.sfm.data.group_model import Centres, CircleRows
 
-WINDOWS_PX = (41, 193)
-"""Sides of the windows whose mean is the threshold, on every level of the pyramid."""
+WINDOWS_PX = (41, 193)  # sides of the windows whose mean is the threshold, on every level of the pyramid
 WINDOW_OVER_DIAMETER = 3.0
 """Smallest ratio of window to blob. In a smaller window the blob pulls the mean towards itself."""
 HALF_SCALE_FROM_PX = 8_000_000
 """Images of more pixels start the pyramid at half scale, unless smaller circles are required …"""
-MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0
-"""Smallest default diameter at half scale."""
-MIN_DIAMETER_PX = 4.5
-"""Smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7."""
+MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0  # smallest default diameter at half scale
+MIN_DIAMETER_PX = 4.5  # smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7
 DOUBLE_SCALE_BELOW_PX = 1_500_000
 """Images of fewer pixels start at double scale: the outline of a small ellipse is coarse."""
 REACH_PX = 11
-OUTLINE_LEVEL = 0.45
-"""Outlines run at this fraction of the highest value within reach."""
+OUTLINE_LEVEL = 0.45  # outlines run at this fraction of the highest value within reach
 MIN_LEVEL_DIAMETER_PX = 3.0
 MIN_COARSE_DIAMETER_PX = 24.0
 """Smallest diameter on coarse levels. Smaller ellipses are found on finer levels, where outlines are more accurate."""
 MAX_OUTLINE_DEVIATION = 0.025
 """RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
-MAX_OUTLINE_DEVIATION_PX = 0.45
-"""Additional deviation by pixels and noise."""
+MAX_OUTLINE_DEVIATION_PX = 0.45  # additional deviation by pixels and noise
 MAX_AREA_ERROR = 0.15
 """Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
-MIN_THRESHOLD = 4.0
-"""Smallest threshold, in grey values of the 8-bit image."""
+MIN_THRESHOLD = 4.0  # smallest threshold, in grey values of the 8-bit image
 
 OPTION_RANGES = {
     "min_diameter_px": (1.0, 1e6),
@@ -92,10 +88,7 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
     """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
     threshold = contrast_threshold(image, options)
     found = [_rows(*level, polarity, threshold, options) for level in _levels(image, options)]
-    centre, shape = distinct(np.concatenate(found))
-    contrast = contrast_of(image, polarity, centre, shape)
-    keep = contrast > threshold
-    return Ellipses(centre[keep], shape[keep], contrast[keep])
+    return distinct(image, polarity, np.concatenate(found), threshold)
 
 
 def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> float:
@@ -129,18 +122,16 @@ def _levels(image: np.ndarray, options: EllipseOptions) -> Iterator[tuple[np.nda
         image = shrunk(image, 0.5)
 
 
-def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
+def _contrast(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Returns the median grey value in the middle minus that around, (n,); with opposite sign for dark circles."""
-    angle = np.arange(16) * (np.pi / 8)
-    unit = np.column_stack([np.cos(angle), np.sin(angle)])
-
-    def sample(factor: float, margin_px: float) -> np.ndarray:
-        wide = factor * shape + margin_px * np.eye(2)
-        at = np.round(centre[:, None] + np.einsum("nij,kj->nki", wide, unit)).astype(int)
+    angle, inner, outer = np.arange(16) * (np.pi / 8), 0.4 * shape, 1.25 * shape + 2.0 * np.eye(2)
+    median = []
+    for wide in (inner, outer):
+        rim = np.einsum("nij,kj->nki", wide, np.column_stack([np.cos(angle), np.sin(angle)]))
+        at = np.round(centre[:, None] + rim).astype(int)
         x, y = (np.clip(at[..., k], 0, image.shape[1 - k] - 1) for k in range(2))
-        return np.median(image[y, x], axis=1) if len(at) else np.zeros(0)
-
-    return (sample(0.4, 0.0) - sample(1.25, 2.0)) * (1 if polarity == "bright" else -1)
+        median.append(np.median(image[y, x], axis=1) if len(at) else np.zeros(0))
+    return (median[0] - median[1]) * (1 if polarity == "bright" else -1)
 
 
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
@@ -198,43 +189,35 @@ def _ellipse(
         return None
     if abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1) > MAX_AREA_ERROR:
         return None
-    deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
-    return None if deviation > 1 else (cx, cy, d1, d2, angle)
+    turn, (x, y) = np.radians(angle), (contour[:, 0, :] - [cx, cy]).T
+    along, across = np.cos(turn) * x + np.sin(turn) * y, np.cos(turn) * y - np.sin(turn) * x
+    rho = np.hypot(along * 2 / max(d1 - 1, 1e-6), across * 2 / max(d2 - 1, 1e-6))
+    size = np.sqrt((d1 - 1) * (d2 - 1)) / 2
+    deviation = np.sqrt(np.mean((rho - 1) ** 2)) * size  # RMS distance of the outline from the ellipse
+    within = deviation <= MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size
+    return (cx, cy, d1, d2, angle) if within else None
 
 
-def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
-    """Returns the RMS distance of the outline from the ellipse divided by its limit."""
-    angle = np.radians(angle_deg)
-    c, s = np.cos(angle), np.sin(angle)
-    dx, dy = points[:, 0] - cx, points[:, 1] - cy
-    rho = np.hypot((c * dx + s * dy) * 2 / max(d1, 1e-6), (c * dy - s * dx) * 2 / max(d2, 1e-6))
-    size = np.sqrt(d1 * d2) / 2
-    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size))
-
-
-def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
-    if not len(table):
-        return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
-    pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-    smaller, larger = np.sort(radius[pairs], axis=1).T
-    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
-    keep = np.ones(len(table), bool)
-    keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
-    table = table[keep]
+def distinct(image: np.ndarray, polarity: Polarity, table: np.ndarray, threshold: float) -> Ellipses:
+    """Returns the ellipses of rows (x, y, full axes 1 and 2, angle of axis 1 in deg) of enough contrast. Of coincident
+    rows the first, from the finest level, is kept."""
+    if len(table):
+        centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
+        pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
+        smaller, larger = np.sort(radius[pairs], axis=1).T
+        near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+        table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
     angle = np.radians(table[:, 4])
     axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
     shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
-    return table[:, :2], shape
+    contrast = _contrast(image, polarity, table[:, :2], shape)
+    keep = contrast > threshold
+    return Ellipses(table[keep, :2], shape[keep], contrast[keep])
 
 
-MAX_POSITION_ERROR = 0.15
-"""Largest distance between a pattern's prediction and a candidate, in radii of the circle."""
-MAX_POSITION_ERROR_PX = 1.5
-"""Lower bound of that distance, px: candidates before centring are good to a few tenths."""
-MAX_AXIS_RATIO = 1.45
-"""Largest ratio between the predicted and the found ellipse along any direction."""
+MAX_POSITION_ERROR = 0.15  # largest distance between a pattern's prediction and a candidate, in radii of the circle
+MAX_POSITION_ERROR_PX = 1.5  # lower bound of that distance, px: candidates before centring are good to a few tenths
+MAX_AXIS_RATIO = 1.45  # largest ratio between the predicted and the found ellipse along any direction
 MIN_HOMOGRAPHY_POINTS = 4
 
 
@@ -303,7 +286,10 @@ def grow_matches(
     homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
     active = np.arange(len(index))
     for turn in range(rounds):
-        active = active[_spread_out(index[active] >= 0, xy_plane[active])]
+        matched = index[active] >= 0
+        low, high = (np.where(matched[..., None], xy_plane[active], far) for far in (np.inf, -np.inf))
+        spread = (high.max(1) > low.min(1)).all(1)  # not all in one row or column
+        active = active[(matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & spread]
         if not len(active):
             break
         xy, matched = xy_plane[active], index[active] >= 0
@@ -324,8 +310,75 @@ def grow_matches(
     return index, homography, holds
 
 
-def _spread_out(matched: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Returns whether four circles or more, not all in one row or column, are matched; (k,)."""
-    low = np.where(matched[..., None], xy, np.inf).min(1)
-    high = np.where(matched[..., None], xy, -np.inf).max(1)
-    return (matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & (high > low).all(1)
+SECOND_BOARD_SHARE = 0.8  # smallest number of dots of a second board, as a share of the dots of the first
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceSighting:
+    """A face in an image."""
+
+    face: str
+    rows: np.ndarray  # (n,) indices of its circles among the candidates, or the image's centres
+    circles: np.ndarray  # (n,) their indices in the design
+
+    def labels(self, design: FaceDesign) -> tuple[CircleLabel, ...]:
+        """Returns the labels of its circles."""
+        labels = design.labels()
+        return tuple(labels[i] for i in self.circles)
+
+    def by(self, row: np.ndarray) -> "FaceSighting":
+        """Returns the circles that have other indices: ``row`` by that so far, −1 for none."""
+        rows = row[self.rows]
+        return FaceSighting(self.face, rows[rows >= 0], self.circles[rows >= 0])
+
+
+OpenFace = tuple[FaceSighting, ...]
+"""A pattern that the image alone cannot name: all faces that it may be."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardSighting:
+    """A board in an image."""
+
+    rows: np.ndarray  # (n,) indices of its dots among the candidates, or the image's centres
+    numberings: np.ndarray  # (k, n, 2) row and column of each dot in each numbering, the likeliest first
+    # (u, n, 2) that require covered dots inside the image; the group may confirm them
+    unlikely: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 2), int))
+
+    def by(self, row: np.ndarray) -> "BoardSighting":
+        """Returns the dots that have other indices: ``row`` by that so far, −1 for none."""
+        rows = row[self.rows]
+        ok = rows >= 0
+        return BoardSighting(rows[ok], self.numberings[:, ok], self.unlikely[:, ok])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageDetection:
+    """Result of detection in one image; a face or the board may occur more than once."""
+
+    centres: Centres
+    faces: tuple[FaceSighting, ...]
+    boards: tuple[BoardSighting, ...] = ()  # the one with the most dots first
+    mirrored: tuple[str, ...] = ()  # ids of faces
+    notes: tuple[str, ...] = ()  # exclusions with reasons
+    candidates: int = 0  # number of outlines
+    open_faces: tuple[OpenFace, ...] = ()  # patterns without a name
+    # faces with a board or tags, whose corners are among the centres, without extent
+    printed: tuple[FaceSighting, ...] = ()
+
+    @property
+    def repeated(self) -> tuple[str, ...]:
+        """Names of the faces, and of the board, that are in view more than once."""
+        ids = [sighting.face for sighting in self.faces]
+        boards = self.boards[1:2] and len(self.boards[1].rows) >= SECOND_BOARD_SHARE * len(self.boards[0].rows)
+        return (BOARD,) * bool(boards) + tuple(f"face {i}" for i in sorted(set(ids)) if ids.count(i) > 1)
+
+    @property
+    def board(self) -> BoardSighting | None:
+        """The only board of the image; None if there is none, or a second one of similar size."""
+        return None if not self.boards or BOARD in self.repeated else self.boards[0]
+
+    def single_faces(self) -> tuple[FaceSighting, ...]:
+        """Returns the faces that are in view exactly once."""
+        ids = [sighting.face for sighting in self.faces]
+        return (*(sighting for sighting in self.faces if ids.count(sighting.face) == 1), *self.printed)
