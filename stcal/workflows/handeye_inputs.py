@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.boards.target_file import load_boards
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import TWIST, require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.pose_content import Said, require_each_once
@@ -30,7 +30,6 @@ from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import motions_missing
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
-from stcal.io.covariance import TWIST
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table

@@ -28,8 +28,7 @@ from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, write_copy
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged

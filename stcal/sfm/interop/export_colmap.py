@@ -26,8 +26,7 @@ from stcal.io.table import csv_text
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
-from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import from_colmap_px, write_database
+from stcal.sfm.mapping.database import from_colmap_px, pycolmap, write_database
 from stcal.sfm.mapping.models import open_model, require_keypoints, rigid_from_colmap, write_reconstruction
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
