@@ -441,20 +441,10 @@ def from_photos(
     require_new_folder(out, images)
     design = target_of(target, printed=False)
     with StageProgress() as progress:
-        result = robot_from_photos(
-            images,
-            read_camera(camera),
-            read_target(faces, design),
-            design,
-            joints,
-            load_robot(robot_file),
-            targets,
-            load_dots(board) if board else None,
-            key,
-            MeasureOptions(workers=workers),
-            IdentifyOptions(model=model, partial=partial),
-            progress,
-        )
+        seen = images, read_camera(camera), read_target(faces, design), design
+        arm, dots = load_robot(robot_file), load_dots(board) if board else None
+        how = MeasureOptions(workers=workers), IdentifyOptions(model=model, partial=partial)
+        result = robot_from_photos(*seen, joints, arm, targets, dots, key, *how, progress)
     print_each("note", result.notes)
     for line in story(result):
         say(line)

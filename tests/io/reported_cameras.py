@@ -77,11 +77,3 @@ CASES = {
     ),
 }
 """File and name of the camera, and the pixels of RAYS."""
-REFUSED = {
-    ("kitti/calib_cam_to_cam.txt", ""): "E-CAMERA-CONTENT … COLMAP, OpenCV, ROS",
-    ("ros_coefficients/invbc.yaml", ""): "E-CAMERA-MODEL … inverse_brown_conrady … another formula … calibrate anew",
-    ("ros_coefficients/uncal.yaml", ""): "E-CAMERA-UNCALIBRATED … all zero … calibrate",
-    ("ros_none/info.yaml", ""): "E-CAMERA-KEY … binning_x = 2 … set it to 0",
-    ("stereo_yml/intrinsics.yml", ""): "E-CAMERA-SEVERAL … 2 cameras … choose of 1, 2",
-    ("exif/f35zero.jpg", ""): "E-CAMERA-UNREADABLE … a photograph … stcal camera convert",
-}

@@ -1,5 +1,5 @@
 """Camera files that were reported (``../shared/cases``): each projects as OpenCV, NumPy or pycolmap does with the
-numbers that stand in it, or is refused in one line."""
+numbers that stand in it. Those that are refused: `test_cases_as_typed`."""
 
 import numpy as np
 import pycolmap
@@ -8,7 +8,7 @@ from scipy.io import loadmat
 
 from stcal.io.cameras.foreign_lenses import ForeignLens
 from stcal.io.cameras.read import camera_of_photograph, read_lens
-from tests.io.reported_cameras import CASES, RAYS, REFUSED, perspective
+from tests.io.reported_cameras import CASES, RAYS, perspective
 from tests.outcome import fails_with
 
 
@@ -21,13 +21,6 @@ def project(lens) -> np.ndarray:
 @pytest.mark.parametrize(("place", "name"), CASES)
 def test_a_reported_file_projects_as_its_numbers_say(shared_case, place, name):
     np.testing.assert_allclose(project(read_lens(shared_case(place), name)), CASES[place, name](), atol=1e-8)
-
-
-@pytest.mark.parametrize(("place", "name"), REFUSED)
-def test_a_reported_file_is_refused_in_one_line(shared_case, place, name):
-    with fails_with(REFUSED[place, name]) as caught:
-        read_lens(shared_case(place), name)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_reported_stereo_file_of_matlab_has_both_cameras(shared_case):

@@ -65,19 +65,9 @@ def plan(
     else:
         centre_noise, source = expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
         source = f"{source} (--noise, --run)"
-    options = PlanOptions(
-        images,
-        spread,
-        distance,
-        width,
-        read_camera(camera) if camera else None,
-        pairs_of_faces(groups, design) if groups else None,
-        centre_noise,
-        one_board,
-        RunOptions(refine_camera=refine_camera),
-        seed,
-        margin,
-    )
+    model, pairs = read_camera(camera) if camera else None, pairs_of_faces(groups, design) if groups else None
+    how = centre_noise, one_board, RunOptions(refine_camera=refine_camera), seed, margin
+    options = PlanOptions(images, spread, distance, width, model, pairs, *how)
     with shared.designs_told(target, board):
         result = planned(options, design, load_dots(board) if board else None, faces)
     with printed_last():
