@@ -41,7 +41,7 @@ def test_a_lag_is_told_with_what_it_explains(offset_s):
     assert isinstance(note, Grave) or abs(offset_s) < 0.01
 
 
-@pytest.mark.parametrize("seed", range(12, 18))
+@pytest.mark.parametrize("seed", range(12, 15))
 def test_clocks_that_agree_are_not_blamed(seed):
     assert told(given_of(seed, 0.0)) == ()
 

@@ -33,15 +33,12 @@ def squares(truth: StreamTruth) -> tuple[float, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("offset_s", [0.023, -0.31])
-def test_the_offset_is_found(setup, offset_s):
+def test_a_clock_that_is_far_behind(setup):
     """20 images of a robot at 150 mm/s and 0.15 mm of errors: some 0.2 ms."""
-    found = found_of(simulated_stream(np.random.default_rng(4), 20, setup, offset_s))
-    assert abs(found.seconds - offset_s) < 3 * found.sigma_s
+    found = found_of(simulated_stream(np.random.default_rng(4), 20, setup, -0.31))
+    assert abs(found.seconds + 0.31) < 3 * found.sigma_s
     assert 5e-5 < found.sigma_s < 5e-4
-    words = found.in_words()
-    assert f"robot's is {'ahead of' if offset_s > 0 else 'behind'} the camera's" in words
-    assert f"taken at t {'+' if offset_s > 0 else '-'} {1e3 * abs(found.seconds):.2f} ms of the robot's" in words
+    assert "robot's is behind the camera's" in found.in_words()
 
 
 @pytest.mark.full
@@ -106,7 +103,8 @@ def test_the_offset_is_found_and_used(command, tmp_path):
     found = json.loads(out.read_text())
     offset = found["time_offset"]
     assert abs(offset["seconds"] - 0.023) < 3 * offset["sigma_s"] < 2e-3
-    assert "robot's clock minus camera's: the robot's is ahead of the camera's" in shown
+    taken = f"taken at t + {1e3 * offset['seconds']:.2f} ms of the robot's"
+    assert all(text in shown for text in ("robot's clock minus camera's: the robot's is ahead of the camera's", taken))
     wrong = off(found, truth)
     assert wrong @ np.linalg.solve(np.array(found["covariance"]), wrong) < 22.5  # χ² of 6, once in a thousand
     code, shown, _ = command(*files, "--splits", 0, "--method", "pose", "--out", tmp_path / "plain.json")

@@ -219,6 +219,14 @@ def frames_of(key: object) -> Known | None:
     return None
 
 
+def inverse_name(key: str) -> str:
+    """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
+    match = re.fullmatch(
+        r"((?:rot|trans|rotation|translation|[rt]vecs?|[rthRTH])_)?(.+?)(_from_|_wrt_|_in_|2)(.+)", key
+    )
+    return match.expand(r"\1\4\3\2") if match else ""
+
+
 WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
 """Keys that may hold a pose in an object that also has its name."""
 NAME_KEYS = (

@@ -24,6 +24,7 @@ from stcal.handeye.data.pose_content import (
     PoseSide,
     Role,
     Said,
+    inverse_name,
     read_tree,
     require_each_once,
 )
@@ -539,7 +540,10 @@ def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Know
     option, frames = statements.frames_of(role), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
         said = f"{path}: {frames.name} {frames.by}, --poses-are {option}"
-        remedy = "if the name is wrong, change it in the file; else leave the option out"
+        name = inverse_name(frames.by.rpartition(" ")[2])
+        remedy = (
+            f"if the name is wrong, change it in the file{f', to {name}' if name else ''}; else leave the option out"
+        )
         raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
     if option is not None:
         return Known(option, "as you say")

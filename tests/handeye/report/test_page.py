@@ -70,11 +70,11 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
 def test_every_sigma_that_there_is_has_a_name():
     """A camera file that is off: its σ are widened, and the factor is among the σ."""
     truth = simulated_views(np.random.default_rng(2), 7, "eye-in-hand", (2e-4, 0.1), 0.1)
-    camera = truth.views.camera
-    wrong = replace(camera, focal=1.02 * camera.focal)
-    views = replace(truth.views, camera=wrong)
-    prior = camera_prior(Camera.of(wrong, "PINHOLE"))
-    options = HandEyeOptions(intrinsics=prior)
+    wrong = replace(truth.views.camera, focal=1.02 * truth.views.camera.focal)
+    options, views = (
+        HandEyeOptions(intrinsics=camera_prior(Camera.of(wrong, "PINHOLE"))),
+        Views(wrong, truth.views.views),
+    )
     outcome = Outcome("images", handeye(truth.pairs, truth.setup, None, views, options), options=options)
     assert "camera file, focal length" in outcome_report(outcome).text()
     assert "Camera, as adjusted" in outcome_report(outcome).page()
