@@ -134,7 +134,6 @@ class Sheet:
     width: float
     height: float
     placed: tuple[Placed, ...]
-    cuts: bool = False  # whether a seam runs through the pattern of its part
     bare: bool = False  # whether the part is without dimensions, with which it would take more sheets
 
 
@@ -238,8 +237,7 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
             clip = np.array([[left, below], [right, above]])
             inside = [(box[0] <= clip[1]).all() and (box[1] >= clip[0]).all() for box in boxes]
             place = f"sheet {len(sheets) + 1} of {way.count}: row {row}, column {column}"
-            content = compress(shapes, inside), shift, clip + shift, way.cuts
-            sheets.append(_sheet(f"{title}; {place}", *way.size, *content))
+            sheets.append(_sheet(f"{title}; {place}", *way.size, compress(shapes, inside), shift, clip + shift))
     return sheets
 
 
@@ -257,16 +255,14 @@ def _registration(way: _Way) -> list[Shape]:
     return marks
 
 
-def _sheet(
-    title: str, width: float, height: float, shapes: Iterable[Shape], shift: ArrayLike, clip=None, cuts=False
-) -> Sheet:
+def _sheet(title: str, width: float, height: float, shapes: Iterable[Shape], shift: ArrayLike, clip=None) -> Sheet:
     bars = [moved(shape, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
     instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
     if clip is not None:
         instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
     words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
     placed = Placed(tuple(moved(shape, shift) for shape in shapes), clip)
-    return Sheet(title, width, height, (placed, Placed((*bars, *words))), cuts)
+    return Sheet(title, width, height, (placed, Placed((*bars, *words))))
 
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
@@ -536,15 +532,12 @@ def drawn_text(drawn: Drawn) -> str:
     lines.append(f"{drawn.path}: {sheets} sheet{'s' if sheets > 1 else ''} {kind}")
     lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if bare := sum(sheet.bare for sheet in drawn.sheets):
-        which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
-        lines.append(f"{which} without dimensions, which would take more sheets")
+        lines.append(f"sheets without dimensions, which would take more sheets: {bare} of {sheets}")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
-        through = ", the worse as one runs through a pattern" if any(sheet.cuts for sheet in drawn.sheets) else ""
         lines.append(
             f"a sheet of {drawn.paper} has room for {_room(drawn.paper)}, either way round, dimensions included; "
-            f"parts that are glued of several sheets are off at the seams{through}: state it in sigma_mm, or "
-            f"{larger}"
+            f"parts that are glued of several sheets are off at the seams: state it in sigma_mm, or {larger}"
         )
     return "\n".join(lines)

@@ -30,7 +30,7 @@ def words(pdf: bytes, command: str = "pdftotext", *options: str) -> str:
 
 @pytest.mark.slow
 def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
-    pdf = pdf_of(page(150))
+    pdf = pdf_of(page(110))
     text = words(pdf, "pdftotext", "-layout").split("\f")[:-1]
     assert "595.276 x 841.89 pts (A4)" in words(pdf, "pdfinfo")
     assert len(text) >= 3

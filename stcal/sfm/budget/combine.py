@@ -417,7 +417,7 @@ def budget(
     more: tuple[BudgetSource, ...] = (),
     camera_given: bool = True,
 ) -> Budget:
-    """Returns the budget of an adjustment, as :func:`stcal.sfm.budget.sources.sources_of`; ``more``: further rows."""
+    """Returns the budget of an adjustment, as :func:`sources_of`; ``more``: further rows."""
     sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
         words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"

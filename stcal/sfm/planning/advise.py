@@ -298,11 +298,6 @@ class Advice(Brief):
     tried: int  # number of candidates
 
     @property
-    def has_board(self) -> bool:
-        """Whether the size is from a board."""
-        return any("board" in shares for shares in self.shares.values())
-
-    @property
     def board_dominates(self) -> bool:
         """Whether most of the worst face's variance is the board's, so that more views help little."""
         return self.shares[self.now.worst()[0]].get("board", 0.0) > BOARD_DOMINATES
@@ -548,7 +543,8 @@ def advice_text(advice: Advice) -> str:
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")
     lines.append(HOW_TO_GO)
-    ways = [(better_um, "a board of half the σ" if advice.has_board else "print and size of half the σ")]
+    has_board = "board" in advice.shares[now.worst_face]
+    ways = [(better_um, "a board of half the σ" if has_board else "print and size of half the σ")]
     if count := len(advice.choices):
         ways.append(
             (MICRO * advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view")

@@ -251,11 +251,6 @@ class Setup:
             return replace(self, board=self.board.with_sigma_times(factor))
         return replace(self, board=replace(self.board, sigma_mm=factor * self.board.sigma_mm))
 
-    @property
-    def size_source(self) -> str:
-        """What tells the size: ``board``, or ``print`` of a body without one."""
-        return "board" if self.board.rows else "print"
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
@@ -331,7 +326,8 @@ def variance_shares(now: Forecast, models: Sequence[MetricModel], setup: Setup) 
     """Returns, by face and source, the share of the variance of the face's position that is due to the source. A
     variance grows by f² where all σ do by f, so that its derivatives by the sources' variances add up to it."""
     noisy = [replace(model, covariance_px2=SMALLER**2 * model.covariance_px2) for model in models]
-    smaller = {"image noise": (noisy, setup), setup.size_source: (models, setup.better_board(SMALLER))}
+    size = "board" if setup.board.rows else "print"
+    smaller = {"image noise": (noisy, setup), size: (models, setup.better_board(SMALLER))}
     if setup.flatness_mm is not None:
         smaller["flatness"] = models, replace(setup, flatness_mm=SMALLER * setup.flatness_mm)
     if setup.prior is not None:

@@ -1,8 +1,7 @@
 """The database for other versions of COLMAP: their schema, and our content.
 
-Only native COLMAP 3.8 and pycolmap 4.2 run here. The other schemas are compared with what was published: the data of
-``stcal.sfm.interop.schema``, and a checksum of the description of the empty database that each version made when it was
-run.
+Only native COLMAP 3.8 and pycolmap 4.2 run here. The other schemas are compared with what was published: a checksum of
+the description of the empty database that each version made when it was run.
 """
 
 import hashlib
