@@ -35,8 +35,6 @@ TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
 APART = null_space(TOGETHER.T)
 """Basis (8, 6) of all other displacements of a tag's corners."""
-TINY_MM2 = 1e-12
-"""Variance of a mode of the print at an amplitude of 0, for an inverse."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +203,8 @@ class _Layout:
         whole_tag = _added(self.tags.noise, px, tags.weight, TOGETHER / 2, 2 / 8 * redundancy[1])
         # Twice the mean of four corners: its variance holds that of the tag's shift four times, of a corner once.
         tag = np.sqrt(max(whole_tag**2 - corner**2, 0.0) / 4)
-        at, nothing = solution.places["print"], np.full(len(self.print.spread_mm), TINY_MM2)
+        at = solution.places["print"]
+        nothing = np.full(len(self.print.spread_mm), 1e-12)  # of an amplitude of 0, for an inverse
         told = Told(solution.values["print"].array[0], solution.inverse[at, at], nothing, self.print.spread_mm)
         factor = max(noise.board * sigma_factor(square, redundancy[0]), LEAST_FACTOR)
         return _Noise(factor, corner, float(tag), found_amplitude([told], noise.amplitude))
@@ -264,7 +263,6 @@ def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray
 
 
 MIN_IMAGES = 2
-MIN_BOARD_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -327,7 +325,7 @@ def calibrate(
         repeated = [tag for _, tag in (t for t in detected.repeated if t in rows)]
         if not listed:
             left_out.append(f"{name}: no tag of the layout")
-        elif view is None or len(view) < MIN_BOARD_POINTS:
+        elif view is None or len(view) < 4:
             left_out.append(f"{name}: the board is not seen")
         elif repeated:
             left_out.append(f"{name}: tag {repeated[0]} is seen twice")

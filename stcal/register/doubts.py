@@ -426,8 +426,6 @@ ASSUMED = (
     "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
     "sample, and the variance of their distances"
 )
-LOW_REDUNDANCY = 6
-"""Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
 SMALL_MM = 20.0
 """Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
 
@@ -468,7 +466,7 @@ def notes_of(result: Registration, problem: Problem, other: Wider | None, shifte
     enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
     if len(inside) <= enough and result.scaled:
         yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
-    if result.redundancy < LOW_REDUNDANCY:
+    if result.redundancy < 6:  # below, σ is known to 30 % at best
         yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
     yield from _on_layout(result, problem, sigma)
 

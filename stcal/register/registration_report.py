@@ -205,8 +205,6 @@ VIEWS = ((0, 1), (0, 2), (1, 2))
 MOST_ARROWS = 1500
 ARROW_SHARE, FEW = 0.12, 80
 """Length of the inliers' RMS residual as a share of the picture's side; number of points above which it shrinks."""
-LONGEST_SHARE = 0.3
-"""Longest arrow of an outlier, as a fraction of the picture's side; longer arrows are cut off."""
 
 
 def space_figure(found: Findings) -> Drawing:
@@ -224,7 +222,7 @@ def _views(place: np.ndarray, error: np.ndarray, inlier: np.ndarray) -> Drawing:
     crowded = min(1.0, FEW / len(place)) ** (1 / 3)
     length = np.maximum(np.linalg.norm(error, axis=1), 1e-300)
     scale = round_below(ARROW_SHARE * crowded * side / max(rms(length[inlier]), 1e-12))
-    longest = np.where(inlier, np.inf, LONGEST_SHARE * side)
+    longest = np.where(inlier, np.inf, 0.3 * side)  # longer arrows of outliers are cut
     arrow = scale * error * np.minimum(1, longest / (scale * length))[:, None]
     middle = (place.min(0) + place.max(0)) / 2
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side

@@ -8,7 +8,6 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
 from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, MODELS, Problem, chernoff, deletion_squares
-from stcal.register.registration import wilks_bound
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, scene
 
@@ -105,20 +104,6 @@ def test_noise_along_one_axis_is_not_two_groups():
         s = scene([trial, 6], n, sigma_mm=0.02)
         b = s.xyz_b + rng.normal(0, along * 0.02, (n, 1)) * [0.6, 0, 0.8]
         assert register(s.xyz_a, b, folds=0).inliers.mean() > 0.9
-
-
-def test_wilks_bound_is_above_the_distribution():
-    """Λ as drawn from the scatter of Gaussian residuals of two linear fits, one within the other."""
-    rng = np.random.default_rng(3)
-    design = rng.normal(size=(20, 6))
-    ratios = []
-    for _ in range(2000):
-        y = rng.normal(size=(20, 3)) * [1, 5, 0.2]
-        less, more = (y - design[:, :k] @ np.linalg.lstsq(design[:, :k], y, rcond=None)[0] for k in (4, 6))
-        ratios.append(np.linalg.slogdet(more.T @ more)[1] - np.linalg.slogdet(less.T @ less)[1])
-    for level in (0.5, 0.1, 0.01):
-        at = np.quantile(ratios, level)
-        assert np.log(level) - 0.3 < wilks_bound(at, 14, 2) < np.log(level) + 3
 
 
 def test_deletion_residuals_are_those_of_the_fit_without_the_point():

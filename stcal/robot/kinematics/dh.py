@@ -202,8 +202,6 @@ def _angle(value: float) -> float:
 
 FITS, TURNED_RAD = 0.05, 0.2
 """Largest RMS error of a nominal robot over the spread of its data, and of orientations: twice what robots err by."""
-MOST_TOOLS = 200
-"""Number of rows of a target whose tools are tried for the one that most rows agree with."""
 
 
 def require_orientations(
@@ -242,7 +240,7 @@ def _typical_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -
     between, angles = np.swapaxes(flange, 1, 2) @ seen, []
     for name in dict.fromkeys(targets):
         own = Rotation.from_matrix(between[[target == name for target in targets]])
-        tools = own[:: 1 + len(own) // MOST_TOOLS]
+        tools = own[:: 1 + len(own) // 200]  # so many are tried for the one that most rows agree with
         off = [(tool.inv() * own).magnitude() for tool in tools]
         angles.append(min(off, key=np.median))
     return float(np.median(np.concatenate(angles)))

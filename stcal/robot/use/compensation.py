@@ -168,8 +168,6 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
     )
 
 
-LEAST_SHOWN_MM = 1e-6
-"""Error below which its size says nothing."""
 FAR_RAD, AMPLIFIED = np.radians(1.0), 10.0
 """Largest usual motion of a joint; its ratio to the error of the pose, in rad, from which the pose is near singular."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
@@ -489,7 +487,7 @@ def compensated_summary(result: Compensated) -> list[str]:
     lines = [f"{int(result.found.usable.sum())} of {len(result)} poses reached by the identified robot"]
     both = result.compared()
     if both.any():
-        before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
+        before, after = result.before_mm[both], max(result.found.error_mm[both].max(), 1e-6)
         lines.append(
             f"position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
             f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less. The real robot errs by more: by "

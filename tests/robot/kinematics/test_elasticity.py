@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot import forward, inverse
+from stcal.robot import forward
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import (
     chain_parameters,
@@ -90,15 +90,6 @@ def test_mistakes_in_a_file_are_named(tmp_path, text, message):
     with pytest.raises(InputError) as error:
         load_robot(path)
     assert message in str(error.value)
-
-
-@pytest.mark.slow
-def test_joint_values_reach_a_pose_of_a_bent_arm():
-    robot = bent()
-    wanted = forward(robot, vectors(robot))
-    found = inverse(robot, wanted)
-    off = forward(robot, found.q).difference(wanted)
-    assert np.abs(off[:, 3:]).max() < 1e-8
 
 
 def test_weights_turn_the_shoulder_by_their_torque():
