@@ -168,7 +168,7 @@ def variances(case: Case, found: Identified, q: np.ndarray, carried: Conditions 
     """(m, 3) by its covariance, mm²."""
     place = tip_jacobian(found.state, q, case.targets(len(q)), found.seen.kind, carried)[1][:, 3:]
     adjusted = found.adjustment
-    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
+    covariance = adjusted.spread.covariance(np.zeros(len(adjusted.spread.least)))
     return np.einsum("rik,kl,ril->ri", place, covariance, place)
 
 
@@ -188,8 +188,8 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
     )
     sigma = np.repeat([SIGMA_RAD, SIGMA_MM], 3)[-derivative.shape[1] :]
     white = (derivative / sigma[:, None]).reshape(-1, derivative.shape[2])
-    held = rows.held(state, known, seen.kind)
-    normal = white.T @ white + held.normal()
+    _, held, _ = rows.held(state, known, seen.kind)
+    normal = white.T @ white + held.T @ held
     units = 1 / np.sqrt(np.diag(normal))  # by what is seen and held of each: moments span ten decades of others
     covariance = np.linalg.pinv(normal * units[:, None] * units, hermitian=True) * units[:, None] * units
     place = tip_jacobian(state, q, case.targets(len(q)), seen.kind, carried)[1][:, 3:]
