@@ -470,7 +470,7 @@ def _solution(
     images: Sequence[ImageObservations], mapping: Mapping, refined: Refined, pairs: Sequence[PairScore]
 ) -> GroupSolution:
     """Returns the solution of a group that was mapped in any way."""
-    missing = left_out([i for i in images if i.name in mapping.model.images], refined.model, mapping.remedy)
+    missing = left_out([i for i in images if i.name not in mapping.left_out], refined.model, mapping.remedy)
     outliers = *mapping.outliers, *refined.outliers
     reasons = mapping.left_out | missing
     return GroupSolution(tuple(pairs), refined.model, mapping.seeded, refined.rounds, reasons, outliers)
