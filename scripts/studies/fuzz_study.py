@@ -1,11 +1,12 @@
 """Whether every file that comes in is judged, and every file that goes out is whole.
 
-.venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--json FILE] [--only CASE]
+.venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--json FILE] [--only CASE]
 
-All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Five parts:
+All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Six parts:
 inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for it
-(`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), what runs keep swapped, aged and changed
-(`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that the file has
+(`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), programs ended by signals, and with a
+full disk (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …), what runs keep
+swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that the file has
 already are not run again: a study that was stopped goes on. The seed and the case's name repeat a case:
 `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
@@ -48,7 +49,7 @@ def names_of(arguments: argparse.Namespace) -> list[str]:
     valid = [f"v{i}" for i in range(len(CALLS))]
     mistakes = [] if arguments.no_mistakes else list(MISTAKES)
     options = [f"o{i}" for i in range(len(option_cases()))]
-    counts = {"s": arguments.kept, "d": arguments.closed, "c": arguments.count}
+    counts = {"k": arguments.kills, "s": arguments.kept, "d": arguments.closed, "c": arguments.count}
     drawn = [f"{letter}{i}" for letter, count in counts.items() for i in range(count)]
     return drawn if arguments.drawn_only else [*valid, *mistakes, *options, *drawn]
 
@@ -96,6 +97,7 @@ def main() -> None:
         __doc__,
         count=1000,
         seed=1,
+        kills=20,
         kept=60,
         closed=20,
         drawn_only=False,

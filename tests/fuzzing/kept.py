@@ -6,13 +6,10 @@ A kept file that is not what it says is refused, or made anew; a call that ends 
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -21,13 +18,15 @@ import numpy as np
 from stcal.io.files import RUN_MARKER
 from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged
-from tests.fuzzing.judged import IN, LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.judged import OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.kills import outcome_of, start_program
 from tests.fuzzing.mutations import a_folder, emptied, flipped, missing, pick, truncated
 
 STREAM_KEPT, STREAM_CLOSED = 20_000_000, 30_000_000
 """Keep the random numbers of these cases from those of others."""
 LONGEST_CALL_S = 6.0
-KEPT_IN = ("run", "detected")  # folders of the stock that commands keep for the next one
+KEPT_IN = ("run", "detected")
+"""Folders of the stock that commands keep for the next one."""
 COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".nvm", ".bin", ".gltf", ".glb"}
 REMADE_BY = ("sfm run", "sfm detect")
 """Commands that make what they keep anew; others leave what was spoiled as it is."""
@@ -173,36 +172,6 @@ SPOILED = (
 )
 
 
-PROGRAM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main; main()")
-
-
-def start_program(call: Call, folder: Path, closed: Sequence[int] = ()) -> subprocess.Popen:
-    """Start a program for a call. ``closed`` : numbers of its streams."""
-
-    def limited() -> None:
-        for number in closed:
-            os.close(number)
-
-    words = [*PROGRAM, *call.arguments(folder / IN, folder / OUT)]
-    root = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {"PYTHONPATH": root, "PYTHONWARNINGS": ""}
-    return subprocess.Popen(
-        words, stdout=-1, stderr=-1, cwd=folder, start_new_session=True, preexec_fn=limited, env=environment
-    )
-
-
-def outcome_of(process: subprocess.Popen, start: float) -> Outcome:
-    try:
-        out, err = process.communicate(timeout=3 * LONGEST_S)
-        trace = ""
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        out, err = process.communicate()
-        trace = "too long"
-    seconds = time.monotonic() - start
-    return Outcome(process.returncode, *(t.decode(errors="replace") for t in (out, err)), seconds, trace=trace)
-
-
 def closed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     """Case ``number`` of this seed: a program some of whose standard streams are closed."""
     rng = np.random.default_rng([seed, STREAM_CLOSED + number])
@@ -211,7 +180,7 @@ def closed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     lay_out(stock, folder, call, earlier=True)
     before = hashes(folder)
     start = time.monotonic()
-    outcome = outcome_of(start_program(call, folder, numbers), start)
+    outcome = outcome_of(start_program(call, folder, [], numbers), start)
     found = [
         each for each in failures(call, folder, _heard(outcome, numbers), before, refused=False) if each[0] != "memory"
     ]

@@ -16,21 +16,23 @@ from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged, judged, judged_option
 from tests.fuzzing.judged import LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out
 from tests.fuzzing.kept import closed, of_kept
+from tests.fuzzing.kills import killed
 from tests.fuzzing.mistakes import MISTAKES, told
 from tests.fuzzing.writers import unchecked, watched
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
-MOST_MEMORY = 8 << 30  # of a process, so that the machine lives
+MOST_MEMORY = 8 << 30
+"""Of a process, so that the machine lives."""
 
 
 def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
-    """The case of this name: ``c12`` a spoiled input, ``s4`` kept files, ``d6`` closed streams, ``o7``
+    """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``s4`` kept files, ``d6`` closed streams, ``o7``
     an option, ``v5`` a valid call, else a mistake."""
     if not name[1:].isdigit():
         return mistaken(stock, folder, name)
     if name[0] in "vo":
         return {"v": went_through, "o": judged_option}[name[0]](stock, folder, int(name[1:]))
-    return {"c": judged, "s": of_kept, "d": closed}[name[0]](stock, folder, seed, int(name[1:]))
+    return {"c": judged, "k": killed, "s": of_kept, "d": closed}[name[0]](stock, folder, seed, int(name[1:]))
 
 
 def went_through(stock: Path, folder: Path, number: int) -> Judged:

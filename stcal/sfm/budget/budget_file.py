@@ -474,6 +474,26 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTest]) -> list[str]
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
 
+USUAL_K, USUAL_SIGMA_K, USUAL_EXPANSION = 25.0, 10.0, 250.0
+"""Distance from 20 °C, σ of a temperature, K, and expansion, ppm/K, beyond which a statement is asked about: rooms are
+nearer, thermometers better, and plastics expand less."""
+
+
+def _unusual(statement: Statement) -> list[str]:
+    """Returns questions about statements that are possible, and as unusual as those in another unit."""
+    asked = []
+    for body, size in (("board", statement.board), ("target", statement.target)):
+        warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
+        if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
+            fahrenheit = (warm - 32) / 1.8
+            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {fahrenheit:.1f} °C?")
+        if sigma > USUAL_SIGMA_K:
+            asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")
+        if abs(rate) > USUAL_EXPANSION:
+            asked.append(f"the {body} expands by {rate:g} ppm/K, more than plastics do: is that so?")
+    return asked
+
+
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
@@ -503,6 +523,7 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     return [
         *notes,
         *(note for note, applies in told.items() if applies),
+        *_unusual(statement),
         *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
         "the frame is in the poses of the other faces",

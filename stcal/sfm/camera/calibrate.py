@@ -400,6 +400,7 @@ def calibrated(
             found = calibrated(find, images, board, PERSPECTIVE, workers)
             camera, of_perspective = replace(camera, focal=found.intrinsics.camera.focal), True
             continue
+        result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
         camera = result.camera
         settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
         if settled and not rounds:
@@ -410,7 +411,7 @@ def calibrated(
         if without or warnings:
             views, skipped = kept, (*skipped, *without)
             require_views(views, files, skipped)
-            result = adjust_intrinsics(views, board, camera, colmap_model)
+            result = replace(adjust_intrinsics(views, board, camera, colmap_model), restarted=result.restarted)
         require_determined(result, views, board)
     calibration = judged(result, views, skipped, number, settled or rounds > 0, board)
     return replace(calibration, warnings=(*calibration.warnings, *warnings))
@@ -559,6 +560,10 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
 
 def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
     centres, dots, differ = result.factors.centres, result.factors.dots, result.differ
+    restarted = (
+        "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
+        "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
+    )
     corners = [
         f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, the "
         f"distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
@@ -573,4 +578,4 @@ def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesig
         f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
         "focus and zoom fixed, and the light even": differ,
     }
-    return corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]
+    return [restarted] * result.restarted + corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]

@@ -339,6 +339,7 @@ class Intrinsics:
     redundancy: int
     settled: bool  # whether σ and eccentricities converged within :data:`MAX_ROUNDS`
     fit: Fit  # from which solutions of some of the views start
+    restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
     def sigma(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
@@ -395,7 +396,18 @@ def adjust_intrinsics(
         boards={m.group: Board(m.xyz_model, PrintModes.of(m.xyz_model[:, :2])) for m in models},
         sigma_mm=board.sigma_mm,
     )
-    return _adjusted(fit, board, colmap_model)
+    try:
+        return _adjusted(fit, board, colmap_model)
+    except ConvergenceError:
+        if held:
+            raise
+    # A focal length far off makes the rest of the lens wander: it comes first, alone, and one for both axes.
+    focal, weight = intrinsic_basis("SIMPLE_PINHOLE")[:, :1], np.full((1, 1), start.focal[0] ** -2.0)
+    alone = replace(fit, basis=focal, weight=weight)
+    for _ in range(FOCAL_ROUNDS):
+        alone = alone.robust_minimum()
+    begun = replace(alone, basis=basis, weight=fit.weight, huber=fit.huber)
+    return replace(_adjusted(begun, board, colmap_model), restarted=True)
 
 
 def _intrinsics(last: LinearFit, colmap_model: str, factors: BoardSigmaFactors, settled: bool) -> Intrinsics:
@@ -416,6 +428,7 @@ def _intrinsics(last: LinearFit, colmap_model: str, factors: BoardSigmaFactors, 
     )
 
 
+FOCAL_ROUNDS = 2
 MOST_STEPS, NO_GAIN = 10, 0.1
 """Most steps from the solution of all views to that of some of them, and the predicted decrease of the cost at which
 they end, in σ²: no parameter is then off by more than a third of its σ."""

@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.design import reference_board
+from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.plane import circle_image_offset
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
+from stcal.sfm.camera import intrinsics
 from stcal.sfm.camera.calibrate import require_determined
 from stcal.sfm.camera.intrinsics import (
     adjust_intrinsics,
@@ -332,3 +334,24 @@ def test_where_the_closed_form_gives_no_focal_length_several_are_tried(monkeypat
     views = views_of(np.random.default_rng(1), count=6)
     found = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height, "OPENCV")).focal[0]
     assert 2**-0.3 < found / TRUE.focal[0] < 2**0.3
+
+
+def test_a_descent_that_does_not_end_begins_again_and_says_so(monkeypatch):
+    views = views_of(np.random.default_rng(7))
+    plain, own, calls = calibrated(views), intrinsics._adjusted, []
+
+    def endless_first(*given):
+        calls.append(given)
+        if len(calls) == 1:
+            raise ConvergenceError("E-NO-MINIMUM", "projections still move")
+        return own(*given)
+
+    monkeypatch.setattr(intrinsics, "_adjusted", endless_first)
+    again = calibrated(views)
+    assert (plain.restarted, again.restarted, len(calls)) == (False, True, 2)
+    np.testing.assert_allclose(again.camera.parameters(), plain.camera.parameters(), rtol=1e-4)  # the same minimum
+    warned = [
+        any("other minima" in line for line in calibration._warnings(result, projection_sigma(result), BOARD))
+        for result in (plain, again)
+    ]
+    assert warned == [False, True]
