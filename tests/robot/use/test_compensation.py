@@ -235,14 +235,6 @@ def test_each_row_is_compensated_for_its_payload(case):
     assert [row["payload_kg"] for row in table[:2]] == ["0", "80"]
 
 
-@pytest.mark.slow
-def test_a_payload_of_a_rigid_robot_is_said_to_do_nothing(case):
-    case.write([*POSE], case.pose_rows()[:FEW])
-    targets = read_targets(case.folder / "targets.csv", case.real, payload_kg=20)
-    (note,) = compensate(case.real, targets, case.nominal).doubts
-    assert "is rigid, payload_kg moves nothing" in note
-
-
 def test_payloads_that_cannot_be_are_refused(case):
     for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
         path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
