@@ -77,8 +77,6 @@ def test_a_bad_row_is_named_and_nothing_written(run, tmp_path):
     [
         (["--threshold", "-1"], "positive"),
         (["--threshold", "1e308"], "1e-09 to 1e+12, needed"),
-        (["--threshold", "1e-308"], "1e-09 to 1e+12, needed"),
-        (["--threshold", "nan"], "a finite number"),
         (["--folds", "-1"], "folds"),
         (["--identified", "r.toml"], "--robot"),
         (["--robot", "no.toml"], "robot init"),

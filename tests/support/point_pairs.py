@@ -56,38 +56,13 @@ def _one_shift(rng, xyz, off):
     return xyz + directions(rng, 1) * rng.uniform(*off)
 
 
-def _two_shifts(rng, xyz, off):
-    half = len(xyz) // 2
-    return np.vstack([_one_shift(rng, xyz[:half], off), _one_shift(rng, xyz[half:], off)])
-
-
 def _other_motion(rng, xyz, off):
     middle = xyz.mean(0)
     turn = directions(rng, 1)[0] * rng.uniform(0.03, 0.5)
     return Rigid.exp([*turn, *(directions(rng, 1)[0] * rng.uniform(*off))]) @ (xyz - middle) + middle
 
 
-def _drift(rng, xyz, off):
-    return xyz + directions(rng, 1) * np.linspace(off[0], off[1], len(xyz))[:, None]
-
-
-def _one_place(rng, xyz, off):
-    return xyz[0] + rng.normal(0, SIGMA_MM, xyz.shape)
-
-
-def _rows_shifted(rng, xyz, off):
-    return np.roll(xyz, 1, axis=0)
-
-
-WRONG: dict[str, Callable] = {
-    "random": _random,
-    "one shift": _one_shift,
-    "two shifts": _two_shifts,
-    "other motion": _other_motion,
-    "drift": _drift,
-    "one place": _one_place,
-    "rows shifted": _rows_shifted,
-}
+WRONG: dict[str, Callable] = {"random": _random, "one shift": _one_shift, "other motion": _other_motion}
 """Ways for points to be wrong."""
 
 

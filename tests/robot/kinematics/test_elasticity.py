@@ -113,19 +113,6 @@ def test_weights_turn_the_shoulder_by_their_torque():
     assert np.abs(forward(robot, q).translation[0] - place).max() == 0
 
 
-def test_a_payload_is_what_moments_of_all_links_with_it_are():
-    robot, centre, mass = bent(), np.array([30.0, -50.0, 120.0]), 40.0
-    robot = replace(robot, elasticity=replace(robot.elasticity, payload_centre=centre))
-    chain = robot.chain()
-    levers = np.vstack([chain.translation[1:], chain.last_from_flange @ centre])
-    moment = robot.elasticity.moment + 1e-3 * 9.80665 * mass * levers
-    heavier = replace(robot, elasticity=replace(robot.elasticity, moment=moment))
-    q = vectors(robot)
-    off = forward(robot, q, payload_kg=mass).difference(forward(heavier, q))
-    assert np.abs(off).max() < 1e-9
-    assert np.abs(forward(robot, q, payload_kg=mass).difference(forward(robot, q))[:, 3:]).max() > 0.01
-
-
 def test_a_file_reads_back_the_same_and_rows_made_of_a_chain_know_the_payload(tmp_path):
     hysteresis = 1e-4 * np.array([1, -0.5, 2, 0.3, 0.7, 1])
     own = replace(bent().elasticity, payload_kg=12.5, payload_centre=np.ones(3), hysteresis=hysteresis)

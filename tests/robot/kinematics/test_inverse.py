@@ -172,19 +172,6 @@ def test_what_only_limits_forbid_is_named():
     assert inverse(robot, forward(robot, q), q).status == ("reached",)
 
 
-def test_branches_are_within_limits_where_the_reference_is_beyond_them_too():
-    robot = ARMS["made modified"]
-    found = branches(robot, forward(robot, np.array([0.2, 0.3, -0.4, 0.5, 0.6, 0.7]))[0])
-    assert len(found) >= 2
-    assert within(robot, found.q)
-    robot = mh80()
-    q = np.array([0.1, 0.2, 0.3, 0.4, 0.9, 0.6])
-    one_side = replace(robot, joints=(*robot.joints[:4], Joint("revolute", -2, -0.1), robot.joints[5]))
-    found = inverse(one_side, forward(robot, q), q)
-    assert found.status == ("reached",)
-    assert abs(found.q[0, 4] + 0.9) < 1e-8
-
-
 def test_turns_follow_the_reference_as_far_as_limits_go():
     robot = mh80()  # its fourth and sixth joint turn ± 360°
     q = np.array([0.1, 0.2, 0.3, 0.4, 0.9, 0.6])

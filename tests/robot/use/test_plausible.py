@@ -40,11 +40,6 @@ def commanded(robot: Robot, count: int, seed: int, share: float = 0.6) -> tuple[
     return q, forward(robot, q)
 
 
-def rolled(poses: Poses) -> Poses:
-    """x, y, z, w read as w, x, y, z."""
-    return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)
-
-
 def times(poses: Poses, factor: float) -> Poses:
     return Poses(poses.rotation, factor * poses.translation)
 
