@@ -10,7 +10,6 @@ import pytest
 import stcal
 from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.boards.board_file import board_toml
-from stcal.boards.cells import outlines
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import EDGE, FOOT, OVERLAP, PAPERS, POINT_MM, SIDE, draw, framed, paper_sheets, seams_between
@@ -123,21 +122,6 @@ def test_the_lengths_to_check_are_said():
     assert lengths == {"7 × 12 = 84": 84.0, "4 × 12 = 48": 48.0}
     (part,) = parts_of(ChessboardDesign(5, 8, 12.0), 10.0)
     assert {"132", "96"} <= {shape.words for shape in framed(part) if isinstance(shape, Text)}
-
-
-def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():
-    ring = np.ones((3, 3), bool)
-    ring[1, 1] = False
-    assert sorted(len(line) for line in outlines(ring)) == [4, 4]
-    assert [len(line) for line in outlines(np.eye(2, dtype=bool))] == [4, 4]
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        cells = rng.random((5, 6)) < 0.5
-        areas = []
-        for line in outlines(cells):
-            x, y = line.T
-            areas.append((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
-        assert sum(areas) == cells.sum()
 
 
 @pytest.mark.parametrize(

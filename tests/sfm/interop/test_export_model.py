@@ -2,10 +2,7 @@
 
 import csv
 import json
-import os
-import re
 import shutil
-import subprocess
 
 import numpy as np
 import pycolmap
@@ -151,31 +148,6 @@ def test_colmap_has_the_runs_circles_poses_and_keypoints(exported, known, keypoi
         assert np.abs(pose.translation - translation).max() < 1e-9
         for k, point in enumerate(images[name].points2D):
             assert np.abs(point.xy - 0.5 - keypoints[name, k][1]).max() < AGAIN_PX
-
-
-def test_native_colmap_reads_it(exported, tmp_path):
-    """Another version than pycolmap's, 3.8 for one, which knows no rigs and frames and passes over their files."""
-    if not shutil.which("colmap"):
-        pytest.skip("no colmap program")
-
-    def colmap(*arguments):
-        environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
-        done = subprocess.run(
-            ["colmap", *map(str, arguments)], env=environment, capture_output=True, text=True, check=True
-        )
-        return done.stdout + done.stderr
-
-    ours = pycolmap.Reconstruction(str(exported["colmap-bin"]))
-    said = colmap("model_analyzer", "--path", exported["colmap-bin"])
-    number = {key: float(re.search(rf"{key}: ([\d.]+)", said)[1]) for key in ("Registered images", "Points", "error")}
-    assert number["Registered images"] == ours.num_reg_images()
-    assert number["Points"] == ours.num_points3D()
-    assert number["error"] == pytest.approx(ours.compute_mean_reprojection_error(), abs=2e-6)
-    colmap("model_converter", "--input_path", exported["colmap-bin"], "--output_path", tmp_path, "--output_type", "TXT")
-    for line in (tmp_path / "points3D.txt").read_text(encoding="ascii").splitlines():
-        if not line.startswith("#"):
-            point_id, *xyz = line.split()[:4]
-            assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
 
 
 @pytest.mark.parametrize(
