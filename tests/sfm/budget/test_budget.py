@@ -1,6 +1,7 @@
-"""The uncertainty budget of a small run: sums, statements, and what it refuses."""
+"""The budget of a run: its rows, what is stated, the tests of lengths, and its page with the PDF."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +13,14 @@ from stcal.design import KnownDistance, ScaleReference, StatedSize
 from stcal.errors import StcalError
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
+from stcal.report import document as pdf
+from stcal.report.text import significant
 from stcal.sfm.budget import combine
-from stcal.sfm.budget.budget_file import BudgetFile, against_stated
-from stcal.sfm.budget.budget_page import budget_report
+from stcal.sfm.budget.budget_file import SHARED, BudgetFile, against_run, against_stated
+from stcal.sfm.budget.budget_page import REQUIRED, as_exact, budget_report
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
-from stcal.sfm.runs.saved import adjusted_run, verify
+from stcal.sfm.runs.saved import adjusted_run, load_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -246,7 +249,6 @@ def test_command(stcal_sfm, small_run, tmp_path):
     path, out = tmp_path / "lab.toml", tmp_path / "budget.json"
     path.write_text(STATEMENT)
     words = "--statement", path, "--field", "instrument=X 5"
-    assert len(stcal_sfm("budget", small_run, *words)[1].splitlines()) <= 15
     code, text, _ = stcal_sfm("budget", small_run, *words, "-v", "--json", out)
     assert code == 0
     assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
@@ -273,10 +275,9 @@ def test_command(stcal_sfm, small_run, tmp_path):
 def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
     copy = own_copy(small_run, tmp_path / "run")
     (copy / "report.html").write_text("x")
-    for more, told in ((), "changed since the run: report.html"), (("-v",), "left it: 1 changed (report.html)"):
-        code, text, _ = stcal_sfm("budget", copy, *more)
-        assert code == 0
-        assert told in text
+    code, text, _ = stcal_sfm("budget", copy)
+    assert (code, len(text.splitlines()) <= 15) == (0, True)
+    assert "changed since the run: report.html" in text
 
 
 def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
@@ -330,10 +331,19 @@ def test_statements_that_are_none(tmp_path, content, words):
     assert words in str(error.value)
 
 
-def test_fields_that_are_none(stcal_sfm, small_run):
-    assert_error(stcal_sfm("budget", small_run, "--field", "operator"), INPUT, "E-OPTION-VALUE")
-    twice = ("--field", "a=1", "--field", "a=2")
-    assert_error(stcal_sfm("budget", small_run, *twice), INPUT, "E-OPTION-REPEATED", "--field")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--field", "operator"), ("E-OPTION-VALUE",)),
+        (("--field", "a=1", "--field", "a=2"), ("E-OPTION-REPEATED", "--field")),
+        (("--lengths-statement", "x.toml"), ("E-OPTION-NEEDS", "--lengths")),
+        (("--pdf",), ("E-OPTION-NEEDS", "--report", "FILE.html")),
+        (("--report", "budget.pdf"), ("E-OUTPUT-SUFFIX", "budget.html, and --pdf")),
+        (("--report", "budget.pdf", "--pdf"), ("E-OUTPUT-SUFFIX", "budget.html, and --pdf")),
+    ],
+)
+def test_options_that_are_none(stcal_sfm, small_run, words, said):
+    assert_error(stcal_sfm("budget", small_run, *words), INPUT, *said)
 
 
 def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
@@ -343,10 +353,155 @@ def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")
 
 
-def test_a_sigma_as_files_are_written_with_counts_as_assumed(small_run, stcal_sfm, tmp_path):
+def test_a_sigma_as_files_are_written_with_counts_as_assumed(plain):
     """The board of the run has the default of 0.005 mm; nobody has measured it."""
-    out = tmp_path / "b.json"
-    stcal_sfm("budget", small_run, "--json", out)
-    rows = {row["key"]: row for row in json.loads(out.read_text())["sources"]}
-    assert rows["board_dots"]["origin"] == "assumed"
-    assert "the default" in rows["board_dots"]["words"]
+    (row,) = (row for row in plain.sources if row.key == "board_dots")
+    assert (row.origin, "the default" in row.words) == ("assumed", True)
+
+
+PITCH = "[board]\npitch_sigma_ppm = 50.0\n"
+
+
+def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,length_mm,sigma_mm"):
+    """Lengths of the run, each shorter by so many expanded uncertainties."""
+    lines = [head]
+    for i, j in longest_of(plain.joint.labels, plain.joint.xyz_model)[:rows]:
+        a, b = plain.joint.labels[i], plain.joint.labels[j]
+        length = float(np.linalg.norm(plain.joint.xyz_model[i] - plain.joint.xyz_model[j]))
+        u = next(r.standard for r in plain.of_kind("distance") if r.measurand.circles == (a, b))
+        cells = [a, b, f"{length - off_u * 2 * np.hypot(u, sigma_mm):.9f}", str(sigma_mm)]
+        lines.append(",".join(cells[: head.count(",") + 1]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("off_u", "rows", "beyond", "agrees"),
+    [(0.0, 4, 0, True), (0.9, 4, 0, True), (1.1, 1, 1, False), (1.1, 4, 4, True), (1.5, 4, 4, False)],
+)
+def test_errors_over_their_uncertainty(plain, tmp_path, off_u, rows, beyond, agrees):
+    """Of four lengths the limit is 1.27: each is beyond 2.53 σ by chance in 1 of 88, all four in 1 of 22."""
+    found = against_stated(plain, lengths_csv(tmp_path / "lengths.csv", plain, off_u, rows))
+    assert [each.e_n for each in found.lengths] == pytest.approx([off_u] * rows, abs=1e-5)
+    assert (found.beyond, found.agrees) == (beyond, agrees)
+    assert found.limit == pytest.approx({1: 1.0, 4: 1.2655}[rows], abs=1e-3)
+    (note,) = found.notes  # no temperature is stated
+    assert "must state lengths for the temperature at which the target was photographed" in note
+    at_20 = replace(plain, conditions=replace(plain.conditions, temperature_c=20.0))
+    assert against_stated(at_20, tmp_path / "lengths.csv").notes == ()
+
+
+def test_lengths_without_sigma_are_exact(plain, tmp_path):
+    path = lengths_csv(tmp_path / "lengths.csv", plain, 0.9, sigma_mm=0.0, head="from,to,length_mm")
+    found = against_stated(plain, path)
+    assert [each.e_n for each in found.lengths] == pytest.approx([0.9] * 4, abs=1e-5)
+    assert "no sigma_mm" in found.notes[0]
+
+
+def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, plain, tmp_path):
+    """U of the difference is √2 that of one run; a pitch that both share leaves it as it is, another board's does
+    not."""
+    alike = against_run(plain, plain, saved.folder, (saved.board_design, saved.board_design))
+    assert alike.agrees
+    assert "cannot be seen here" in alike.notes[0]
+    longest = plain.of_kind("distance")[0]
+    assert alike.lengths[0].circles == longest.measurand.circles
+    assert alike.lengths[0].error_um == 0
+    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * np.sqrt(2) * longest.expanded)
+    path = tmp_path / "lab.toml"
+    path.write_text(PITCH)
+    stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
+    same = against_run(stated, stated, saved.folder, (saved.board_design, saved.board_design))
+    assert same.lengths[0].expanded_um == pytest.approx(alike.lengths[0].expanded_um)
+    other = against_run(stated, stated, saved.folder, (saved.board_design, replace(saved.board_design, pitch_mm=20.0)))
+    pitch = 50e-6 * longest.measurand.length_mm
+    wanted = np.hypot(alike.lengths[0].expanded_um, 2e3 * np.sqrt(2) * pitch)
+    assert other.lengths[0].expanded_um == pytest.approx(wanted, rel=2e-3)
+    assert other.notes == ()
+    assert "board_pitch" in SHARED
+    at_20 = replace(plain, conditions=replace(plain.conditions, temperature_c=20.0))
+    mixed = against_run(plain, at_20, saved.folder, (saved.board_design, saved.board_design))
+    assert len(mixed.notes) == 2
+    assert "hold at different temperatures" in mixed.notes[1]
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("1:1,9:9,100,0", "line 2: no circle 9:9"),
+        ("1:1,1:1,100,0", "line 2: 1:1 to 1:1"),
+        ("1:1,1:2,40,-1", "a σ of 0 or more"),
+        ("1:1,1:2,x,0", "length_mm is 'x'"),
+    ],
+)
+def test_lengths_that_are_none(plain, tmp_path, row, words):
+    path = tmp_path / "lengths.csv"
+    path.write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
+    with pytest.raises(StcalError) as error:
+        against_stated(plain, path)
+    assert words in str(error.value)
+
+
+STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"
+
+
+def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
+    """Fields are text, not markup; a contribution stands in the page as in the terminal."""
+    monkeypatch.setattr(pdf, "pdf_of", lambda page: b"%PDF-" + page[:15].encode())
+    statement, page = tmp_path / "lab.toml", tmp_path / "budget.html"
+    statement.write_text(STATED)
+    field = "operator=<b>A & B</b>"
+    words = ("--statement", statement, "--field", field, "--lengths", small_run, "--report", page, "--pdf")
+    code, text, _ = stcal_sfm("budget", small_run, *words, "-v")
+    assert code == 0
+    html = page.read_text(encoding="utf-8")
+    assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in html
+    assert "<b>A &" not in html
+    combined = next(line for line in text.splitlines() if line.startswith("combined standard")).split()[4:]
+    row = re.search(r'<th scope="row" class="l">combined standard uncertainty u</th>(.*?)</tr>', html, re.DOTALL)
+    assert row is not None
+    assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
+    assert "+40.0 ppm" in html
+    assert "not a certificate: nothing is stated of" in html
+    expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[6:]
+    assert len(expanded) == 3
+    assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
+    circle = next(iter(json.loads((small_run / "faces.json").read_text())["circles"]))
+    assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
+    assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
+    assert not re.search(r'(?:src|href)="(?!data:|#)', html)
+    assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(14.26, "14"), (9.96, "10"), (0.01234, "0.012"), (126.0, "130"), (None, "–")]
+)
+def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_of_them(value, shown):
+    assert significant(value) == shown
+    assert [as_exact(166.18664, 0.031), as_exact(236.457, 15.0), as_exact(1.23456, 0.0)] == ["166.187", "236", "1.2346"]
+
+
+def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_path):
+    """Of a sound run with lengths at 20 °C; its head has the answer, its end the definitions and the board."""
+    run = load_run(small_run)
+    file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
+    stated = [row.model_copy(update={"origin": "stated"}) for row in file.sources]
+    full = file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
+    for one, lacks in (
+        *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
+        (file.model_copy(update={"fields": full.fields}), "board's pitch"),
+    ):
+        page = budget_report(one).page()
+        assert "Certificate" not in page
+        assert re.search(
+            f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
+        )
+    care = full.model_copy(update={"reserved": True})
+    assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
+    page = budget_report(full).page()
+    assert re.search("<h1>Certificate of calibration no. rule 7, with uncertainty budget: .*</h1>", page)
+    assert "not a certificate" not in page
+    assert page.index("May the run be used?") < page.index("<h2>")
+    assert "origin at circle" in page
+    assert run.folder.parent.name not in page
+    assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]

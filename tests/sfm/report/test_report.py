@@ -41,12 +41,6 @@ def group() -> dict:
     residuals = {f"board:{r}:{c}": [3.0 * r, -4.0 * c, 0.5] for r in range(2) for c in range(2)}
     return {
         "name": "a",
-        "images": [NASTY, "a/1.jpg"],
-        "faces": ["1", "2"],
-        "points": 12,
-        "seeded": "COLMAP's estimate of the chosen pair",
-        "rounds": 3,
-        "pairs": [{"first": NASTY, "second": "a/0.jpg", "median_angle_rad": 0.9}],
         "scale": {
             "mm_per_unit": 116.2175381,
             "mm_per_unit_rows": 116.2175976,
