@@ -66,8 +66,10 @@ def _laid_out(stock: Path, folder: Path, call: Call) -> tuple[Path, Path]:
     """As :func:`lay_out`; a single file of a run has the run's marker beside it."""
     read, written = lay_out(stock, folder, call, earlier=False)
     for place in KEPT_IN:
-        if (read / place).is_dir() and not (read / place / RUN_MARKER).exists():
-            shutil.copyfile(stock / place / RUN_MARKER, read / place / RUN_MARKER)
+        marker = read / place / RUN_MARKER
+        if (read / place).is_dir() and not marker.exists():
+            marker.parent.mkdir(exist_ok=True)
+            shutil.copyfile(stock / place / RUN_MARKER, marker)
     return read, written
 
 

@@ -142,24 +142,14 @@ FILES = {
 }
 """A file of each program, and the pixels of RAYS."""
 FX = "fx: 911.5\n{0}fy: 910.25\n{0}cx: 639.0\n{0}cy: 359.0\n"
-LENS_JSON = '"fx": 911.5, "fy": 910.25, "cx": 639.0, "cy": 359.0'
-MATRIX_JSON = "[[911.5, 0, 639.0], [0, 910.25, 359.0], [0, 0, 1]]"
 REMOVED = {
     "ROS-Industrial": "intrinsics:\n  fx: 911.5\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
     "ORB-SLAM": f'%YAML:1.0\nCamera.type: "PinHole"\nCamera.{FX.format("Camera.")}Camera.k1: -0.2\n',
-    "Nerfstudio": '{"camera_model": "OPENCV", "fl_x": 911.5, "fl_y": 910.25, "cx": 639.5, "cy": 359.5, "frames": []}',
     "KITTI": f"S_00: 1280 720\nK_00: {FLAT}\nD_00: {D5}\nK_01: {FLAT}\nP_rect_00: {P}\n",
-    "MC-Calib": f"nb_camera: 1\ncamera_0:\n  camera_matrix: {FLAT}\n  distortion_vector: {K4}\n  distortion_type: 1\n",
-    "Anipose": f'[cam_0]\nname = "A"\nsize = [ 1280, 720,]\nmatrix = {MATRIX_JSON}\ndistortions = {D5}\n',
     "Zhang": "832.5 0 832.53 303.959 206.585\n\n-0.228601 0.190353\n\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n",
     "a matrix alone": "911.5 0 639\n0 910.25 359\n0 0 1\n",
-    "lengths alone": f'{{{LENS_JSON}, "width": 1280, "height": 720}}',
-    "nested intrinsics": f'{{"intrinsics": {{{LENS_JSON}}}, "distortion_coefficients": {D5}}}',
-    "a matrix as intrinsics": f'{{"intrinsics": {MATRIX_JSON}, "distortion": {D5}}}',
-    "a list of cameras": f'{{"cameras": [{{"name": "a", "K": {FLAT}}}]}}',
     "two nested cameras": f"left: {{K: {FLAT}, D: {D5}}}\nright: {{K: {FLAT}, D: {D5}}}\n",
     "RealityCapture": '<x:xmpmeta xmlns:x="adobe:ns:meta/" xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"/>',
-    "PhotoScan of old": METASHAPE.replace("<f>910.25</f>", "<fx>910.25</fx><fy>910</fy>"),
     "camodocal, SCARAMUZZA": VINS.format(model="SCARAMUZZA", parameters="fx: 1"),
 }
 """Files of forms that are not read."""
