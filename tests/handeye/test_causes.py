@@ -94,7 +94,7 @@ def test_a_side_that_is_stored_a_pose_late_is_named(which, flange, board):
 
 
 def test_residuals_that_no_arm_leaves_are_not_to_be_used():
-    given = given_of(22, 0.0)
+    given = given_of(22, 0.0, 12)
     rng = np.random.default_rng(1)
     board = given.pairs.camera_from_board
     far = Poses(board.rotation, board.translation + rng.normal(0, 40, (len(board), 3)))
