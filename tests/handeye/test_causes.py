@@ -37,15 +37,14 @@ def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
     return HandEyeInput("poses", pairs, timed=Timed(truth.stream, truth.seconds))
 
 
-def told(given: HandEyeInput) -> tuple[str, ...]:
-    return lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("offset_s", [-0.003, 0.004, -0.02, 0.1])
+@pytest.mark.parametrize("offset_s", [-0.003, -0.02, 0.1])
 def test_a_lag_is_told_with_what_it_explains(offset_s):
+    """A doubt of the board's size ends with it."""
     given = given_of(11, offset_s)
-    (note,) = told(given)
+    doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
+    again, (note,) = lag_tried(HandEyeProblem(given.pairs), given.timed, doubted)
+    assert not any(isinstance(note, SizeDoubt) for note in again.notes)
     assert f"{'ahead of' if offset_s > 0 else 'behind'} the camera's" in note
     found = float(note.split("clock is ")[1].split(" ±")[0])
     assert found == pytest.approx(1e3 * abs(offset_s), abs=1.0)
@@ -54,16 +53,8 @@ def test_a_lag_is_told_with_what_it_explains(offset_s):
 
 @pytest.mark.parametrize("seed", range(12, 15))
 def test_clocks_that_agree_are_not_blamed(seed):
-    assert told(given_of(seed, 0.0)) == ()
-
-
-@pytest.mark.slow
-def test_a_doubt_of_the_size_ends_with_the_lag():
-    given = given_of(19, 0.05)
-    doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
-    again, notes = lag_tried(HandEyeProblem(given.pairs), given.timed, doubted)
-    assert not any(isinstance(note, SizeDoubt) for note in again.notes)
-    assert len(notes) == 1
+    given = given_of(seed, 0.0)
+    assert lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1] == ()
 
 
 def stale(pairs: HandEyePoses, rows: slice) -> HandEyePoses:
