@@ -55,10 +55,8 @@ def test_a_file_of_poses(command, tmp_path, setup, splits):
     code, shown, _ = command(source, "--setup", setup, "--out", out, *more)
     assert code == 0
     data = json.loads(out.read_text())
-    camera, board = {
-        "eye-in-hand": ("flange_from_camera", "base_from_board"),
-        "eye-to-hand": ("base_from_camera", "flange_from_board"),
-    }[setup]
+    in_hand = setup == "eye-in-hand"
+    camera, board = ("flange_from_camera", "base_from_board") if in_hand else ("base_from_camera", "flange_from_board")
     assert {camera, board} < data.keys()
     assert not {"flange_from_camera", "base_from_camera"} <= data.keys()
     assert 0.01 < in_sigmas(data, camera, truth.mount_from_camera) < CHANCE

@@ -40,16 +40,10 @@ def changed(i: int, edit) -> np.ndarray:
     ("matrices", "parts"),
     [
         (changed(2, lambda m: m * [1.01, 1.01, 1.01, 1]), ["pose 3", "not a rotation", "1.01", "1 ± 0.001 needed"]),
-        (
-            changed(2, lambda m: m * [1, -1, 1, 1]),
-            ["pose 3", "a reflection, determinant −1", "change the sign of one axis"],
-        ),
+        (changed(2, lambda m: m * [1, -1, 1, 1]), ["pose 3", "a reflection", "change the sign of one axis"]),
         (changed(1, np.transpose), ["pose 2", "last row", "0 0 0 1 needed", "transposed"]),
         (changed(4, lambda m: m * [1, 1, 1, np.nan]), ["pose 5", "not finite"]),
-        (
-            changed(0, lambda m: m * ([[1, 1, 1, 1e-3]] * 3 + [[1] * 4])),
-            ["pose 1 is", "as if in two units", "--length-unit"],
-        ),
+        (changed(0, lambda m: m * ([[1, 1, 1, 1e-3]] * 3 + [[1] * 4])), ["pose 1 is", "two units", "--length-unit"]),
         (GOOD[:, :3], ["no poses", "4×4 matrices", "TUM", "needed"]),
         (np.zeros((0, 4, 4)), ["shape (0, 4, 4); numbers needed"]),
     ],
@@ -152,8 +146,6 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
         (TUM.replace("0.3", "nan"), ["not finite"]),
         (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc or mitsubishi-abc"]),
-        (f"{EULER},rx,ry,rz\n1,2,3,10,20,30\n", ["like ur-rotvec, yaskawa, staubli, xyz, XYZ or ZYX"]),
-        (f"{EULER},roll,pitch,yaw\n1,2,3,10,20,30\n", ["give --rotation, like rpy"]),
         (f"{EULER},q1,q2,q3,q4\n1,2,3,1,0,0,0\n", ["q1, q2, q3, q4 may be quaternions"]),
         (f"{EULER},euler_ZYX_1_deg,euler_ZYX_2_deg\n1,2,3,1,2\n", ["without euler_ZYX_3_deg; all 3 needed"]),
         (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["are both 'a'"]),

@@ -1,6 +1,5 @@
 """Pose-error least squares: it reaches the bound, its covariance is true, bad poses are named."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -80,14 +79,6 @@ def test_few_poses_state_what_they_can_know(count, low, high):
         covariances.append(found.covariance)
     assert len(errors) > 190
     assert low < normalised(errors, covariances) < high
-
-
-@pytest.mark.parametrize(("robot", "ratio"), [((np.radians(1), 10), 0.2), ((np.radians(10), 100), 0.02)])
-def test_stated_sigma_that_are_far_too_large_are_said(robot, ratio):
-    pairs = simulated(np.random.default_rng(5), 15, robot=(2e-4, 0.1), camera=(5e-4, 0.2)).pairs
-    found = handeye(pairs, options=HandEyeOptions(Noise(*robot)))
-    said = re.search(r"the residuals are ([\d.]+) times what the stated σ make expect", found.notes[-1])
-    assert float(said.group(1)) < ratio
 
 
 @pytest.mark.parametrize("factor", [pytest.param(1, marks=pytest.mark.slow), 4])

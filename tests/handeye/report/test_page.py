@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
 from stcal.handeye.handeye_file import HandEyeFile
-from stcal.handeye.handeye_page import by_robot, image_coverage, outcome_report
+from stcal.handeye.handeye_page import by_robot, outcome_report
 from stcal.handeye.handeye_pipeline import Outcome
 from stcal.handeye.handeye_problem import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
@@ -102,29 +102,6 @@ def truth():
 def outcome(request, truth) -> Outcome:
     result = handeye(truth.pairs, truth.setup, request.param, truth.views, HandEyeOptions(with_scale=True))
     return Outcome("images", result, pairs=truth.pairs, views=truth.views)
-
-
-def views_of(camera, *corners) -> Views:
-    return Views(
-        camera, tuple(View(np.pad(np.array(xy, float), ((0, 0), (0, 1))), np.array(xy, float)) for xy in corners)
-    )
-
-
-def test_the_share_of_the_image(truth):
-    """A quarter, by one view and by two that are the same; two quarters that meet are half; a line is nothing. Cells of
-    a sixtieth of the width let a straight border be off by one of them: 1/60 and 1/45 of the sides."""
-    camera = truth.views.camera
-    w, h = camera.width, camera.height
-    first = [(0, 0), (w / 2, 0), (w / 2, h / 2), (0, h / 2), (w / 5, h / 5)]
-    second = [(x + w / 2, y) for x, y in first]
-    for views, share, most in (((first,), 0.25, 1), ((first, first), 0.25, 2), ((first, second), 0.5, 1)):
-        found = image_coverage(views_of(camera, *views))
-        assert (found > 0).mean() == pytest.approx(share, abs=0.04)
-        assert found.max() == most
-    found = image_coverage(views_of(camera, first))
-    assert found[:20, :25].min() == 1  # rows are y, columns x
-    assert found[-20:].max() == 0
-    assert not image_coverage(views_of(camera, [(x, 10) for x in range(10, 60, 10)])).any()
 
 
 @pytest.mark.parametrize("method", ["reprojection", "pose"])
