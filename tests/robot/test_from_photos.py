@@ -12,6 +12,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import require_new_folder, save_folder
 from stcal.io.images import Skipped
 from stcal.io.table import Table, pose_cells, read_table
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import made
@@ -90,7 +91,8 @@ def swept(cell):
     """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
-    return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted(cell.about(12)))
+    targets, options = wanted(cell.about(12)), IdentifyOptions(repeats=1)
+    return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
 
 
 @pytest.mark.slow
