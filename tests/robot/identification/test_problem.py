@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import problem
 from stcal.robot.identification.adjustment import Weighting, jacobian, moved, observed, residuals
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.problem import MOST_BENT, ArmProblem, Bent, Spread, huber_limit, relaxed
+from stcal.robot.identification.problem import ArmProblem, Spread, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
@@ -89,65 +89,16 @@ def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
         ArmProblem(seen, WEIGHTING).solve(far)
 
 
-def regression(
-    rng: np.random.Generator, rows: int, width: int = 4, groups: int = 0, sigma: float = 1.0, tau: float = 1.0
-):
-    """A linear model of ``width`` parameters, the last ``groups`` of them drawn with ``tau`` about 0; about zero."""
-    design = rng.normal(size=(rows, width))
-    drawn = rng.normal(size=width) * tau * (np.arange(width) >= width - groups)
-    seen = design @ drawn + rng.normal(size=rows) * sigma
-    each, doubt = [Equations.of(seen, -design)], [np.inf]
-    if groups:
-        mine = np.diag((np.arange(width) >= width - groups).astype(float))
-        each, doubt = [*each, replace(Equations.of(np.zeros(width), mine), count=groups)], [np.inf, 1.0]
-    fixed = Equations.of(np.zeros(width), 1e-6 * np.eye(width))
-    far = np.full(len(each), 3.0)
-    return Spread(Components(each, fixed, 0.0, np.array(doubt)), -far, far, np.ones(width)), design, seen, drawn
-
-
 @pytest.mark.parametrize("rows", [14, 24, 104])
 def test_one_sigma_is_that_of_least_squares_and_the_covariance_that_of_t(rows):
-    parts, design, seen, _ = regression(np.random.default_rng(rows), rows)
-    freedom = rows - 4
+    rng = np.random.default_rng(rows)
+    design, seen = rng.normal(size=(rows, 4)), rng.normal(size=rows)
+    fixed = Equations.of(np.zeros(4), 1e-6 * np.eye(4))
+    parts = Components([Equations.of(seen, -design)], fixed, 0.0, np.array([np.inf]))
+    spread = Spread(parts, np.array([-3.0]), np.array([3.0]), np.ones(4))
+    freedom, best = rows - 4, spread.best()
     left = np.linalg.lstsq(design, seen, rcond=None)[1][0]
-    best = parts.best()
     assert np.exp(2 * best[0]) == pytest.approx(left / freedom, rel=1e-6)
     wanted = left / (freedom - 2) * np.linalg.inv(design.T @ design)  # of a t distribution with so many degrees
     # three nodes are exact to the fourth order of the spread of log σ, 1 / √(2 · freedom)
-    assert parts.covariance(best) == pytest.approx(wanted, rel=3 / freedom**2 + 1e-3)
-
-
-@pytest.mark.slow
-def test_of_several_parts_the_covariance_is_true_on_average():
-    error = []
-    for seed in range(400):
-        parts, _, _, drawn = regression(np.random.default_rng(seed), 30, 10, 6, 1.0, 0.6)
-        best = parts.best()
-        step = parts.parts.at(best)[2]
-        away = step - drawn
-        error.append(away @ np.linalg.solve(parts.covariance(best), away) / 10)
-    # With the σ taken for known it is 1.18. Three standard errors of the mean of 400 draws:
-    assert np.mean(error) == pytest.approx(1, abs=0.1)
-
-
-@pytest.mark.parametrize("slope", [-2.5, -0.5, 0.9])
-def test_steps_that_overshoot_are_shortened(slope):
-    """Of an iteration x → slope · x the first wanted step is (slope - 1) x; at -2.5 whole steps lead away for ever."""
-    x, last, share = np.array([1.0, -2.0]), np.zeros(2), 1.0
-    for _ in range(30):
-        wanted = (slope - 1) * x
-        last, share = wanted, relaxed(wanted, last, share)
-        x = x + share * wanted
-    assert np.abs(x).max() < 0.1 * max(slope, 0) ** 30 * 20 + 1e-6
-
-
-def test_second_derivatives_leave_a_minimum():
-    """They are as they are where they take little, and are cut off where they would make a saddle."""
-    root = np.random.default_rng(0).normal(size=(4, 4)) * [1, 10, 100, 1000]
-    normal, share = root @ root.T, np.array([-1.0, 0.1, 0.5, 2.0])
-    little = (root * np.minimum(share, 0.5)) @ root.T
-    assert Bent.of(normal, little).taken() == pytest.approx(little, rel=1e-6)
-    bent = Bent.of(normal, (root * share) @ root.T)
-    left = (root * [2.0, 0.9, 0.5, 1 - MOST_BENT]) @ root.T
-    assert normal - bent.taken() == pytest.approx(left, rel=1e-6)
-    assert bent.bends().T @ normal @ bent.bends() == pytest.approx(left, rel=1e-6)
+    assert spread.covariance(best) == pytest.approx(wanted, rel=3 / freedom**2 + 1e-3)

@@ -13,11 +13,11 @@ from stcal.robot.identification.adjustment import (
     jacobian,
     moved,
     observed,
-    parameter_names,
     residuals,
     tips,
 )
 from stcal.robot.identification.identify import identify
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identified_report import joints_figure
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames
@@ -64,19 +64,6 @@ def test_rows_and_mounts_come_back_from_the_chain(convention):
     assert true.rows[2].theta != robot.rows[2].theta
     assert again.rows[3] != robot.rows[3]
     assert np.abs(again.tree.mounts[8][1].matrix() - RIGHT.matrix()).max() > 1e-4
-
-
-def test_derivatives_are_those_of_differences():
-    robot, rng = two_arms(), np.random.default_rng(3)
-    data = measured(robot, joint_vectors(robot, 9, rng), rng, 0.0, 0.0, MARKERS * 3)
-    state, seen = State(robot.chain(), dict(robot.tools)), observed(data)
-    derivative = jacobian(state, seen)
-    for k in range(derivative.shape[2]):
-        step = np.zeros(derivative.shape[2])
-        step[k] = 1e-4 if parameter_names(state, "pose")[k].split()[-1] in ("x", "y", "z") else 1e-7
-        ahead, behind = (residuals(moved(state, sign * step, "pose"), seen) for sign in (1, -1))
-        by_difference = (behind - ahead) / (2 * step[k])
-        assert np.abs(derivative[:, :, k] - by_difference).max() < 1e-5 * max(np.abs(by_difference).max(), 1)
 
 
 @pytest.mark.slow
@@ -133,15 +120,6 @@ def test_a_load_hangs_at_the_tool_without_name():
     assert sag["right"] == 0
 
 
-def test_the_file_of_an_elastic_tree_reads_back_the_same(tmp_path):
-    rng = np.random.default_rng(2)
-    robot = elastic(made(two_arms(), rng), rng)
-    (tmp_path / "robot.toml").write_text(robot_toml(robot))
-    again, q = load_robot(tmp_path / "robot.toml"), joint_vectors(robot, 5, rng)
-    assert again.tree.carriers == robot.tree.carriers
-    assert max(np.abs(apart(again, robot, q, name)).max() for name in MARKERS) < 1e-9
-
-
 def test_joints_are_drawn_with_the_rows_that_they_move():
     robot, rng = two_arms(), np.random.default_rng(3)
     seen = observed(seen_by(robot, rng, each=4))
@@ -157,7 +135,7 @@ def test_two_arms_are_identified_together():
     rng = np.random.default_rng(4)
     nominal = two_arms()
     true = made(nominal, rng)
-    found = identify(nominal, seen_by(true, rng))
+    found = identify(nominal, seen_by(true, rng), IdentifyOptions(repeats=1))
     assert found.rank == 4 * 14 + 6 * 3
     assert found.undetermined == ()
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.15)
@@ -219,6 +197,7 @@ def test_rows_of_an_elastic_tree_keep_the_place_about_which_a_link_gives_way(tmp
     file = tmp_path / "robot.toml"
     file.write_text(robot_toml(robot_from_chain(bent, robot.tools, robot)))
     again = load_robot(file)
+    assert again.tree.carriers == robot.tree.carriers
     q, targets = joint_vectors(robot, 8, rng), MARKERS * 2
     q, targets = q[: len(targets)], targets[: len(q)]
     wanted = tips(State(bent, dict(robot.tools)), q, targets)
