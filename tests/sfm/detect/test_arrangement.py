@@ -86,16 +86,12 @@ def poses(scene):
     return next(g for g in scene.groups.values() if g.name == "12").camera_from_target
 
 
-def test_everything_that_fits_is_kept(scene, group):
+def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group):
+    """Everything that fits is kept. The circles are 0.02 mm off the design: 0.06 px here."""
     results, arrangement = labelled(scene, [Seen(o).detection() for o in group])
     assert all(set(r.observations.labels) == set(o.labels) for r, o in zip(results, group, strict=True))
     assert set(arrangement.group_from_plane) == {"1", "2", "board"}
     assert all(r.notes == () for r in results)
-
-
-def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group):
-    """The circles are 0.02 mm off the design: 0.06 px here."""
-    _, arrangement = labelled(scene, [Seen(o).detection() for o in group])
     for i, image in enumerate(group):
         pose, planes = arrangement.camera_from_group[i], arrangement.group_from_plane
         predicted = predict_circles(pose, planes, [], patterns_of(scene.target, scene.board), scene.camera)
@@ -110,9 +106,6 @@ def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group)
         assert max(own) < 0.6
 
 
-PHANTOM = "a pattern like face 5: not where"
-
-
 @pytest.mark.parametrize("count", [1, 4])
 def test_a_phantom_that_does_not_stand_still_goes_out(scene, group, count):
     """Something that reads as face 5, at another place against the target in every image."""
@@ -125,7 +118,7 @@ def test_a_phantom_that_does_not_stand_still_goes_out(scene, group, count):
         assert {x for x in r.observations.labels if x.plane != "5"} == set(o.labels)
     kept = sum("5" in r.observations.face_ids() for r in results)
     assert kept <= 1  # one alone contradicts nothing that the group knows
-    assert sum(PHANTOM in n for r in results for n in r.notes) == count - kept
+    assert sum("a pattern like face 5: not where" in n for r in results for n in r.notes) == count - kept
 
 
 def test_a_face_in_view_twice_is_neither(scene, group):
@@ -225,21 +218,16 @@ def test_a_face_that_no_image_names_is_what_the_images_have_in_common(scene, gro
             assert (r.notes == ()) == (set(o.face_ids()) <= planes)
 
 
-def test_a_pattern_without_a_name_that_fits_nothing_is_left_out(scene, group):
-    seen = [Seen(o) for o in group]
-    seen[0].face("5", plane_centres(Rigid.exp([2.8, 0.2, 0.1, -300, 200, 1100]), TARGET.face("5").xy_mm)).unnamed("5")
-    results, _ = labelled(scene, [s.detection() for s in seen])
-    assert set(results[0].observations.labels) == set(group[0].labels)
-    assert any("fits face 1, 2, 3, 4, 5 but may be another" in note for note in results[0].notes)
-
-
-def test_patterns_of_which_the_same_is_said_make_one_note(scene, group):
+def test_patterns_without_a_name_that_fit_nothing_are_left_out_with_one_note(scene, group):
     seen = Seen(group[0])
     for x in (-300, 0, 300):
         pose = Rigid.exp([2.8, 0.2, 0.1, x, 200, 1100])
         seen.face("5", plane_centres(pose, TARGET.face("5").xy_mm)).unnamed("5")
-    found = label_single("a.png", "12", seen.detection(), scene.target)
-    assert [note.partition("(")[2] for note in found.notes if "may be another" in note] == ["3 times)"]
+    results, _ = labelled(scene, [seen.detection(), *(Seen(o).detection() for o in group[1:])])
+    assert set(results[0].observations.labels) == set(group[0].labels)
+    for found in (results[0], label_single("a.png", "12", seen.detection(), scene.target)):
+        (note,) = [note for note in found.notes if "fits face 1, 2, 3, 4, 5 but may be another" in note]
+        assert note.endswith("(3 times)")
 
 
 def numbered(image, numberings) -> ImageDetection:
@@ -262,7 +250,7 @@ def is_numbered(image, result, half_a_turn=False) -> bool:
     return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_all_images_agree_on_one_numbering(scene, group, seed):
     turns = np.random.default_rng(seed).integers(0, 2, len(group)).astype(bool)
     detections = [numbered(o, turned) if turn else Seen(o).detection() for o, turn in zip(group, turns, strict=True)]

@@ -3,6 +3,7 @@
 Rendered photographs are judged as in ``test_light_and_cover``.
 """
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from stcal.sfm.detect.labelling import label_groups
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.levels import sampled
 from tests.sfm.detect.degraded import Bench, study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
@@ -49,18 +51,11 @@ def mirrored_in(kind):
     return make
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", MIRRORS)
+@pytest.mark.parametrize("kind", sampled(MIRRORS))
 def test_a_mirror_image_of_the_target_gives_no_wrong_label(bench, kind):
     """One group of four sees it. That group alone could not tell a face that it does not show from its image."""
     found = bench.label(mirrored_in(kind), 0.7, *ALL)
     found.assert_all_found()
-
-
-@pytest.mark.full
-def test_a_mirror_at_another_place_in_every_group_gives_no_wrong_label(bench):
-    """In each the one of 26 of which its photographs show most."""
-    bench.label("reflection", 0.7, *ALL).assert_all_found()
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +91,7 @@ def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_grou
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reflectance", [0.3, 0.9])
+@pytest.mark.parametrize("reflectance", [0.9])
 def test_a_shiny_table_gives_no_wrong_label(reflectance, tmp_path):
     options = SceneOptions(seed=3, width=1300, height=867, images_per_group=3, distance_mm=1400, groups=(("1", "2"),))
     scene = make_scene(options)
@@ -163,18 +158,19 @@ def detected(name, faces=(), mirrored=()):
 
 
 def images(mirrored, upright, empty=0):
-    return (
-        *(detected(f"m{i}", mirrored=("2", "5")) for i in range(mirrored)),
-        *(detected(f"u{i}", faces=("1",)) for i in range(upright)),
-        *(detected(f"e{i}") for i in range(empty)),
-    )
+    numbers = {("m", "", "25"): mirrored, ("u", "1", ""): upright, ("e", "", ""): empty}
+    return tuple(detected(f"{kind}{i}", *shown) for (kind, *shown), n in numbers.items() for i in range(n))
 
 
-@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(1, 0, 0), (3, 2, 0), (3, 2, 40), (12, 0, 0)])
-def test_a_set_that_is_mostly_mirrored_is_refused(mirrored, upright, empty):
+@pytest.mark.parametrize(
+    ("mirrored", "upright", "empty"),
+    [(1, 0, 0), (3, 2, 40), (12, 0, 0), (0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)],
+)
+def test_a_set_that_is_mostly_mirrored_is_refused_and_others_go_on(mirrored, upright, empty):
     """Images without a face say nothing of it."""
     words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 appears"
-    with pytest.raises(DetectionError, match=words):
+    refused = pytest.raises(DetectionError, match=words)
+    with refused if mirrored > upright else nullcontext():
         require_upright(images(mirrored, upright, empty))
 
 
@@ -185,17 +181,6 @@ def test_a_board_that_is_read_shows_that_the_drawing_is_mirrored(corner, said):
     own = [replace(i, detection=replace(i.detection, boards=(seen,))) for i in images(3, 0, 0)]
     with pytest.raises(DetectionError, match=said):
         require_upright(tuple(own), board)
-
-
-@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)])
-def test_a_set_of_which_some_images_are_mirrored_goes_on(mirrored, upright, empty):
-    own = images(mirrored, upright, empty)
-    require_upright(own)
-    named = replace(own[0], detection=replace(own[0].detection, mirrored=("1", "2")))
-    with pytest.raises(DetectionError):  # so that it is the number that decides
-        require_upright(
-            (named, *own[: mirrored + 1], *(detected(f"x{i}", mirrored=("1",)) for i in range(upright + 1)))
-        )
 
 
 @pytest.mark.slow
@@ -250,7 +235,7 @@ TARGET_FROM_RIGHT = Rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.arr
 
 
 @pytest.mark.parametrize("kind", GRIDS)
-@pytest.mark.parametrize("turn", [-1.1, -0.8, -0.4])
+@pytest.mark.parametrize("turn", [-1.1, -0.4])
 def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, turn):
     """Both at right angles: seen from either side of the plane half way."""
     target = TargetDesign("two", "dark", GRIDS[kind])
