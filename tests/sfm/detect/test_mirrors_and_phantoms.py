@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign
+from stcal.design import BoardDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
 from stcal.sfm.detect.candidates import BoardSighting
 from stcal.sfm.detect.detect_files import DetectedImage, require_upright
-from stcal.sfm.detect.face_patterns import mirror_images
 from stcal.sfm.detect.labelling import label_groups
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
@@ -211,43 +210,3 @@ def test_a_phantom_in_one_image_goes_out_and_ends_nothing(bench):
     found.assert_all_found()
     assert sum(note.startswith("a pattern like face 3: not where") for note in found.images[FIRST].notes) == 1
     assert {label.plane for label in found.labels(FIRST)} == {"1", "2", "board"}
-
-
-def nine_circles(face_id: str, large: str, shifts: dict[int, tuple[float, float]]) -> FaceDesign:
-    """A face of 3 × 3 circles, 35 mm apart, those of ``large`` with 6 mm radius, some shifted."""
-    xy = np.array([(35.0 * (i % 3), 35.0 * (i // 3)) for i in range(9)])
-    for i, shift in shifts.items():
-        xy[i] += shift
-    radius = np.where([c == "o" for c in large], 6.0, 3.5)
-    return FaceDesign(face_id, tuple("123456789"), xy, radius, "1", "3", "7")
-
-
-GRIDS = {
-    "perturbed": (
-        nine_circles("front", "o.ooo..oo", {2: (6, 3), 4: (0, 5)}),
-        nine_circles("right", "ooo..ooo.", {0: (-3, 0), 5: (4, -6)}),
-    ),
-    "pure": (nine_circles("front", "ooooo.oo.", {}), nine_circles("right", "o..oo.o.o", {})),
-    "partly alike": (nine_circles("front", "o.o...ooo", {}), nine_circles("right", "o.o...oo.", {4: (0, 6)})),
-}
-"""Pairs of faces that only radii or small shifts distinguish from mirror images of each other."""
-TARGET_FROM_RIGHT = Rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([100.0, 0, -30]))
-
-
-@pytest.mark.parametrize("kind", GRIDS)
-@pytest.mark.parametrize("turn", [-1.1, -0.4])
-def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, turn):
-    """Both at right angles: seen from either side of the plane half way."""
-    target = TargetDesign("two", "dark", GRIDS[kind])
-    assert "right" not in mirror_images(target).get("front", ())
-    images = []
-    for i in range(4):
-        pose = Rigid.exp([3.1, 0.02 * i, 0, 0, 0, 0]) @ Rigid.exp([0, turn + 0.05 * i, 0, 0, 0, 0])
-        pose = Rigid(pose.rotation, np.array([0.0, 20 * i, 900]))
-        seen = Seen()
-        for face, own in zip(target.faces, (pose, pose @ TARGET_FROM_RIGHT), strict=True):
-            seen.face(face.id, plane_centres(own, face.xy_mm), range(9))
-        images.append((str(i), "a", seen.detection()))
-    ((labelled, _),) = label_groups([images], target, None, FOCAL_PX)
-    assert all(set(each.observations.face_ids()) == {"front", "right"} for each in labelled)
-    assert all(each.notes == () for each in labelled)
