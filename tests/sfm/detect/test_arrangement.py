@@ -165,21 +165,16 @@ def test_one_bad_first_image_does_not_speak_for_the_group(scene, group):
     seen[0].boards[0] = BoardSighting(wrong.rows[9:], wrong.numberings[:1, 9:] - [1, 0])
     results, _ = labelled(scene, [s.detection() for s in seen])
     for r, o in list(zip(results, group, strict=True))[1:]:
-        dots = {
-            x: tuple(c) for x, c in zip(r.observations.labels, r.observations.centre, strict=True) if x.plane == "board"
-        }
-        truth = {x: tuple(c) for x, c in zip(o.labels, o.centre, strict=True)}
-        turned = [dots.get(x) == truth[x] for x in truth if x.plane == "board"]
+        dots, truth = places(r.observations, "board"), places(o, "board")
+        turned = [dots.get(x) == truth[x] for x in truth]
         assert len(dots) == 63
         assert all(turned) or not any(turned[:20])
 
 
-def test_a_mirrored_image_gives_no_labels_and_says_so(scene, group):
-    detections = [Seen(o).detection(("1",) if i == 1 else ()) for i, o in enumerate(group)]
-    results, _ = labelled(scene, detections)
-    assert len(results[1].observations) == 0
-    assert any("the image is mirrored: it shows face 1" in note for note in results[1].notes)
-    assert set(results[0].observations.labels) == set(group[0].labels)
+def places(observations, plane=None) -> dict:
+    """Centres by label, of one plane if it is named."""
+    found = zip(observations.labels, map(tuple, observations.centre), strict=True)
+    return {label: at for label, at in found if plane in (None, label.plane)}
 
 
 def test_faces_without_a_name_are_named_by_the_group(scene, group):
@@ -190,8 +185,7 @@ def test_faces_without_a_name_are_named_by_the_group(scene, group):
             own.unnamed(face_id)
     results, _ = labelled(scene, [s.detection() for s in seen])
     for r, o in zip(results[1:], group[1:], strict=True):
-        found = dict(zip(r.observations.labels, map(tuple, r.observations.centre), strict=True))
-        truth = dict(zip(o.labels, map(tuple, o.centre), strict=True))
+        found, truth = places(r.observations), places(o)
         assert {x.plane for x in found} == {x.plane for x in truth}
         assert all(found[x] == truth[x] for x in found)
         assert len(found) == len(truth) - 4 * (len({x.plane for x in truth}) - 1)
@@ -238,9 +232,7 @@ def turned(true, other):
 
 def is_numbered(image, result, half_a_turn=False) -> bool:
     """Whether the board's labels are the true ones, or those after half a turn."""
-    truth = dict(zip(image.labels, map(tuple, image.centre), strict=True))
-    found = zip(result.observations.labels, map(tuple, result.observations.centre), strict=True)
-    dots = [(x, at) for x, at in found if x.plane == "board"]
+    truth, dots = places(image), places(result.observations, "board").items()
     return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
 
 

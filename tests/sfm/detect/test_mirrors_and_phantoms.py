@@ -1,4 +1,4 @@
-"""What is not the target: mirror images of its faces, mirrored files, printed grids, plates with a face's pattern.
+"""What is not the target: mirror images of its faces, mirrored files, and what is blurred beyond its size.
 
 Rendered photographs are judged as in ``test_light_and_cover``.
 """
@@ -17,14 +17,10 @@ from stcal.io.images import ImageFile
 from stcal.sfm.detect.candidates import BoardSighting
 from stcal.sfm.detect.detect_files import DetectedImage, require_upright
 from stcal.sfm.detect.labelling import label_groups
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import sampled
-from tests.sfm.detect.degraded import Bench, study
+from tests.sfm.detect.degraded import study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
-from tests.support.photograph import read_set
 
 FIRST = "12/IMG_1000"
 ALL = ("12", "14", "15", "23")
@@ -87,15 +83,6 @@ def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_grou
             "board",
             "a pattern like face 3",
         ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reflectance", [0.9])
-def test_a_shiny_table_gives_no_wrong_label(reflectance, tmp_path):
-    options = SceneOptions(seed=3, width=1300, height=867, images_per_group=3, distance_mm=1400, groups=(("1", "2"),))
-    scene = make_scene(options)
-    write_dataset(tmp_path / "set", scene, RenderOptions(clutter=True, reflectance=reflectance, seed=3), workers=1)
-    Bench(read_set(tmp_path / "set"), tmp_path / "bench").label("plain").assert_all_found()
 
 
 def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
@@ -180,33 +167,3 @@ def test_a_board_that_is_read_shows_that_the_drawing_is_mirrored(corner, said):
     own = [replace(i, detection=replace(i.detection, boards=(seen,))) for i in images(3, 0, 0)]
     with pytest.raises(DetectionError, match=said):
         require_upright(tuple(own), board)
-
-
-@pytest.mark.slow
-def test_a_printed_grid_of_equal_discs_beside_the_target_is_no_face(bench):
-    """Discs of the size and pitch of a face's large circles, in all images. None takes them for a face by itself, which
-    the group would then have to contradict."""
-    found = bench.label("printed grids", 1)
-    found.assert_all_found()
-    assert "a pattern like face" not in found.notes()
-
-
-CAMERA_FROM_PLATE = Rigid.exp([np.pi, 0.0, 0.0, 200.0, 150.0, 1200.0])
-"""In the first image of group 12; beside target and board, and the other images would show all of it, too."""
-
-
-def plate_like_a_face(photo, value, case):
-    """A plate with the pattern of face 3 beside the target in the first image, and gone in the others."""
-    if photo.number:
-        return study.Picture(photo.grey)
-    (real,) = [face for face in study.all_faces(photo) if face.name == "3"]
-    pose = CAMERA_FROM_PLATE
-    plate = replace(real, matrix=np.column_stack([pose.rotation[:, :2], pose.translation]))
-    return study.Picture(degrade.behind(photo, [plate], [photo.levels(photo.faces[0])], 15.0))
-
-
-def test_a_phantom_in_one_image_goes_out_and_ends_nothing(bench):
-    found = bench.label(plate_like_a_face)
-    found.assert_all_found()
-    assert sum(note.startswith("a pattern like face 3: not where") for note in found.images[FIRST].notes) == 1
-    assert {label.plane for label in found.labels(FIRST)} == {"1", "2", "board"}
