@@ -16,7 +16,6 @@ from stcal.synthetic.optics import ThinLens
 from stcal.synthetic.render import RenderOptions, encode, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.board_views import find_board
-from tests.levels import SLOW
 
 LENS = ThinLens(f_number=1.8, focal_mm=24.0, focus_mm=1150.0)
 GROUP = "12"
@@ -45,7 +44,8 @@ def shifts_px(blurred, sharp):
     return blurred.centre_px[own] - sharp.centre_px[[place[blurred.labels[i]] for i in own]], own
 
 
-@pytest.mark.parametrize("image", [pytest.param(0, marks=SLOW), pytest.param(1, marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("image", range(2))
 def test_centres_through_a_lens_are_those_of_the_pinhole_twin(scene, pairs, image):
     """Off by up to 0.03 px before; after it by what the correction's σ, 15 % of it, allows, and the pixels' squares."""
     blurred, sharp = pairs[image]
@@ -91,20 +91,14 @@ LEFT_PX = 0.0035
 
 
 @pytest.mark.slow
-def test_the_dots_of_a_camera_calibration_are_corrected(boards):
+def test_the_dots_of_a_camera_calibration_and_of_single_views_are_corrected(boards):
     scene, folder = boards
-    blurred, sharp = (
-        calibrate_camera(folder / name, scene.target, scene.board, workers=1).views for name in ("blurred", "sharp")
-    )
+    names = "blurred", "sharp"
+    blurred, sharp = (calibrate_camera(folder / name, scene.target, scene.board, workers=1).views for name in names)
     for view, twin in zip(blurred, sharp, strict=True):
         assert np.sqrt((shifts_px(view, twin)[0] ** 2).mean()) < LEFT_PX
-
-
-@pytest.mark.slow
-def test_the_dots_of_a_single_view_are_corrected(boards):
-    scene, folder = boards
     for i in range(3):
-        pictures = (decode((folder / name / f"{i}.png").read_bytes(), name) for name in ("blurred", "sharp"))
+        pictures = (decode((folder / name / f"{i}.png").read_bytes(), name) for name in names)
         view, twin = (find_board(picture, "", scene.camera, scene.board)[0] for picture in pictures)
         assert view
         assert twin

@@ -25,7 +25,7 @@ def add_ellipse(image, centre, axes, angle=0.0, value=200):
 
 
 @pytest.mark.parametrize("polarity", ["bright", "dark"])
-@pytest.mark.parametrize("diameter", [8, 15, 40, 120, 400])
+@pytest.mark.parametrize("diameter", [8, 40, 400])
 def test_every_size_is_found(polarity, diameter):
     level, value = (40, 200) if polarity == "bright" else (200, 40)
     image = add_ellipse(picture(level=level), (600, 450), (diameter / 2, diameter / 2), value=value)
@@ -36,7 +36,7 @@ def test_every_size_is_found(polarity, diameter):
     assert found.contrast[0] == pytest.approx(160, abs=40)
 
 
-@pytest.mark.parametrize("tilt_deg", [30, 60, 70])
+@pytest.mark.parametrize("tilt_deg", [30, 70])
 def test_a_tilted_circle_keeps_its_shape(tilt_deg):
     image = add_ellipse(picture(), (600, 450), (30, 30 * np.cos(np.radians(tilt_deg))), angle=35)
     found = find_ellipses(image, "bright", EllipseOptions())
@@ -65,12 +65,8 @@ def test_what_is_no_circle_is_not_found(image, polarity):
     assert len(find_ellipses(image, polarity, EllipseOptions())) == 0
 
 
-def test_size_limits_are_kept():
+def test_size_limits_are_kept_and_faint_blobs_left_out_against_bright_ones():
     image = add_ellipse(add_ellipse(picture(), (300, 300), (10, 10)), (700, 500), (60, 60))
+    add_ellipse(image, (1000, 300), (30, 30), value=48)
     found = find_ellipses(image, "bright", EllipseOptions(min_diameter_px=40))
     assert [round(r) for r in found.radius_px()] == [60]
-
-
-def test_faint_blobs_are_left_out_against_bright_ones():
-    image = add_ellipse(add_ellipse(picture(), (300, 300), (20, 20), value=240), (700, 500), (20, 20), value=48)
-    assert len(find_ellipses(image, "bright", EllipseOptions())) == 1

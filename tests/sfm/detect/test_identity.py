@@ -50,11 +50,7 @@ def ellipses_of(camera_from_plane, xy_mm, radius_mm, contrast=100.0):
 
 
 def joined(*parts):
-    return Ellipses(
-        np.concatenate([p.centre_px for p in parts]),
-        np.concatenate([p.shape_px for p in parts]),
-        np.concatenate([p.contrast for p in parts]),
-    )
+    return Ellipses.concatenate(parts)
 
 
 def junk(count, seed=0, contrast=100.0):
@@ -85,13 +81,12 @@ def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
     assert finding.faces[0].rows.tolist() == finding.faces[0].circles.tolist() == list(range(10))
 
 
-@pytest.mark.parametrize("hidden", [("1",), ("a",), ("3", "5"), ("6", "7"), ("b", "4")])
-def test_up_to_two_hidden_circles_leave_the_name(hidden):
-    finding = find_faces(face_ellipses("4", pose(50, 120, 30), hidden))
-    assert [r.face for r in finding.faces] == ["4"]
-    assert len(finding.faces[0].rows) == 10 - len(hidden)
-    missing = [TARGET.face("4").ids[i] for i in set(range(10)) - set(finding.faces[0].circles)]
-    assert set(missing) == set(hidden)
+@pytest.mark.parametrize("hidden", ["1", "a", "35", "67", "b4", "126", "457b"])
+def test_up_to_four_hidden_circles_leave_the_name(hidden):
+    """Six circles are left at least: four make a homography, two confirm it, and nothing else reads like them."""
+    (found,) = find_faces(face_ellipses("4", pose(50, 120, 30), hidden)).faces
+    assert found.face == "4"
+    assert {TARGET.face("4").ids[i] for i in set(range(10)) - set(found.circles)} == set(hidden)
 
 
 def test_a_circle_of_another_size_is_left_out_of_its_face():
@@ -117,16 +112,10 @@ def test_without_the_circle_that_tells_the_faces_apart_nothing_is_named():
     assert {each.face for refused in finding.refused for each in refused} > {"3"}
 
 
-@pytest.mark.parametrize("hidden", [("1", "2", "6"), ("4", "5", "7", "b")])
-def test_four_hidden_circles_leave_the_name(hidden):
-    """Six circles are left: four make a homography, two confirm it, and the design has no other reading of them."""
-    finding = find_faces(face_ellipses("3", pose(40, 20, 100), hidden))
-    assert [r.face for r in finding.faces] == ["3"]
-    assert len(finding.faces[0].rows) == 10 - len(hidden)
-
-
-def test_five_hidden_circles_are_too_many():
+def test_five_hidden_circles_are_too_many_and_a_design_without_faces_has_none():
     assert find_faces(face_ellipses("3", pose(), hidden=("1", "2", "6", "a", "4"))).faces == ()
+    finding = FaceFinder(TargetDesign("none", "bright", ())).find(Candidates.of(face_ellipses("1", pose()), CAMERA))
+    assert finding.faces == finding.refused == ()
 
 
 @pytest.mark.parametrize("ratio", [0.15, 0.45, 3.0, 5.0])
@@ -151,7 +140,7 @@ def test_a_printed_grid_of_equal_discs_is_no_face(radius):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
+@pytest.mark.parametrize("seed", range(2))
 def test_random_discs_are_no_faces_and_hide_none(seed):
     assert find_faces(junk(150, seed)).faces == ()
     finding = find_faces(joined(junk(150, seed), face_ellipses("2", pose(60, 40, 200))))
@@ -186,12 +175,6 @@ def test_which_circles_name_a_face():
     assert is_named(face, range(10), TARGET)
     assert not is_named(face, set(range(10)) - {face.ids.index("c")}, TARGET)
     assert all(max(map(len, confusable(face, TARGET))) == 9 for face in TARGET.faces)
-
-
-def test_a_design_without_faces_has_none():
-    """As photographs of a dot board alone are read."""
-    finding = FaceFinder(TargetDesign("none", "bright", ())).find(Candidates.of(face_ellipses("1", pose()), CAMERA))
-    assert finding.faces == finding.refused == ()
 
 
 def test_faces_of_few_and_of_many_circles_are_found_together():
@@ -243,12 +226,8 @@ def test_a_plain_board_is_numbered_up_to_half_a_turn(tilt, azimuth, roll):
     both = [cells_of(reading, keep, BOARD, k) for k in range(2)]
     assert truth in both
     assert turned in both
-
-
-def test_a_square_plain_board_has_four_numberings():
     square = BoardDesign(7, 7, 30.0, 7.5, "bright", 0.005)
-    _, ellipses = board_ellipses(square, pose(30, 20, 10, facing=False))
-    (reading,) = find(ellipses, square)
+    (reading,) = find(board_ellipses(square, pose(tilt, azimuth, roll, facing=False))[1], square)
     assert len(reading.numberings) == 4
 
 
@@ -261,22 +240,19 @@ def test_a_larger_corner_dot_settles_the_numbering(corner):
     assert cells_of(reading, keep, board) == {i: divmod(i, 10) for i in range(100)}
 
 
-def test_hidden_dots_do_not_shift_the_numbering():
-    hidden = {(0, 0), (3, 4)}
-    keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False), hidden)
-    (reading,) = find(ellipses, BOARD)
-    truth = {i: divmod(i, 9) for i in keep}
-    assert truth in [cells_of(reading, keep, BOARD, k) for k in range(len(reading.numberings))]
-
-
-def test_a_hidden_strip_leaves_both_readings_open():
-    """Nothing in the image tells on which side the hidden column was."""
-    hidden = {(r, 0) for r in range(7)}
-    keep, ellipses = board_ellipses(BOARD, pose(20, 80, 0, facing=False), hidden)
+@pytest.mark.parametrize(
+    ("tilt", "azimuth", "roll", "hidden", "count"),
+    [
+        (45, 80, 20, {(0, 0), (3, 4)}, 2),
+        (20, 80, 0, {(r, 0) for r in range(7)}, 4),  # nothing tells on which side the hidden column was
+    ],
+)
+def test_hidden_dots_leave_the_numberings_open_that_fit(tilt, azimuth, roll, hidden, count):
+    keep, ellipses = board_ellipses(BOARD, pose(tilt, azimuth, roll, facing=False), hidden)
     (reading,) = find(ellipses, BOARD)
     numberings = [cells_of(reading, keep, BOARD, k) for k in range(len(reading.numberings))]
     assert {i: divmod(i, 9) for i in keep} in numberings
-    assert len(numberings) == 4
+    assert len(numberings) == count
 
 
 def test_a_strip_cut_off_by_the_image_is_known():
@@ -294,16 +270,13 @@ def test_a_strip_cut_off_by_the_image_is_known():
     assert len(numberings) == 2
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_discs_around_the_board_are_not_taken_into_it(seed):
     keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False))
+    assert find(junk(300, seed), BOARD) == []
     readings = find(joined(ellipses, junk(120, seed)), BOARD)
     assert len(readings) == 1
     assert set(readings[0].rows) == set(range(len(keep)))
-
-
-def test_random_discs_are_no_board():
-    assert find(junk(300, 1), BOARD) == []
 
 
 def test_rings_at_other_places_than_stated_are_refused():

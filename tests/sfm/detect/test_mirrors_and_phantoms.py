@@ -1,29 +1,26 @@
-"""What is not the target: mirror images of its faces, mirrored files, printed grids, plates with a face's pattern.
+"""What is not the target: mirror images of its faces, mirrored files, and what is blurred beyond its size.
 
 Rendered photographs are judged as in ``test_light_and_cover``.
 """
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign
+from stcal.design import BoardDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
 from stcal.sfm.detect.candidates import BoardSighting
 from stcal.sfm.detect.detect_files import DetectedImage, require_upright
-from stcal.sfm.detect.face_patterns import mirror_images
 from stcal.sfm.detect.labelling import label_groups
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
-from tests.sfm.detect.degraded import Bench, study
+from tests.levels import sampled
+from tests.sfm.detect.degraded import study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
-from tests.support.photograph import read_set
 
 FIRST = "12/IMG_1000"
 ALL = ("12", "14", "15", "23")
@@ -49,18 +46,11 @@ def mirrored_in(kind):
     return make
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", MIRRORS)
+@pytest.mark.parametrize("kind", sampled(MIRRORS))
 def test_a_mirror_image_of_the_target_gives_no_wrong_label(bench, kind):
     """One group of four sees it. That group alone could not tell a face that it does not show from its image."""
     found = bench.label(mirrored_in(kind), 0.7, *ALL)
     found.assert_all_found()
-
-
-@pytest.mark.full
-def test_a_mirror_at_another_place_in_every_group_gives_no_wrong_label(bench):
-    """In each the one of 26 of which its photographs show most."""
-    bench.label("reflection", 0.7, *ALL).assert_all_found()
 
 
 @pytest.fixture(scope="module")
@@ -93,15 +83,6 @@ def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_grou
             "board",
             "a pattern like face 3",
         ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reflectance", [0.3, 0.9])
-def test_a_shiny_table_gives_no_wrong_label(reflectance, tmp_path):
-    options = SceneOptions(seed=3, width=1300, height=867, images_per_group=3, distance_mm=1400, groups=(("1", "2"),))
-    scene = make_scene(options)
-    write_dataset(tmp_path / "set", scene, RenderOptions(clutter=True, reflectance=reflectance, seed=3), workers=1)
-    Bench(read_set(tmp_path / "set"), tmp_path / "bench").label("plain").assert_all_found()
 
 
 def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
@@ -163,18 +144,19 @@ def detected(name, faces=(), mirrored=()):
 
 
 def images(mirrored, upright, empty=0):
-    return (
-        *(detected(f"m{i}", mirrored=("2", "5")) for i in range(mirrored)),
-        *(detected(f"u{i}", faces=("1",)) for i in range(upright)),
-        *(detected(f"e{i}") for i in range(empty)),
-    )
+    numbers = {("m", "", "25"): mirrored, ("u", "1", ""): upright, ("e", "", ""): empty}
+    return tuple(detected(f"{kind}{i}", *shown) for (kind, *shown), n in numbers.items() for i in range(n))
 
 
-@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(1, 0, 0), (3, 2, 0), (3, 2, 40), (12, 0, 0)])
-def test_a_set_that_is_mostly_mirrored_is_refused(mirrored, upright, empty):
+@pytest.mark.parametrize(
+    ("mirrored", "upright", "empty"),
+    [(1, 0, 0), (3, 2, 40), (12, 0, 0), (0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)],
+)
+def test_a_set_that_is_mostly_mirrored_is_refused_and_others_go_on(mirrored, upright, empty):
     """Images without a face say nothing of it."""
     words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 appears"
-    with pytest.raises(DetectionError, match=words):
+    refused = pytest.raises(DetectionError, match=words)
+    with refused if mirrored > upright else nullcontext():
         require_upright(images(mirrored, upright, empty))
 
 
@@ -185,84 +167,3 @@ def test_a_board_that_is_read_shows_that_the_drawing_is_mirrored(corner, said):
     own = [replace(i, detection=replace(i.detection, boards=(seen,))) for i in images(3, 0, 0)]
     with pytest.raises(DetectionError, match=said):
         require_upright(tuple(own), board)
-
-
-@pytest.mark.parametrize(("mirrored", "upright", "empty"), [(0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)])
-def test_a_set_of_which_some_images_are_mirrored_goes_on(mirrored, upright, empty):
-    own = images(mirrored, upright, empty)
-    require_upright(own)
-    named = replace(own[0], detection=replace(own[0].detection, mirrored=("1", "2")))
-    with pytest.raises(DetectionError):  # so that it is the number that decides
-        require_upright(
-            (named, *own[: mirrored + 1], *(detected(f"x{i}", mirrored=("1",)) for i in range(upright + 1)))
-        )
-
-
-@pytest.mark.slow
-def test_a_printed_grid_of_equal_discs_beside_the_target_is_no_face(bench):
-    """Discs of the size and pitch of a face's large circles, in all images. None takes them for a face by itself, which
-    the group would then have to contradict."""
-    found = bench.label("printed grids", 1)
-    found.assert_all_found()
-    assert "a pattern like face" not in found.notes()
-
-
-CAMERA_FROM_PLATE = Rigid.exp([np.pi, 0.0, 0.0, 200.0, 150.0, 1200.0])
-"""In the first image of group 12; beside target and board, and the other images would show all of it, too."""
-
-
-def plate_like_a_face(photo, value, case):
-    """A plate with the pattern of face 3 beside the target in the first image, and gone in the others."""
-    if photo.number:
-        return study.Picture(photo.grey)
-    (real,) = [face for face in study.all_faces(photo) if face.name == "3"]
-    pose = CAMERA_FROM_PLATE
-    plate = replace(real, matrix=np.column_stack([pose.rotation[:, :2], pose.translation]))
-    return study.Picture(degrade.behind(photo, [plate], [photo.levels(photo.faces[0])], 15.0))
-
-
-def test_a_phantom_in_one_image_goes_out_and_ends_nothing(bench):
-    found = bench.label(plate_like_a_face)
-    found.assert_all_found()
-    assert sum(note.startswith("a pattern like face 3: not where") for note in found.images[FIRST].notes) == 1
-    assert {label.plane for label in found.labels(FIRST)} == {"1", "2", "board"}
-
-
-def nine_circles(face_id: str, large: str, shifts: dict[int, tuple[float, float]]) -> FaceDesign:
-    """A face of 3 × 3 circles, 35 mm apart, those of ``large`` with 6 mm radius, some shifted."""
-    xy = np.array([(35.0 * (i % 3), 35.0 * (i // 3)) for i in range(9)])
-    for i, shift in shifts.items():
-        xy[i] += shift
-    radius = np.where([c == "o" for c in large], 6.0, 3.5)
-    return FaceDesign(face_id, tuple("123456789"), xy, radius, "1", "3", "7")
-
-
-GRIDS = {
-    "perturbed": (
-        nine_circles("front", "o.ooo..oo", {2: (6, 3), 4: (0, 5)}),
-        nine_circles("right", "ooo..ooo.", {0: (-3, 0), 5: (4, -6)}),
-    ),
-    "pure": (nine_circles("front", "ooooo.oo.", {}), nine_circles("right", "o..oo.o.o", {})),
-    "partly alike": (nine_circles("front", "o.o...ooo", {}), nine_circles("right", "o.o...oo.", {4: (0, 6)})),
-}
-"""Pairs of faces that only radii or small shifts distinguish from mirror images of each other."""
-TARGET_FROM_RIGHT = Rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([100.0, 0, -30]))
-
-
-@pytest.mark.parametrize("kind", GRIDS)
-@pytest.mark.parametrize("turn", [-1.1, -0.8, -0.4])
-def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, turn):
-    """Both at right angles: seen from either side of the plane half way."""
-    target = TargetDesign("two", "dark", GRIDS[kind])
-    assert "right" not in mirror_images(target).get("front", ())
-    images = []
-    for i in range(4):
-        pose = Rigid.exp([3.1, 0.02 * i, 0, 0, 0, 0]) @ Rigid.exp([0, turn + 0.05 * i, 0, 0, 0, 0])
-        pose = Rigid(pose.rotation, np.array([0.0, 20 * i, 900]))
-        seen = Seen()
-        for face, own in zip(target.faces, (pose, pose @ TARGET_FROM_RIGHT), strict=True):
-            seen.face(face.id, plane_centres(own, face.xy_mm), range(9))
-        images.append((str(i), "a", seen.detection()))
-    ((labelled, _),) = label_groups([images], target, None, FOCAL_PX)
-    assert all(set(each.observations.face_ids()) == {"front", "right"} for each in labelled)
-    assert all(each.notes == () for each in labelled)

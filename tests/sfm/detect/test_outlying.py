@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from stcal.geometry.plane import apply_homography, fit_homography
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.labelling import Arrangement, label_groups
-from stcal.sfm.detect.predict import MIN_LIMIT_PX, outlying_circles
+from stcal.sfm.detect.predict import MIN_LIMIT_PX, adjusted_planes, outlying_circles
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen
 
 
@@ -113,3 +113,25 @@ def test_few_circles_of_a_face_are_held_to_where_others_have_it(group):
     group.assert_out(set())
     group.move_px(3, "2:2", [2.0, 0.0])
     group.assert_out({(3, "2:2")})
+
+
+def test_an_image_without_points_keeps_its_pose():
+    grid = np.array([[x, y, 0.0] for x in range(-40, 60, 20) for y in range(-40, 60, 20)])
+    poses = [Rigid.exp([0.1 * i, 0.3 - 0.2 * i, 0.05, 5 * i, -8, 500]) for i in range(3)]
+    planes = [Rigid(), Rigid.exp([0, 0.8, 0, 120, 0, -30])]
+    image, plane, xyz, seen = [], [], [], []
+    for i in (0, 2):  # nothing is left of image 1
+        for k, world_from_plane in enumerate(planes):
+            at = poses[i] @ (world_from_plane @ grid)
+            image += [i] * len(grid)
+            plane += [k] * len(grid)
+            xyz.append(grid)
+            seen.append(1000.0 * at[:, :2] / at[:, 2:])
+    off = Rigid.exp([2e-3, -1e-3, 1e-3, 0.5, 0.3, 1.0])
+    start = Poses.of(pose @ off for pose in poses)
+    points = np.array(image), np.array(plane), np.concatenate(xyz), np.concatenate(seen), 1000.0
+    found, world_from_plane = adjusted_planes(start, Poses.of([planes[0], planes[1] @ off]), *points)
+    for i in (0, 2):
+        np.testing.assert_allclose(found[i].matrix(), poses[i].matrix(), atol=1e-6)
+    np.testing.assert_array_equal(found[1].matrix(), (poses[1] @ off).matrix())
+    np.testing.assert_allclose(world_from_plane[1].matrix(), planes[1].matrix(), atol=1e-6)

@@ -122,15 +122,13 @@ def test_every_image_registers_and_the_shape_is_right(scene, observed, database,
         assert np.median(error) < 0.1
 
 
-def test_our_own_pose_is_registered_where_colmap_refuses_the_pair(scene, observed, database, tmp_path, monkeypatch):
+def test_our_own_pose_is_registered_where_colmap_refuses_the_pair_or_no_model_is_named(
+    scene, observed, database, tmp_path, monkeypatch
+):
     monkeypatch.setattr("stcal.sfm.mapping.incremental.seeded_mapping", lambda *_: None)
     own, mapping = map_one(scene, observed, database, tmp_path, "12")
     assert set(mapping.model.images) == {o.name for o in own}
     assert "our relative pose" in mapping.seeded
-
-
-def test_no_model_names_group_and_pair(scene, observed, database, tmp_path, monkeypatch):
-    monkeypatch.setattr("stcal.sfm.mapping.incremental.seeded_mapping", lambda *_: None)
     monkeypatch.setattr("stcal.sfm.mapping.incremental._own_mapping", lambda *_: None)
     with fails_with("E-MAPPING-NO-MODEL … 12"):
         map_one(scene, observed, database, tmp_path, "12")
