@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import MESSAGE_CHARACTERS
-from stcal.io import cache as io_cache
 from stcal.io.files import require_written
 from tests.commands import CALLS, COMMANDS
-from tests.fuzzing import kept
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import OUT, Outcome, failures, hashes, lay_out
 from tests.fuzzing.mistakes import MISTAKES, call_of
@@ -78,29 +76,6 @@ def test_whatever_comes_in_is_judged(stock, case, part):
 def test_kept_files_and_closed_streams(stock, case, kind, number):
     found = perform(stock, case, SEED, f"{kind}{number}")
     assert (found.said, found.failures) == (found.said, ())
-
-
-class _Equal(bytes):
-    def __eq__(self, _):
-        return True
-
-    __hash__ = bytes.__hash__
-
-
-ALL_ARE_EQUAL = _Equal()
-
-
-@pytest.mark.slow
-def test_a_cache_that_is_believed_is_seen(stock, case, monkeypatch):
-    """A run that takes an edited file for what it kept has another answer."""
-    monkeypatch.setattr(kept, "SPOILED", (kept._edited,))
-    monkeypatch.setattr(
-        kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
-    )
-    monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob(".stcal/cache/[0-9a-f]*.npz")))
-    assert kept.of_kept(stock, case, KNOWN_SEED, 1).failures == ()
-    monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
-    assert [kind for kind, _ in kept.of_kept(stock, case, KNOWN_SEED, 1).failures] == ["silent wrong"]
 
 
 OF_ROBOTS = ("identify", "axes", "compensate", "verify", "locate", "register")

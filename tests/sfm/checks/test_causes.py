@@ -159,13 +159,6 @@ def test_of_two_halves_of_a_group_none_is_named(few, lab):
     assert f"group {images[0].group}: leaving out less than half of them" in checks["moved"].reason
 
 
-def test_zoom_in_two_images_of_a_group_accuses_no_image(few, lab):
-    images, _ = zoomed(lambda i, k: 0.004 * (k in (1, 2)))(few, lab.observe(few))
-    checks = lab.check(few, images)
-    assert checks["moved"].verdict == "failed"
-    assert checks["moved"].names == ()
-
-
 def test_a_camera_turned_by_a_quarter_has_its_parameters_turned():
     distortion = np.array([-0.1, 0.02, 1e-3, -2e-3, 0, 0, 0, 0, 3e-3, 1e-3, -2e-3, 4e-3])
     camera = Camera(1000, 1000, np.array([800.0, 790.0]), np.array([520.0, 480.0]), distortion)
@@ -180,8 +173,7 @@ def test_a_camera_turned_by_a_quarter_has_its_parameters_turned():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("zoom", [0.001, 0.003, 0.01])
-@pytest.mark.parametrize("place", [2, 5])
+@pytest.mark.parametrize(("place", "zoom"), [(2, 0.001), (5, 0.01)])
 def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place, zoom):
     images, _ = zoomed(lambda _, k: zoom * (k == place))(few, lab.observe(few))
     assert first(few, lab, images).key != CAUSE

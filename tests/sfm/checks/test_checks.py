@@ -94,9 +94,7 @@ def not_passed(checks):
     return {key: check.verdict for key, check in checks.items() if check.verdict not in ("passed", "not possible")}
 
 
-@pytest.mark.parametrize(
-    ("noise_px", "seed"), [(0.005, 1), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.015, 2), (0.05, 3)))]
-)
+@pytest.mark.parametrize(("noise_px", "seed"), [(0.005, 1), pytest.param(0.05, 3, marks=pytest.mark.slow)])
 def test_honest_runs_pass(full_scene, lab, noise_px, seed):
     checks = lab.check(full_scene, lab.observe(full_scene, noise_px, seed))
     assert not_passed(checks) == {}
@@ -187,14 +185,7 @@ def test_a_blurred_image_is_named(full_scene, lab, stated, caught):
         assert checks[key].names == (image.name,)
 
 
-@pytest.mark.parametrize(
-    ("over", "verdict"),
-    [
-        pytest.param(1, "passed", marks=pytest.mark.slow),
-        (3, "suspicious"),
-        pytest.param(6, "failed", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("over", "verdict"), [(3, "suspicious"), pytest.param(6, "failed", marks=pytest.mark.slow)])
 def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdict):
     """σ stated too small for all centres alike: no image stands out, and the result's σ are scaled."""
     images = [replace(i, covariance_px2=i.covariance_px2 / over**2) for i in lab.observe(full_scene, over * NOISE_PX)]

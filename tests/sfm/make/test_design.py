@@ -20,14 +20,13 @@ from stcal.sfm.make import (
     NAMES,
     DesignOptions,
     faces_of,
-    make_pattern,
     make_target,
     sides_of,
     size_of,
     unnamed_cases,
 )
 from stcal.sfm.planning.session import PlanOptions, plan
-from stcal.synthetic.designs import face_of_drawing, second_design
+from stcal.synthetic.designs import second_design
 from tests.outcome import fails_with
 
 SIZE = (130.0, 110.0, 100.0)
@@ -83,20 +82,6 @@ def test_likeness_is_found_where_there_is_some(made):
     assert len(failed) == cases == 168
 
 
-@pytest.mark.slow
-def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
-    """Ten circles of two sizes in rows that a half turn takes to themselves, but for one."""
-    x, y = np.meshgrid(np.arange(5) * 20.0, [0.0, 20.0])
-    rows = [(str(i), *xy, 4.0) for i, xy in enumerate(zip(x.ravel(), y.ravel(), strict=True), 1)]
-    rows[7] = ("8", 45.0, 27.0, 6.0)
-    face, _ = face_of_drawing("only", rows, "1", "5", "6")
-    target = TargetDesign("rows", "dark", (face,))
-    failed, cases = unnamed_cases(target, DesignOptions(SIZE, width=2592).ideal_camera(), 800.0, HIDDEN, None)
-    odd = [gone for _, gone in failed if {"3", "8"} <= set(gone)]  # the one off its place, and where it would go
-    assert len(odd) == 8
-    assert len(failed) < 0.2 * cases
-
-
 @pytest.mark.full
 def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
@@ -144,13 +129,6 @@ def test_the_file_has_all_of_it(made, tmp_path):
         assert face.rough_target_from_face is not None
         assert own.rough_target_from_face is not None
         np.testing.assert_allclose(face.rough_target_from_face.matrix(), own.rough_target_from_face.matrix(), atol=1e-9)
-
-
-def test_another_seed_makes_another_pattern():
-    sides = sides_of(SIZE)[:1]
-    patterns = [make_pattern(sides, 10, 4.0, "dark", seed, "box").target.faces[0].xy_mm for seed in (1, 1, 2)]
-    np.testing.assert_array_equal(patterns[0], patterns[1])
-    assert not np.allclose(patterns[0], patterns[2])
 
 
 @pytest.mark.parametrize(
@@ -213,7 +191,7 @@ def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
         load_target(tmp_path / "target.toml")
 
 
-@pytest.mark.parametrize("angle_deg", range(0, 180, 20))
+@pytest.mark.parametrize("angle_deg", [0, 50, 100])
 def test_outlines_at_any_angle_are_taken(tmp_path, angle_deg):
     design = second_design()[0]
     middle, reach = design.faces[0].xy_mm.mean(0), np.ptp(design.faces[0].xy_mm, axis=0).max()
@@ -225,8 +203,8 @@ def test_outlines_at_any_angle_are_taken(tmp_path, angle_deg):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("distance_mm", [400.0, 600.0, 1000.0])
-def test_box_and_board_fit_the_image_side_by_side(distance_mm):
+def test_box_and_board_fit_the_image_side_by_side():
+    distance_mm = 400.0
     made = make_target(DesignOptions((130.0, 110.0, 90.0), distance_mm=distance_mm, faces=("front", "right", "top")))
     assert made.board.radius_mm >= made.least_mm
     target = made.pattern.target

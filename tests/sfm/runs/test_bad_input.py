@@ -5,10 +5,6 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -88,16 +84,6 @@ def test_no_image_is_left(small_set, stcal_sfm):
     assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
 
 
-def test_all_images_of_another_size(small_set, stcal_sfm):
-    small = small_set("12", "14")
-    for group in ("12", "14"):
-        for i in range(4):
-            small.image(i, group).write_bytes(encoded(".jpg", pixels(small.image(i, group))[::2, ::2]))
-    parts = ("12/IMG_1000.jpg", "648×432 px", "1296×864 px", "use images as the camera took them")
-    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
-    assert results_in(small.out) == []
-
-
 @pytest.mark.usefixtures("no_page")
 def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm):
     small = small_set("12")
@@ -165,15 +151,6 @@ def assert_left_out(small, stcal_sfm, *parts: str) -> None:
     faces = json.loads((small.out / "faces.json").read_text())["target_from_face"].keys()
     assert {"1", "2"} <= faces
     assert "4" not in faces
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
-    small = small_set("12", "14")
-    for i in (1, 2, 3):
-        shutil.copy(small.image(0, "14"), small.image(i, "14"))
-    parts = ("group 14: 1 usable image", "the same image as 14/IMG_1000.jpg", "add photographs from other places")
-    assert_left_out(small, stcal_sfm, *parts)
 
 
 @pytest.mark.usefixtures("no_page")
@@ -301,10 +278,6 @@ def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, 
     assert results_in(small.out) == ["faces.json"]
 
 
-def command(*arguments) -> list[str]:
-    return [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
-
-
 def test_debug_lets_the_error_through(small_set, stcal_sfm):
     small = small_set()
     with fails_with("E-IMAGES-NONE"):
@@ -334,29 +307,6 @@ def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, mon
     assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert results_in(small.out) == list(RESULTS)
     assert len(detected) == 3  # the first one was kept
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_page")
-def test_a_run_that_is_killed_leaves_nothing_that_looks_complete(small_set, stcal_sfm):
-    """With a word, as by Ctrl-C: the test above, and tests/sfm/test_signals.py."""
-    small = small_set("12", detected=False)
-    running = subprocess.Popen(command(*small.arguments(*CHAIN)), start_new_session=True, stderr=subprocess.DEVNULL)
-    cache = small.out / ".stcal/cache"
-    until = time.monotonic() + 60
-    while not (cache.is_dir() and any(cache.glob("*.npz"))) and time.monotonic() < until:
-        time.sleep(0.005)
-    os.killpg(running.pid, signal.SIGKILL)
-    assert running.wait(timeout=60) == -signal.SIGKILL
-    kept = {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}
-    assert 1 <= len(kept) < 4
-    assert {p.name for p in small.out.iterdir()} == {".stcal"}
-
-    assert_success(stcal_sfm(*small.arguments(*CHAIN)))
-    assert json.loads((small.out / "report.json").read_text())["summary"]["images_mapped"] == 4
-    assert results_in(small.out) == list(RESULTS)
-    assert not (small.out / ".stcal/unfinished").exists()
-    assert {name: (cache / name).stat().st_mtime_ns for name in kept} == kept
 
 
 def same_centres(found, expected, tolerance_px: float) -> None:

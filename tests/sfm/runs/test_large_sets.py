@@ -69,29 +69,23 @@ def partition(parts: list[int]) -> set[frozenset[int]]:
     return {frozenset(np.flatnonzero(np.array(parts) == p).tolist()) for p in set(parts)}
 
 
-def test_sparse_pairs_hold_every_track_together_as_all_pairs_do(crowd):
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9))
+@settings(max_examples=3, deadline=None)
+def test_sparse_pairs_hold_every_track_together_as_all_pairs_do(crowd, seed, share):
+    """Also of images that show a random share of their circles, some of them nearly nothing."""
     scene, observations = crowd
-    seen = incidence(observations)
+    rng = np.random.default_rng(seed)
+    spoiled = [o.select(np.flatnonzero(rng.random(len(o)) < share * rng.random())) for o in observations]
+    for images in (observations, spoiled):
+        seen = incidence(images)
+        every, sparse = (image_graph(images, scene.board, kind) for kind in ("all", "sparse"))
+        for a, b in zip(parts_of_tracks(every.pairs, seen), parts_of_tracks(sparse.pairs, seen), strict=True):
+            assert partition(a) == partition(b)
     every, sparse = (image_graph(observations, scene.board, kind) for kind in ("all", "sparse"))
-    for a, b in zip(parts_of_tracks(every.pairs, seen), parts_of_tracks(sparse.pairs, seen), strict=True):
-        assert partition(a) == partition(b)
     assert set(map(tuple, sparse.pairs.tolist())) <= set(map(tuple, every.pairs.tolist()))
     assert len(every.pairs) > 4000
     # Two skeletons with all their pairs, three or more links for every other image, a few between the groups.
     assert 2 * SKELETON * (SKELETON - 1) / 2 + 60 * NEIGHBOURS <= len(sparse.pairs) < 900
-
-
-@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9))
-@settings(max_examples=3, deadline=None)
-def test_tracks_hold_together_whatever_is_missing(crowd, seed, share):
-    """Images that show a random share of their circles, some of them nearly nothing."""
-    scene, observations = crowd
-    rng = np.random.default_rng(seed)
-    spoiled = [o.select(np.flatnonzero(rng.random(len(o)) < share * rng.random())) for o in observations]
-    seen = incidence(spoiled)
-    every, sparse = (image_graph(spoiled, scene.board, kind) for kind in ("all", "sparse"))
-    for a, b in zip(parts_of_tracks(every.pairs, seen), parts_of_tracks(sparse.pairs, seen), strict=True):
-        assert partition(a) == partition(b)
 
 
 def test_pairs_have_enough_labels_in_common_and_dots_of_their_group_only(crowd):
