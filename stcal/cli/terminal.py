@@ -38,16 +38,16 @@ _beating: ContextVar["_Beat | None"] = ContextVar("_beating", default=None)
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
     """Sets the verbosity within the context: warnings and errors only, or more than usual."""
     beat = _Beat()
-    given = ((_quiet, quiet), (_verbose, verbose), (_beating, beat))
-    tokens = [(choice, choice.set(value)) for choice, value in given]
+    tokens = _quiet.set(quiet), _verbose.set(verbose), _beating.set(beat)
     if not quiet:
         beat.start()
     try:
         yield
     finally:
         beat.over.set()
-        for choice, token in tokens:
-            choice.reset(token)
+        _quiet.reset(tokens[0])
+        _verbose.reset(tokens[1])
+        _beating.reset(tokens[2])
 
 
 def verbose() -> bool:
