@@ -12,7 +12,6 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.conventions import repair
 from stcal.handeye.data.pose_pairs import Loop
-from stcal.handeye.handeye_pipeline import handeye
 from stcal.handeye.remarks import Observability
 from stcal.io.rotations import INVERTED
 from stcal.workflows.handeye_inputs import HandEyeInput
@@ -25,6 +24,7 @@ from tests.support.handeye import (
     FLANGE_FROM_BOARD,
     FLANGE_FROM_CAMERA,
     disturbed,
+    handeye,
     simulated,
 )
 

@@ -96,7 +96,7 @@ def test_scenes_are_found_by_another_column(files):
     hand_eye, poses, _ = files
     poses.write_text(poses.read_text().replace("scene", "image"))
     assert list(read_chain(hand_eye, poses, key="image").flange) == ["a"]
-    with pytest.raises(InputError, match="column scene is missing"):
+    with pytest.raises(InputError, match="no column scene"):
         read_chain(hand_eye, poses)
 
 

@@ -309,7 +309,7 @@ def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
 @pytest.mark.parametrize(
     ("name", "content", "part"),
     [
-        (CAMERA, "1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
+        (CAMERA, "1 PINHOLE 9 9 1 1 1", "3 parameters of PINHOLE, 4 needed"),
         (TARGET, "polarity = 3", "polarity"),
         (BOARD, "rows", "not valid TOML"),
     ],
