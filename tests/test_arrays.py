@@ -72,6 +72,8 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
             lambda: Camera(*SIZE, [900, 900], [640, 360], [0, 0, 1e-3, 0, 0, 0, 0, 0], True).to_opencv(),
             "E-CAMERA-MODEL … fish",
         ),
+        (lambda: Rigid.exp([1, 2]), "E-ARRAY-SHAPE … (2,)"),
+        (lambda: Poses.from_quaternions([[1, 0, 0]], [[0, 0, 0]]), "E-ARRAY-SHAPE … quaternions"),
         (lambda: Poses.from_matrices([np.eye(4), -np.eye(4)]), "E-MATRIX-LAST-ROW … pose 2"),
         (lambda: robot.Robot.from_dh(np.zeros((6, 3)), "standard"), "E-ARRAY-SHAPE … (6, 3) … a, alpha, d, theta"),
         (lambda: robot.Robot.from_dh(np.full((2, 4), 300), "standard", np.zeros((3, 2))), "E-ARRAY-SHAPE … (3, 2)"),

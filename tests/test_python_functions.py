@@ -188,7 +188,7 @@ def test_a_hand_eye_result_leads_to_the_base():
     mount, board = stcal.Rigid.exp([0.1, 0.2, 0.3, 60, 20, 50]), stcal.Rigid.exp([0.3, 0, 0, 900, 0, 0])
     flange = stcal.Poses.of([stcal.Rigid.exp([*rng.normal(0, 0.5, 3), *rng.normal(300, 80, 3)]) for _ in range(12)])
     seen = (flange @ mount).inverse() @ board
-    found = handeye.handeye(flange, seen, setup="eye-in-hand", method="park-martin")
+    found = handeye.handeye(base_from_flange=flange, camera_from_board=seen, method="park-martin")
     chain = locate.goal_chain(found, robot_poses={"one": flange[0]})
     assert chain.moving
     np.testing.assert_allclose(chain.mount.rigid.matrix(), mount.matrix(), atol=1e-6)

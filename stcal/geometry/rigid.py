@@ -149,7 +149,7 @@ class Rigid(ByValue, _Frames):
     def exp(cls, twist: ArrayLike) -> "Rigid":
         """Return the transform of a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential, but
         the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
-        motion = np.asarray(twist, float)
+        motion = np.array(frozen(twist, (6,), "rotation vector and translation"))
         return cls(Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:])
 
     def log(self) -> np.ndarray:
@@ -276,7 +276,7 @@ class Poses(Brief, _Frames):
     @classmethod
     def from_quaternions(cls, wxyz: ArrayLike, translation: ArrayLike) -> "Poses":
         """Return the transforms of quaternions (m, 4), w first, unit to 1e-3, and translations (m, 3), mm."""
-        wxyz = np.asarray(wxyz, float)
+        wxyz = frozen(wxyz, (None, 4), "quaternions")
         off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
         if len(off) and off.max() > UNIT_WITHIN:
             raise InputError(

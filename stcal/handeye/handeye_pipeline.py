@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 from scipy.stats import f
@@ -350,15 +350,15 @@ def validated(
 @require_arguments
 @one_thread()
 def handeye(
+    pairs: HandEyePoses | None = None,
+    *unnamed: Never,
     base_from_flange: Any = None,
     camera_from_board: Any = None,
+    unit: LengthUnit = "mm",
+    setup: Setup | None = None,
     method: str | None = None,
     views: Views | None = None,
     options: HandEyeOptions | None = None,
-    *,
-    setup: Setup | None = None,
-    unit: LengthUnit = "mm",
-    pairs: HandEyePoses | None = None,
 ) -> HandEye:
     """Returns where the camera is on the flange, or in the robot's base frame: the answer of ``stcal handeye``.
 
@@ -367,20 +367,19 @@ def handeye(
 
     Parameters
     ----------
-    base_from_flange : (m, 4, 4), at least three poses, rotated about two axes that are not parallel
-    camera_from_board : (m, 4, 4), the pose of the board in the camera in each of them. After ``pairs``, the setup may
-        stand here.
+    pairs, unnamed : pairs of poses, see :func:`~stcal.handeye.read_poses`, :func:`~stcal.handeye.pairs_of_views`;
+        everything else by name
+    base_from_flange, camera_from_board : (m, 4, 4) each, in place of ``pairs``: at least three poses, rotated about two
+        axes that are not parallel, and the pose of the board in the camera in each of them
+    unit : {"mm", "m", "cm", "um", "in"}, unit of their translations
+    setup : {"eye-in-hand", "eye-to-hand"}, ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``:
+        the board on the flange
     method : one of :data:`METHODS`. If None, the way that predicts poses held out best, among all methods, with the
         board's size as stated or solved for; ``reprojection`` with views, else ``pose``, where ``options`` name
         unknowns.
     views : the corners from which the poses were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
         camera's errors into σ.
     options : known errors of robot and camera, and further unknowns; the defaults if None
-    setup : {"eye-in-hand", "eye-to-hand"}, ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``:
-        the board on the flange
-    unit : {"mm", "m", "cm", "um", "in"}, unit of translations
-    pairs : pairs of poses in place of the first two, also as the first argument; see :func:`~stcal.handeye.read_poses`,
-        :func:`~stcal.handeye.pairs_of_views`
 
     Returns
     -------
@@ -397,17 +396,17 @@ def handeye(
     >>> found = handeye(pairs, setup="eye-in-hand")  # doctest: +SKIP
     >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
-    if isinstance(base_from_flange, HandEyePoses):
-        pairs, base_from_flange = base_from_flange, None
-    asked = setup or "eye-in-hand"
+    if unnamed:
+        given = "handeye(base_from_flange=…, camera_from_board=…, setup=…)"
+        raise InputError("E-ARGUMENT-UNNAMED", f"hand-eye: arguments without names are easily exchanged; give {given}")
+    asked, sides = setup or "eye-in-hand", (base_from_flange, camera_from_board)
     if pairs is not None:
-        asked = setup or camera_from_board or "eye-in-hand"
-        if unit != "mm":
-            raise InputError("E-OPTION-CONFLICT", f"hand-eye: unit {unit!r} of pairs of poses, which are in mm already")
-    elif base_from_flange is None or camera_from_board is None or isinstance(camera_from_board, str):
-        raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
+        if unit != "mm" or any(side is not None for side in sides):
+            raise InputError("E-OPTION-CONFLICT", "hand-eye: pairs of poses are in mm; give no matrices, no unit")
+    elif any(side is None for side in sides):
+        raise InputError("E-POSES-COUNT", "hand-eye: give base_from_flange and camera_from_board of each pose")
     else:
-        pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)
+        pairs = HandEyePoses.from_matrices(*sides, unit=unit)
     problem = HandEyeProblem(pairs, asked, views, options or HandEyeOptions())
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
     prior = None if views is None else problem.options.camera

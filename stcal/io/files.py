@@ -30,7 +30,7 @@ MODEL_BYTES = 1000 * MB  # largest size of a file of a COLMAP model
 def read_bytes(path: str | Path, most: int) -> bytes:
     """Return the whole content of a file; raise OSError if it cannot be read, or is larger than ``most`` bytes."""
     chunks, remaining = [], most + 1
-    with open(path, "rb") as stream:
+    with open(Path(path), "rb") as stream:  # a number is no path: it would be closed as one of the process's streams
         step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` allocates as much memory as it is asked for
         while chunk := stream.read(min(step, remaining)):
             chunks.append(chunk)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import TYPE_CHECKING, Generic
 
 import numpy as np
 
@@ -13,6 +14,15 @@ from stcal.geometry.arrays import OF_POINT, Array, Brief, ByValue, freeze, requi
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
 from stcal.register.consensus import Problem, Transform, parts
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    T = TypeVar("T", bound=Transform, default=Transform)
+else:
+    from typing import TypeVar
+
+    T = TypeVar("T")
 
 WHAT = "point pairs"
 COVARIANCE = tuple(f"cov_{a}_{b}" for a, b in combinations_with_replacement(OF_POINT.names, 2))
@@ -178,7 +188,7 @@ class Alternative(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Registration(Brief):
+class Registration(Brief, Generic[T]):
     """The transform between two instruments' frames.
 
     Parameters
@@ -207,7 +217,7 @@ class Registration(Brief):
 
     model: str
     method: str
-    b_from_a: Transform
+    b_from_a: T
     covariance: Array
     inliers: Array
     residuals: Array

@@ -141,7 +141,8 @@ def test_a_board_at_the_base_needs_its_setup_stated():
 def test_sides_that_are_exchanged_are_doubted(given, told, setup):
     """No residual tells; the camera is then as far off the flange as the board is off the base."""
     pairs = simulated_stream(np.random.default_rng(5), 15, "eye-in-hand", 0.0).pairs
-    result = stcal.handeye.handeye(*given(pairs.base_from_flange, pairs.camera_from_board), setup=setup)
+    flange, board = given(pairs.base_from_flange, pairs.camera_from_board)
+    result = stcal.handeye.handeye(base_from_flange=flange, camera_from_board=board, setup=setup)
     assert any(told in note for note in result.notes) if told else not result.notes
 
 

@@ -58,25 +58,26 @@ def test_the_answer_is_that_of_the_command(command, truth, pairs, method, tmp_pa
 
 @pytest.mark.slow
 def test_matrices_in_metres_are_pairs_of_poses(pairs):
-    found = handeye.handeye(
-        metres(pairs.base_from_flange), metres(pairs.camera_from_board), setup="eye-in-hand", unit="m", method="pose"
-    )
-    same = handeye.handeye(pairs, "eye-in-hand", "pose")
+    sides = {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}
+    found = handeye.handeye(**{name: metres(poses) for name, poses in sides.items()}, unit="m", method="pose")
+    same = handeye.handeye(pairs, setup="eye-in-hand", method="pose")
     assert handeye.handeye(pairs=pairs, method="pose").mount_from_camera == same.mount_from_camera
     np.testing.assert_allclose(found.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
     off = found.mount_from_camera.translation - FLANGE_FROM_CAMERA.translation
     assert np.linalg.norm(off) < 1.0  # noise of 0.2 mm an axis
-    mixed = handeye.handeye(
-        pairs.base_from_flange, pairs.camera_from_board.matrix(), setup="eye-in-hand", method="pose"
-    )
+    mixed = handeye.handeye(**sides | {"camera_from_board": pairs.camera_from_board.matrix()}, method="pose")
     np.testing.assert_allclose(mixed.covariance, same.covariance)
 
 
 def test_what_is_no_pairs_of_poses_is_refused(pairs):
-    refuses("E-POSES-COUNT … camera_from_board", handeye.handeye, pairs.base_from_flange, setup="eye-in-hand")
-    refuses("E-OPTION-CONFLICT … unit 'm'", handeye.handeye, pairs, unit="m")
+    flange, board = pairs.base_from_flange, pairs.camera_from_board
+    refuses("E-POSES-COUNT … camera_from_board", handeye.handeye, base_from_flange=flange, setup="eye-in-hand")
+    refuses("E-OPTION-CONFLICT … no unit", handeye.handeye, pairs, unit="m")
+    refuses("E-OPTION-CONFLICT … no matrices", handeye.handeye, pairs, camera_from_board=board)
+    refuses("E-FIELD-TYPE … HandEyePoses", handeye.handeye, flange.matrix(), board.matrix())
+    refuses("E-ARGUMENT-UNNAMED … setup=", handeye.handeye, pairs, "eye-in-hand")
     with fails_with("E-OPTION-VALUE … unit 'feet'"):
-        handeye.handeye(pairs.base_from_flange, pairs.camera_from_board, setup="eye-in-hand", unit="feet")
+        handeye.handeye(base_from_flange=flange, camera_from_board=board, unit="feet")
 
 
 @pytest.fixture

@@ -314,3 +314,9 @@ def test_mrcals_region_is_read(tmp_path):
     (tmp_path / "c.cameramodel").write_text(text.replace(str(REGION.tolist()), "[1, 2, 3]"))
     with fails_with("E-CAMERA-CONTENT … valid_intrinsics_region"):
         read_lens(tmp_path / "c.cameramodel")
+
+
+def test_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(recwarn):
+    lens = ForeignLens("too strong", lambda rays: 1e308 * rays[:, :2] * 10, 10, 10)
+    assert not np.isfinite(lens.project(np.ones((2, 3)))).any()
+    assert not recwarn.list

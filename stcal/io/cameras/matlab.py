@@ -15,8 +15,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, savemat
-from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
@@ -63,6 +61,9 @@ HEAD_BYTES = 116  # length of the text at the beginning of a file; scipy writes 
 
 def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
     """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras."""
+    from scipy.io import loadmat  # slow to load, and needed for these files alone
+    from scipy.io.matlab import MatReadWarning
+
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", "of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
@@ -235,6 +236,9 @@ def mat(camera: Camera, name: str) -> bytes:
         "K": matrix,
         "IntrinsicMatrix": matrix.T,
     }
+    from scipy.io import savemat
+    from scipy.io.matlab import MatWriteWarning
+
     stream = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("error", MatWriteWarning)
