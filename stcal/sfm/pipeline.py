@@ -39,7 +39,7 @@ from stcal.sfm.runs.stages import (
     Groups,
     Task,
     camera_by_dots,
-    detect,
+    detect_and_label,
     detect_with,
     groups_of,
     guessed_cameras,
@@ -125,10 +125,11 @@ def run(
             return replace(run(images, camera, scratch, target, board, options, progress, checks, every), out=None)
     images = frames_of_video(images, out, every)
     with begun(images, camera, out, target, board, options, progress) as task:
-        seen = detect(task)  # and label
+        seen = detect_and_label(task)
         with overlays_beside(seen, task) as left_out:
             task = scaled_by_drawing(task, seen, board is not None)
-            groups, calibration = adjust(task, seen, map_groups(task, groups_of(task, seen)))  # scale, chain, adjust
+            groups = map_groups(task, groups_of(task, seen))
+            groups, calibration = scale_chain_adjust(task, seen, groups)
             result = result_of(task, seen, groups, calibration)
             left_out.update(result.unadjusted())
         result = checked(compared(task, result), checks, task.progress)
@@ -172,17 +173,17 @@ def begun(
         yield Task(files, folder, design, scale, options, progress or (lambda *_: None), model, place.absolute())
 
 
-def adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Calibration]:
+def scale_chain_adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Calibration]:
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
-    calibration = adjusted(task, groups)
+    calibration = calibration_by(task, groups)
     doubted = {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}
     if doubted:
         with suppress(StcalError):
             again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
             refined = replace(groups, solutions=tuple(by_name.get(s.model.group, s) for s in groups.solutions))
-            calibration, groups = adjusted(task, refined), refined
+            calibration, groups = calibration_by(task, refined), refined
     lens = calibration.camera
     corners = np.array([[x, y] for x in (0, lens.width) for y in (0, lens.height)], float)
     try:
@@ -192,11 +193,11 @@ def adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Ca
         warnings.warn(PLAIN, InputNote, stacklevel=2)
         plain = model_of(plain_lens(lens), PHOTOGRAPHS)
         groups = replace(groups, camera=start_of(plain, seen, task.options))
-        return adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+        return scale_chain_adjust(replace(task, camera=plain), seen, map_groups(task, groups))
     return groups, calibration
 
 
-def adjusted(task: Task, groups: Groups) -> Calibration:
+def calibration_by(task: Task, groups: Groups) -> Calibration:
     """Returns the calibration by the solutions of the groups; of the board alone, its scale."""
     models = [solution.model for solution in groups.solutions]
     camera, board, options = groups.camera, groups.board, groups.options.adjustment(task.target)
@@ -252,7 +253,7 @@ def compared(task: Task, result: RunResult) -> RunResult:
     answer: Answer | StcalError
     try:
         groups = map_groups(task, groups_of(task, detect_with(task, model)))
-        calibration = adjusted(task, groups)
+        calibration = calibration_by(task, groups)
         models = tuple(solution.model for solution in groups.solutions)
         answer = Answer(calibration.target, models, calibration.scales)
     except StcalError as error:

@@ -38,12 +38,10 @@ from stcal.sfm.adjust.equations import (
     planes,
     shapes,
 )
-from stcal.sfm.adjust.refine import MIN_DOTS
+from stcal.sfm.adjust.refine import EXACTLY, MIN_DOTS
 from stcal.sfm.data.group_model import MetricModel
 
 Values = dict[str, Any]  # unknowns by block
-EXACTLY = 1e-15
-"""Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 NEAR = 1e-8  # the same where a result is the start of another one: a hundredth of σ
 NEARLY = 1e-6
 """The same where parts of the images are compared, or the σ of faces of known shape are estimated: a tenth of σ."""

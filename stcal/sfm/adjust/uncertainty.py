@@ -292,7 +292,7 @@ def centre_sigma_px(state: Adjusted, kind: str) -> float:
     return float(np.sqrt(square.mean())) if len(square) else 0.0
 
 
-def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Adjusted:
+def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Adjusted:
     """Returns an adjustment that knows by how much its photographs differ more than their pixels explain, pooled over
     all faces and groups; arguments as of :func:`calibrated_target`.
 

@@ -156,7 +156,7 @@ def held_out(
     for fold in range(folds):
         without = of_some_views(result, [view for i, view in enumerate(views) if i % folds != fold], board)
         factors.append(without.factors.centres)
-        residuals_of_view |= {view.name: foretold(view, board, without) for view in views[fold::folds]}
+        residuals_of_view |= {view.name: prediction_errors(view, board, without) for view in views[fold::folds]}
     residuals_px, in_sigma = zip(*(residuals_of_view[view.name] for view in views), strict=True)
     return HeldOut(residuals_px, in_sigma, float(np.median(factors)), folds)
 
@@ -216,7 +216,7 @@ def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
         return error
 
 
-def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def prediction_errors(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
     camera, factor = result.camera, result.factors.centres
     ((group, members),) = by_group([view]).items()
@@ -260,7 +260,7 @@ def without_gross_errors(
     for view in views:
         own = view
         while view.name in suspects and len(own) > LEAST_CORNERS:  # one by one: each disturbs the pose, and the others
-            length_px, in_sigmas = (np.linalg.norm(each, axis=1) for each in foretold(own, grid, result))
+            length_px, in_sigmas = (np.linalg.norm(each, axis=1) for each in prediction_errors(own, grid, result))
             in_sigmas /= result.factors.centres
             worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
             if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:

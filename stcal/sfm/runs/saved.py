@@ -41,7 +41,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
 from stcal.sfm.adjust.faces_file import FacesFile, TargetCircles
 from stcal.sfm.adjust.joint import Adjusted, adjusted
 from stcal.sfm.adjust.refine import ScaleSource, projection_jacobians, with_edge_sigma
-from stcal.sfm.adjust.uncertainty import with_differences
+from stcal.sfm.adjust.uncertainty import with_scatter
 from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, by_group
 from stcal.sfm.detect.candidates import EllipseOptions
@@ -587,7 +587,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     start = CalibratedTarget(run.faces.reference_face, run.faces.poses(), by_circle(run.faces.circles), placed)
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
-    state = with_differences(state, start, run.target_design, run.faces.frame)
+    state = with_scatter(state, start, run.target_design, run.faces.frame)
     return AdjustedRun(replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start, prior)
 
 

@@ -121,7 +121,7 @@ class DetectedImages(Brief):
         }
 
 
-def detect(task: Task) -> DetectedImages:
+def detect_and_label(task: Task) -> DetectedImages:
     """Detects and labels with the camera given, or with the one that printed faces, or the board's dots, determine."""
     camera, printed = task.camera, task.target.with_faces(printed=True)
     if camera is None and printed.faces:
