@@ -64,6 +64,7 @@ say()
 """
 NOTHING_LEFT = """
 import asyncio, ctypes, multiprocessing, os, signal, sys, warnings
+import stcal.sfm.data.group_model  # loads libraries with filters of warnings of their own
 
 system = ctypes.CDLL(None)
 def handler_of(number):

@@ -258,6 +258,8 @@ class RenderOptions:
         the face is. Dots of the board have the rims that its design states.
     slope : float
         Fraction by which the light of each disc of the faces rises from one side to the other, along x of its face.
+    fade : float
+        Fraction of its light that each disc of the faces lacks at its edge; the loss grows with the squared radius.
     """
 
     noise: float = 0.01
@@ -273,10 +275,11 @@ class RenderOptions:
     lens: ThinLens | None = None
     rim_mm: float = 0.0
     slope: float = 0.0
+    fade: float = 0.0
 
     def __post_init__(self):
         require_fields(self, "rendering", seed=0)
-        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure", "slope"):
+        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure", "slope", "fade"):
             if (value := getattr(self, name)) < 0:
                 raise InputError("E-SIMULATE-OPTIONS", f"rendering: {name} {value:g}, zero or more needed")
         if self.bit_depth not in (8, 16):
@@ -372,8 +375,8 @@ def _add_circles(
         ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
         shares = [_fine_coverage(camera, ideal, plane, normal, radius, steep) for plane in planes]
         own = None
-        if options.slope and slopes[i].any():
-            own = _light_of_disc(ideal, planes[-1], normal, radius, slopes[i], options.slope)
+        if (options.slope or options.fade) and slopes[i].any():
+            own = _light_of_disc(ideal, planes[-1], normal, radius, slopes[i], options)
         if lens is not None and confusion[i] > SHARP_PX:
             share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px, own)
         else:
@@ -415,11 +418,12 @@ def _fine_coverage(
     return share.transpose(0, 2, 1, 3).reshape(height * FINE, width * FINE)
 
 
-def _light_of_disc(ideal: np.ndarray, centre, normal, radius: float, x, slope: float) -> np.ndarray:
+def _light_of_disc(ideal: np.ndarray, centre, normal, radius: float, x, options: RenderOptions) -> np.ndarray:
     """Returns the light of a disc over its mean level on the squares of :func:`_fine_coverage`; ``x`` : unit vector."""
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
     place = (rays * ((normal @ centre) / (rays @ normal))[..., None] - centre) / radius
-    light = 1 + slope / 2 * np.clip(place @ x, -1.5, 1.5)
+    light = 1 + options.slope / 2 * np.clip(place @ x, -1.5, 1.5)
+    light -= options.fade * np.minimum((place**2).sum(-1), 1.5)
     return cv2.resize(light.astype(np.float32), None, fx=FINE, fy=FINE, interpolation=cv2.INTER_LINEAR)
 
 

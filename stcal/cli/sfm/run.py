@@ -296,7 +296,8 @@ def crosscheck(
     say(f"report: {run / 'report.html'}")
     if check.differences:
         raise MappingError(
-            "E-CROSSCHECK-DIFFERS", f"native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
+            "E-CROSSCHECK-DIFFERS",
+            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}",
         )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.camera_model import EQUIDISTANT, CameraModel, camera_from_opencv
+from stcal.io.cameras.camera_model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
 from stcal.io.cameras.foreign_lenses import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
 from stcal.io.cameras.keys import Keys, is_neutral, note, numbers_of, plain, require_known
 from stcal.io.cameras.matlab import MARKS, from_structure
@@ -310,6 +310,15 @@ def _of_camodocal(keys: Keys) -> Lens:
     return _camera(lens, given, kind, size, xi=xi)
 
 
+def _of_industrial(keys: Keys) -> CameraModel:
+    """Return the camera of ROS-Industrial; its lens may have distortion, though the form has none."""
+    own = Keys(dict(keys.left.pop("intrinsics")))  # type: ignore[call-overload]
+    lens = [own.number(name) for name in ("fx", "fy", "cx", "cy")]
+    width, height, _ = keys.size()
+    require_known(keys.left | own.left, undistorted=True)
+    return camera_model(np.array([*lens, *[0.0] * 8]), "OPENCV", width or None, height or None)
+
+
 def _matrix_cameras(values: dict) -> dict[str, dict]:
     """Return the camera of a matrix, or those of a pair, by the ends of their keys, such as ``M1`` and ``D1``."""
     names = [*map(plain, MATRIX)]
@@ -340,6 +349,10 @@ FORMATS: tuple[tuple[Callable[[dict], dict[str, dict]], Callable[[Keys], Lens]],
     (_if(lambda values: not values.keys().isdisjoint(MARKS)), lambda keys: from_structure(keys.left)),
     (_if(lambda values: "model_type" in values), _of_camodocal),
     (_kalibr_cameras, _of_kalibr),
+    (
+        _if(lambda values: isinstance(values.get("intrinsics"), Mapping) and "fx" in values["intrinsics"]),
+        _of_industrial,
+    ),
     (_matrix_cameras, of_matrix),
 )
 """For each format a function that finds its cameras by name, a single one without a name, and the reader of one."""

@@ -194,18 +194,18 @@ def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
     covariance = contributions.covariance_mm2[INTRINSICS]
-    origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
     if not camera_given:
-        origin, words = "estimated", "found from these photographs, without a camera file; adjusted with all else"
-    elif refined:
+        words = "found from these photographs, without a camera file; adjusted with all else"
+        return BudgetSource("intrinsics", "intrinsics", "A", "estimated", words, None, "", covariance)
+    origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
+    if refined:
         known = "the camera file" if origin == "stated" else "a calibration of some age"
         words = f"adjusted; σ before that of {known}"
     else:
         words = "fixed; σ of the camera file" if origin == "stated" else "fixed; no σ in the camera file"
         effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
         covariance = np.zeros_like(covariance) if camera.covariance is None else effect @ camera.covariance @ effect.T
-    evaluation = "A" if origin == "estimated" else "B"
-    return BudgetSource("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
+    return BudgetSource("intrinsics", "intrinsics", "B", origin, words, None, "", covariance)
 
 
 def _of_statement(found: Contributions, statement: Statement) -> Iterator[BudgetSource]:

@@ -14,7 +14,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.files import MODEL_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
-from stcal.io.table import FARTHEST, csv_rows, read_table
+from stcal.io.table import FARTHEST, LENGTHS, csv_rows, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import NONE, cells, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
@@ -29,6 +29,9 @@ right. Eccentricity makes 0.2."""
 MOST_LISTED = 20
 """Largest number of images that the table of poses has a row for."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
+OF_A_UNIT = 0.1
+"""Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
+worst."""
 
 
 class ComparedFaces(Part):
@@ -147,6 +150,7 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         raise InputError(
             "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
         )
+    _require_one_unit(f"run {run}, truth {truth}", answer, known)
     faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None
     if run.is_dir() and known.groups:
@@ -194,18 +198,23 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
     measured, covariance = table.poses(), table.pose_covariances()
     images: dict[str, PoseErrors] = {}
     unknown: list[str] = []
+    distances: list[list[float]] = []
     for i, name in enumerate(table.text("image")):
         same = [name] if name in true else by_file.get(Path(name).name, [])
         if len(same) != 1:
             unknown.append(name)
             continue
-        images[name] = _pose_errors(measured[i], true[same[0]], None if covariance is None else covariance[i])
+        pose = true[same[0]]
+        images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
+        distances.append([float(np.linalg.norm(p.translation)) for p in (pose, measured[i])])
     if not images:
         raise InputError(
             "E-COMPARE-IMAGES",
             f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
             f"photographs{f', with names like {next(iter(true))}' if true else ''}",
         )
+    true_mm, measured_mm = np.median(distances, axis=0).tolist()
+    _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", true_mm, measured_mm, "poses")
     return ComparePosesFile(images=images, not_in_truth=unknown)
 
 
@@ -221,6 +230,31 @@ def _pose_errors(found: Rigid, true: Rigid, covariance: np.ndarray | None) -> Po
         rotation_mdeg=1e3 * float(np.degrees(turn.angle_rad())),
         normalised_error=normalised,
     )
+
+
+def _require_one_unit(where: str, found: ComparedFaces, known: TruthFile) -> None:
+    """Refuses lengths if distances show that those of one side are in another unit than mm."""
+    labels = [label for label in known.circles if label in found.circles]
+    faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
+    sides = (known, found)
+    for kind, points in (
+        ("circles", [np.array([side.circles[label] for label in labels]) for side in sides]),
+        ("faces", [np.array([side.target_from_face[face_id][:3, 3] for face_id in faces]) for side in sides]),
+    ):
+        true, measured = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
+        _require_same_unit(where, kind, true, measured, "run")
+
+
+def _require_same_unit(where: str, kind: str, true: float, measured: float, side: str) -> None:
+    """Refuses lengths whose ratio is the factor of another unit than mm."""
+    for unit, factor in LENGTHS.items():
+        for name, small, large in (("truth", true, measured), (side, measured, true)):
+            if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
+                raise InputError(
+                    "E-COMPARE-UNITS",
+                    f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
+                    f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
+                )
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
