@@ -139,11 +139,14 @@ FILES = {
     "Metashape": (METASHAPE, perspective(D5)),
     "Kalibr": (CHAIN, perspective(D4)),
     "mrcal": (MRCAL, perspective(D5)),
+    "ROS-Industrial": (
+        "data: []\nfinder: {type: A}\nintrinsics:\n  fx: 911.5  # px\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
+        perspective([]),
+    ),
 }
 """A file of each program, and the pixels of RAYS."""
 FX = "fx: 911.5\n{0}fy: 910.25\n{0}cx: 639.0\n{0}cy: 359.0\n"
 REMOVED = {
-    "ROS-Industrial": "intrinsics:\n  fx: 911.5\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
     "ORB-SLAM": f'%YAML:1.0\nCamera.type: "PinHole"\nCamera.{FX.format("Camera.")}Camera.k1: -0.2\n',
     "KITTI": f"S_00: 1280 720\nK_00: {FLAT}\nD_00: {D5}\nK_01: {FLAT}\nP_rect_00: {P}\n",
     "Zhang": "832.5 0 832.53 303.959 206.585\n\n-0.228601 0.190353\n\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n",

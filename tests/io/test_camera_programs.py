@@ -53,7 +53,8 @@ def test_a_program_projects_the_same(tmp_path, name):
     lens = read(tmp_path, text)
     for each in (lens, longer, read(tmp_path, encoded)):
         np.testing.assert_allclose(project(each), wanted, atol=1e-9)
-    assert (lens.width, lens.height) == SIZE
+    assert (lens.width, lens.height) in (SIZE, (None, None))
+    assert lens.width or name == "ROS-Industrial"  # its files have no size
 
 
 def with_key(text: str, key: str, value: str) -> str:
