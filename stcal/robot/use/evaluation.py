@@ -51,6 +51,8 @@ OFF, OFF_MM = 6.0, 0.1
 """Ratio of a pose's typical error to that of most, and its size, from which on the pose is named."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
+NO_BETTER, WORSE = 0.8, 1.2  # times the errors of the first set: about as much, and more
+MOST_OF_IT = 0.75  # share of the squared errors of distances from which on their scale is named
 LEAST_SPREAD_MM = 20.0
 """Largest commanded distance below which the unit is doubted."""
 SCALE_WITHIN = 0.005
@@ -166,6 +168,20 @@ class Verification(Brief):
                 f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
                 "the names of their columns say, correct these"
             )
+        first = self.sets[0]
+        for each in (each for each in self.sets if not each.doubt()):
+            by_scale, ratio = abs(each.scale - 1) * each.pairs_mm, each.pairs_rms_mm / max(first.pairs_rms_mm, 1e-12)
+            against = f"{each.pairs_rms_mm:.3g} against {first.pairs_rms_mm:.3g} mm (RMS of all pairs)"
+            causes = {
+                f"measured distances are {each.scale:.5f} times the commanded ones, which is most of its error: check "
+                "the instrument's scale": by_scale**2 > MOST_OF_IT * each.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2,
+                f"errs more than set {first.name}, the first in the file, {against}: were the sets exchanged? The one "
+                "before compensation comes first": each is not first and ratio > WORSE,
+                f"errs as set {first.name} does, {against}: were these positions commanded with compensated joint "
+                "values, and was --robot of compensate the file of identify?": each is not first
+                and WORSE >= ratio > NO_BETTER,
+            }
+            found += [f"set {each.name}: {words}" for words, applies in causes.items() if applies]
         return found
 
 

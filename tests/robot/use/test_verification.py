@@ -140,8 +140,13 @@ def ten_of_two_sets(first, second) -> Verification:
     return verify(MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)))
 
 
-def test_positions_that_are_copies_are_named():
+def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     assert ten_of_two_sets(1.0, 0.1).warnings() == []
+    assert "set after errs more than set before" in " ".join(ten_of_two_sets(0.1, 1.0).warnings()).replace(": ", " ")
+    assert "errs as set before does" in ten_of_two_sets(1.0, 1.0).warnings()[0]
+    ten = np.random.default_rng(6).uniform(-500, 500, (10, 3))
+    larger = verify(MeasuredPoses("t", range(2, 12), ("a",) * 10, tuple("abcdefghij"), ten, 1.002 * ten))
+    assert "1.00200 times the commanded ones, which is most of its error" in larger.warnings()[0]
     assert "are the commanded ones to the last digit" in ten_of_two_sets(0.0, 0.1).warnings()[0]
     both = ten_of_two_sets(1.0, 0.0)
     assert "set after: measured positions are the commanded ones" in both.warnings()[0]
