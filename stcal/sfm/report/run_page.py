@@ -8,6 +8,7 @@ from functools import partial
 from itertools import chain, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stcal.labels import BOARD, dot_cells, parse_label, parse_labels
 from stcal.report.document import (
@@ -505,6 +506,7 @@ AXIS = 0.2
 CAMERA = 0.07
 """Depth of a camera's pyramid, as a share of the scene's extent."""
 SHEET = "#7f93a8"
+LEAST_UPRIGHT = 0.5  # length of the mean of the photographs' upward directions from which on they agree
 
 
 def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
@@ -524,7 +526,16 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
     for camera in scene["cameras"]:
         path, colour = frustum(camera, report["camera"], depth), colours.get(camera["group"], INK)
         parts.append(_part("line", path, colour, name=camera["image"], size=1.1))
-    return parts
+    return upright(parts, scene["cameras"])
+
+
+def upright(parts: list[dict], cameras: list[dict]) -> list[dict]:
+    """Returns the parts of the scene as they stood for upright photographs, else with the target's Z up."""
+    up = -np.mean([camera["axes"][1] for camera in cameras] or [np.zeros(3)], axis=0)
+    if np.linalg.norm(up) < LEAST_UPRIGHT:
+        return parts
+    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]
+    return [part | {"xyz": np.round(turn.apply(part["xyz"]), DIGITS).tolist()} for part in parts]
 
 
 def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict]:
