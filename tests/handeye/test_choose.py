@@ -108,7 +108,7 @@ def test_answers_that_contradict_widen_sigma():
     assert re.search(r" 5(\.\d)? mm off", note)
     factor = np.sqrt(found.covariance[3, 3] / plain.covariance[3, 3])
     assert f"{factor:.2g} times what their σ allow" in note
-    assert 0.5 * 5 / np.sqrt(12) < np.sqrt(found.covariance[3, 3]) < 1.5 * 5 / np.sqrt(6)
+    assert 0.5 * 5 / np.sqrt(6) < np.sqrt(found.covariance[3, 3]) < 1.5 * 5 / np.sqrt(6)
 
 
 @pytest.mark.slow

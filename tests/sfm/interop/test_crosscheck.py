@@ -18,7 +18,7 @@ from stcal.cli.main import main_sfm
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop.crosscheck import find_colmap, mapper_options
 from stcal.sfm.mapping.incremental import pipeline_options
-from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 from tests.shared import own_copy
 
@@ -295,6 +295,61 @@ def test_a_model_that_lacks_an_image(own_run, stcal_sfm, colmap, tmp_path):
     check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
     assert check["images"]["only_pycolmap"] == ["12/IMG_1002.jpg", "14/IMG_1002.jpg"]
     assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # resected by its labels
+
+
+SPOIL = """
+import json, os, shutil, sqlite3, subprocess, sys
+import numpy as np
+colmap, spoilt, *words = sys.argv[1:]
+database = words[words.index("--database_path") + 1]
+shutil.copy(database, database + ".spoilt")
+with sqlite3.connect(database + ".spoilt") as opened:
+    for image, keypoints in json.loads(spoilt).items():
+        (data, columns) = opened.execute("SELECT data, cols FROM keypoints WHERE image_id = ?", [image]).fetchone()
+        xy = np.frombuffer(data, np.float32).reshape(-1, columns).copy()
+        xy[keypoints, 0] += 0.3
+        opened.execute("UPDATE keypoints SET data = ? WHERE image_id = ?", [xy.tobytes(), image])
+opened.close()
+words[words.index("--database_path") + 1] = database + ".spoilt"
+subprocess.run([colmap, *words], check=True)
+import pycolmap
+place = words[words.index("--output_path") + 1] + "/0"
+model = pycolmap.Reconstruction(place)
+for image_id, image in model.images.items():
+    for k in json.loads(spoilt).get(str(image_id), []):
+        image.points2D[k].xy = image.points2D[k].xy - [np.float32(0.3), 0]
+model.write_binary(place)
+"""
+
+
+def spoiling(tmp_path, colmap: str, run) -> Path:
+    """The true program on a copy of the database where the circles of face 2 are 0.3 px to the right; the model has
+    the run's keypoints."""
+    observations = load_run(run).observations
+    spoilt = {
+        i: [k for k, label in enumerate(image.labels) if label.startswith("2:")]
+        for i, image in enumerate(observations, start=1)
+    }
+    (tmp_path / "spoil.py").write_text(SPOIL)
+    words = f"'{sys.executable}' '{tmp_path / 'spoil.py'}' {colmap} '{json.dumps(spoilt)}'"
+    return program(tmp_path, f'exec {words} "$@"', asked=answers_of(colmap))
+
+
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.slow
+def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
+    """Face 2 is where the others are not. At 1 m and f = 1393 px, 0.3 px are 0.2 mm across; the images see it from
+    sides that differ."""
+    path = spoiling(tmp_path, colmap, own_run)
+    outcome = stcal_sfm("crosscheck", own_run, "--colmap", path)
+    line = assert_error(outcome, COMPUTATION, "face 2 (mapped by both)", " σ; 3 σ allowed", "circle 2:")
+    assert 70 < float(re.search(r"face 2 \(mapped by both\) ([\d.]+) µm", line)[1]) < 600
+    check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
+    assert "face 4 (" not in line  # in group 14, which does not show face 2
+    # A pattern pushed 0.3 px alike in all images leaves a sixth of that as residuals.
+    assert 0.02 < check["residual_rms_px"]["native"] < 0.1
+    assert check["residual_rms_px"]["pycolmap"] < 0.01
+    assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # from our own centres again
 
 
 def test_a_report_that_cannot_be_added_to(own_run, refused_page_and_all, tmp_path):

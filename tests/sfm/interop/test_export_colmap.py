@@ -8,11 +8,13 @@ small readers of what the formats' documents say.
 import csv
 import hashlib
 import json
+import os
 import re
 import shutil
 import sqlite3
 import subprocess
 from contextlib import closing
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -21,8 +23,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_colmap import SCHEMAS, export_database, export_model
+from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with
 from tests.shared import own_copy, unsealed_copy
 
@@ -136,6 +140,45 @@ def test_everything_is_kept(schema, small_run, tmp_path):
         assert opened.execute("PRAGMA foreign_key_check").fetchall() == []
     assert state_of(small_run / "colmap") == before
     assert [path.name for path in tmp_path.iterdir()] == ["out.db"]
+
+
+def first_group(run) -> tuple[list[str], tuple[int, int]]:
+    """Names of the first group's images, and the ids of its initial pair."""
+    pair = json.loads((run / "report.json").read_text())["groups"][0]["pairs"][0]
+    with read_only(run / "colmap/database.db") as opened:
+        ids = {name: i for i, name in opened.execute("SELECT image_id, name FROM images")}
+    group = pair["first"].split("/")[0]
+    return [name for name in ids if name.startswith(f"{group}/")], (ids[pair["first"]], ids[pair["second"]])
+
+
+def mapped(database, folder, names, pair) -> pycolmap.Reconstruction:
+    folder.mkdir()
+    own = own_copy(database, folder / "database.db")  # pycolmap changes what it opens
+    models = pycolmap.incremental_mapping(str(own), str(folder), str(folder), pipeline_options(names, pair))
+    assert len(models) == 1
+    return models[0]
+
+
+def points_by_track(model) -> dict[tuple, np.ndarray]:
+    return {
+        tuple(sorted((element.image_id, element.point2D_idx) for element in point.track.elements)): point.xyz
+        for point in model.points3D.values()
+    }
+
+
+def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
+    """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
+    names, pair = first_group(small_run)
+    own = small_run / "colmap/database.db"
+    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
+    assert len(ours) >= 80
+    for schema in ("3.8", "3.13"):
+        export_database(small_run, tmp_path / f"{schema}.db", schema)
+        model = mapped(tmp_path / f"{schema}.db", tmp_path / schema, names, pair)
+        assert model.num_reg_images() == len(names)
+        theirs = points_by_track(model)
+        assert theirs.keys() == ours.keys()
+        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
 @pytest.fixture
@@ -347,6 +390,50 @@ def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keyp
     # The lens stretches residuals by a few per cent.
     assert np.sqrt(np.mean(np.square(residuals))) == pytest.approx(own["residual_rms_px"], rel=0.1)
     assert own["residual_rms_px"] < 0.02
+
+
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
+def test_native_colmap_reads_it(exported, kind, tmp_path):
+    """Another version than pycolmap's, 3.8 for one, which knows no rigs and frames and passes over their files."""
+    if not shutil.which("colmap"):
+        pytest.skip("no colmap program")
+
+    def colmap(*arguments):
+        environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
+        done = subprocess.run(
+            ["colmap", *map(str, arguments)], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout + done.stderr
+
+    ours = pycolmap.Reconstruction(str(exported[kind]))
+    said = colmap("model_analyzer", "--path", exported[kind])
+    number = {key: float(re.search(rf"{key}: ([\d.]+)", said)[1]) for key in ("Registered images", "Points", "error")}
+    assert number["Registered images"] == ours.num_reg_images()
+    assert number["Points"] == ours.num_points3D()
+    assert number["error"] == pytest.approx(ours.compute_mean_reprojection_error(), abs=2e-6)
+    colmap("model_converter", "--input_path", exported[kind], "--output_path", tmp_path, "--output_type", "TXT")
+    for line in (tmp_path / "points3D.txt").read_text(encoding="ascii").splitlines():
+        if not line.startswith("#"):
+            point_id, *xyz = line.split()[:4]
+            assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
+
+
+def test_two_focal_lengths_become_one(own, tmp_path, keypoints):
+    model = read_camera(own / "inputs/cameras.txt")
+    camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
+    write_cameras_txt(own / "inputs/cameras.txt", camera)
+    native = pycolmap.Reconstruction(str(own / "colmap/target_model"))
+    native.camera(1).params = camera.colmap_params()
+    native.write_binary(str(own / "colmap/target_model"))
+    written = export_model(own, tmp_path / "model.nvm", "nvm")
+    assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
+    cameras, points = read_nvm(tmp_path / "model.nvm")
+    for _, _, views in points:
+        for i, k, x, y in views:
+            name, focal, *_ = cameras[i]
+            assert focal == written.focal_px
+            seen = camera.pixel_from_normalised(np.array([x, y]) / focal)
+            assert np.abs(seen - keypoints[name, k][1]).max() < AGAIN_PX
 
 
 def test_a_model_that_was_changed_is_refused(small_run, tmp_path):

@@ -236,6 +236,16 @@ def offered(known):
     return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
 
 
+@pytest.mark.slow
+def test_an_advised_view_beats_a_random_one(known, advice):
+    views = [view for _, own in offered(known) for view in own]
+    picked = np.random.default_rng(5).choice(len(views), 20, replace=False)
+    random = [after(known, [views[i]], advice.now).worst()[1] for i in picked]
+    now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
+    assert best <= min(random)
+    assert (now - best) > 1.5 * (now - np.mean(random)) > 0
+
+
 @pytest.fixture
 def coarse(monkeypatch):
     monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 50.0)
