@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import (
@@ -207,3 +208,23 @@ def test_rows_of_an_elastic_tree_keep_the_place_about_which_a_link_gives_way(tmp
     assert np.abs(tips(State(slid.chain(), dict(slid.tools)), q, targets).difference(wanted)).max() > 1e-3
     pivots = [joint_frames(each, q)[1][0] for each in (bent, again.chain())]
     assert np.abs(pivots[1] - pivots[0]).max() < 1e-8
+
+
+@pytest.mark.full
+def test_covariance_of_a_tree_is_honest():
+    """NEES of what the covariance says of the tips over 40 draws: χ² of 3 a place."""
+    nominal, total, count = two_arms(), 0.0, 0
+    for seed in range(40):
+        rng = np.random.default_rng([5, seed])
+        true = made(nominal, rng)
+        found = identify(nominal, seen_by(true, rng, each=40), IdentifyOptions(folds=0))
+        state = found.state
+        q, names = joint_vectors(true, 3, rng), list(MARKERS)
+        exact = measured(true, q, rng, 0.0, 0.0, names)
+        seen = observed(replace(exact, covariance=None))
+        slope, off = jacobian(state, seen)[:, 3:], residuals(state, seen)[:, 3:]
+        for place, error in zip(slope, off, strict=True):
+            total += error @ np.linalg.solve(place @ found.covariance @ place.T, error)
+            count += 3
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], count)
+    assert low < total < high

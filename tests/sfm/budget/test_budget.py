@@ -16,7 +16,7 @@ from stcal.labels import CircleLabel
 from stcal.report import document as pdf
 from stcal.report.text import significant
 from stcal.sfm.budget import combine
-from stcal.sfm.budget.budget_file import SHARED, BudgetFile, against_run, against_stated
+from stcal.sfm.budget.budget_file import SHARED, BudgetFile, _unusual, against_run, against_stated
 from stcal.sfm.budget.budget_page import REQUIRED, as_exact, budget_report
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
@@ -505,3 +505,13 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     assert "origin at circle" in page
     assert run.folder.parent.name not in page
     assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]
+
+
+def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():
+    def asked(**values) -> list[str]:
+        return _unusual(Statement(StatedSize(**values), StatedSize(), {}, {}, False))
+
+    assert asked(temperature_c=23.0, temperature_sigma_k=0.5, expansion_ppm_per_k=70.0) == []
+    assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
+    assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
+    assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]
