@@ -228,15 +228,17 @@ def test_progress_as_lines(capsys, monkeypatch):
     assert progress_of(capsys, monkeypatch, True, False) == []
 
 
-@pytest.mark.parametrize("quiet", [False, True])
-def test_a_command_that_works_in_silence_says_what_it_is_at(capsys, monkeypatch, quiet):
+@pytest.mark.parametrize(("quiet", "waits"), [(False, False), (True, False), (False, True)])
+def test_a_command_that_works_in_silence_says_what_it_is_at(capsys, monkeypatch, quiet, waits):
     monkeypatch.setattr(terminal, "LINE_EVERY_S", 0.2)
     with terminal.manner(quiet, False), terminal.StageProgress() as progress:
         progress("check", 0, 3)
+        if waits:
+            terminal.wait_for_others()
         time.sleep(0.6)
     said = capsys.readouterr().err.splitlines()
     assert all(line.startswith("check: ") for line in said)
-    assert len(said) in ((0,) if quiet else (1, 2, 3))
+    assert len(said) in ((0,) if quiet or waits else (1, 2, 3))
 
 
 @pytest.mark.parametrize("word", ["--quiet", "-q"])

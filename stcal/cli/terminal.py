@@ -50,6 +50,12 @@ def manner(quiet: bool, verbose: bool) -> Iterator[None]:
         _beating.reset(tokens[2])
 
 
+def wait_for_others() -> None:
+    """Notes that the command waits for others from now on: its silence is no work."""
+    if beat := _beating.get():
+        beat.over.set()
+
+
 def verbose() -> bool:
     """Returns whether more than usual is to be printed."""
     return _verbose.get()

@@ -280,7 +280,7 @@ def _design_beside(faces: Path) -> Path | None:
 
 
 def _serve(setting: tuple, source: int | str | None, host: str, port: int, limits: dict, as_json: bool) -> None:
-    from stcal.cli.terminal import write_out
+    from stcal.cli.terminal import wait_for_others, write_out
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
     from stcal.sfm.measurement.measure_images import Tracker
@@ -296,6 +296,7 @@ def _serve(setting: tuple, source: int | str | None, host: str, port: int, limit
         else:
             say(f"showing {url}/ until {'it ends' if isinstance(source, str) else 'Ctrl-C'}")
         sys.stdout.flush()
+        wait_for_others()
         if source is None:
             threading.Event().wait()
         first = next(frames)
