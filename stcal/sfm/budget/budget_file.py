@@ -5,7 +5,7 @@ Terms of the length test are those of VDI/VDE 2634 part 1 and ISO 10360; E_n is 
 both agree."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,18 +16,21 @@ from scipy.stats import norm
 import stcal
 from stcal.design import BoardDesign, StatedSize
 from stcal.errors import InputError
-from stcal.io.files import RUN_MARKER
+from stcal.io.files import RUN_MARKER, digest_of
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.io.table import LENGTHS, read_table
 from stcal.report.text import join, number
 from stcal.sfm.budget.combine import (
+    BY_CHANCE,
     COVERAGE_FACTOR,
+    FIELDS,
     REFERENCE_C,
     Budget,
     GroupViews,
     Origin,
     Row,
     Statement,
+    coverage_factor,
     distance,
     longest_of,
     reference_temperature_c,
@@ -37,8 +40,6 @@ from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, judgement_of
 from stcal.sfm.runs.saved import SavedRun, Verified
 
-BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
-"""Probability that one length that agrees is beyond U by chance, and that any length of a test is beyond the limit."""
 SHARED = ("board_pitch", "board_expansion", "target_expansion")
 """Sources whose errors two calibrations of one target with one board share: they scale all lengths by one factor."""
 
@@ -115,7 +116,8 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
                 f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, and a σ of 0 "
                 "or more",
             )
-        tested.append(_length(budget, (places[a], places[b]), float(value), float(sigma_mm)))
+        own = _corrected(budget, (places[a], places[b]))
+        tested.append(_tested((a, b), own, (float(value), float(sigma_mm) ** 2, 0.0)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
     if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
         notes += (
@@ -142,9 +144,8 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     shared = SHARED if same else ("target_expansion",)
     tested = []
     for i, j in pairs:
-        reference = _length(other, (other_rows[i], other_rows[j]), 0.0, 0.0, shared)
-        sigma_mm = 1e-3 * (reference.expanded_um or 0.0) / COVERAGE_FACTOR
-        tested.append(_length(budget, (rows[i], rows[j]), reference.measured_mm, sigma_mm, shared))
+        reference = _corrected(other, (other_rows[i], other_rows[j]), shared)
+        tested.append(_tested((common[i], common[j]), _corrected(budget, (rows[i], rows[j]), shared), reference))
     note = (
         "both calibrations rest on boards of the same description: if it is one board, what its pitch and expansion "
         "are off is in both alike, cannot be seen here, and is not in U of the differences; a length from elsewhere "
@@ -194,19 +195,31 @@ def _require_size(budget: Budget) -> None:
         )
 
 
-def _length(
-    budget: Budget, ends: tuple[int, int], reference_mm: float, sigma_mm: float, without: Sequence[str] = ()
-) -> TestedLength:
-    """Returns a corrected length of the run, with U by all sources except ``without`` and by the reference's σ."""
+Length = tuple[float, float, float]
+"""A length, mm, its variance, mm², and of that the square of the part of type A over its degrees of freedom."""
+
+
+def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = ()) -> Length:
+    """Returns a corrected length of the run, with its variance by all sources except ``without``."""
     measurand = distance(budget.joint, *ends)
-    variance = sum(
-        float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
-    )
-    measured = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
-    expanded = 1e3 * COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm))
-    error = 1e3 * (measured - reference_mm)
+    variances = {
+        each.key: (each.evaluation, float(measurand.covariance(each, 0.0)[0, 0]))
+        for each in budget.sources
+        if each.key not in without
+    }
+    estimated = sum(variance for evaluation, variance in variances.values() if evaluation == "A")
+    length = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
+    return length, sum(variance for _, variance in variances.values()), estimated**2 / budget.freedom
+
+
+def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLength:
+    """Returns a length against a reference, with U of their difference."""
+    (measured_mm, *_), (reference_mm, *_) = own, reference
+    variance, lost = (own[i] + reference[i] for i in (1, 2))
+    k = coverage_factor(variance**2 / lost if lost else np.inf)
+    expanded, error = 1e3 * k * float(np.sqrt(variance)), 1e3 * (measured_mm - reference_mm)
     e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
-    return TestedLength(measurand.circles, measured, reference_mm, error, expanded, e_n)
+    return TestedLength(tuple(circles), measured_mm, reference_mm, error, expanded, e_n)
 
 
 MICRO = 1e3
@@ -223,6 +236,7 @@ class RunOfBudget:
     sha256: str
     faces_sha256: str
     changed: list[str]
+    photographs_sha256: dict[str, str] = field(default_factory=dict)
 
 
 class SourceRow(Part):
@@ -241,7 +255,8 @@ class Uncertainty(Part):
     axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
     contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
     standard: float = Field(description="combined standard uncertainty of all of them together")
-    expanded: float = Field(description="expanded uncertainty")
+    coverage_factor: float = Field(2.0, description="k, by the effective degrees of freedom")
+    expanded: float = Field(description="expanded uncertainty, k times `standard`")
     coverage: float = Field(description="of `expanded`, by simulation")
     degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
 
@@ -251,6 +266,7 @@ class Uncertainty(Part):
             axes=(unit * np.sqrt(np.diag(row.covariance))).tolist(),
             contributions={key: unit * contribution for key, contribution in row.contributions.items()},
             standard=unit * row.standard,
+            coverage_factor=row.coverage_factor,
             expanded=unit * row.expanded,
             coverage=row.coverage,
             degrees_of_freedom=row.freedom,
@@ -268,6 +284,12 @@ class FaceUncertainty(Part):
     rotation_mdeg: Uncertainty
 
 
+class AngleUncertainty(Part):
+    faces: list[str]
+    angle_deg: float
+    angle_mdeg: Uncertainty
+
+
 class DistanceUncertainty(Part):
     circles: list[str]
     length_mm: float
@@ -279,6 +301,7 @@ class DistanceUncertainty(Part):
 class CircleUncertainty:
     position_mm: list[float]
     position_xyz_um: list[float]
+    coverage_factor: float = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,11 +319,11 @@ class BudgetFile(ResultFile):
     version: str = Field(description="of stcal")
     run: RunOfBudget = Field(
         description="`folder`, `images` (photographs), name of the `target`, `version` of stcal that made it, `sha256` "
-        "of its `stcal-run.json` (that of all files) and `faces_sha256`; `changed` files, not as the run left them"
+        f"of its `{RUN_MARKER}` (that of all files) and `faces_sha256`; `changed` files, not as the run left them; "
+        "`photographs_sha256` of those that are still in their folder"
     )
     fields: dict[ByName, str] = Field(
-        description="`number`, `laboratory`, `place`, `customer`, `instrument`, `operator`, `date`, `traceability` and "
-        "others, as given; empty where not"
+        description=f"{', '.join(f'`{name}`' for name in FIELDS)} and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"')
@@ -313,7 +336,9 @@ class BudgetFile(ResultFile):
         description="temperature of the target for which corrected lengths and positions hold; null if not known"
     )
     holds: str = Field(description="the same in words, and why; empty where `usable` is false")
-    coverage_factor: float = Field(description="k of the expanded uncertainties")
+    coverage_factor: float = Field(
+        description="k for many degrees of freedom; each uncertainty has its own `coverage_factor`"
+    )
     sigma0: float = Field(description="residuals over σ of all observations, 1 if smaller; multiplies all σ")
     redundancy: int = Field(description="degrees of freedom of the adjustment")
     views: list[GroupViews] = Field(
@@ -335,6 +360,9 @@ class BudgetFile(ResultFile):
         description="against the reference face: `position_mm` of the origin, corrected, and `rotation_vector_deg`; "
         "`position_um` and `rotation_mdeg`, their uncertainties"
     )
+    angles: list[AngleUncertainty] = Field(
+        default=[], description="`angle_deg` between the Z axes of every two `faces`; `angle_mdeg`, its uncertainty"
+    )
     distances: list[DistanceUncertainty] = Field(
         description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm`, and "
         "`distance_um`, its uncertainty"
@@ -342,7 +370,7 @@ class BudgetFile(ResultFile):
     circles: dict[ByName, CircleUncertainty] = Field(
         default={},
         description="by label: corrected `position_mm` in the target frame, and standard uncertainties of x, y, z, "
-        "`position_xyz_um`; empty without a size, or if the run must not be used",
+        "`position_xyz_um`, with their `coverage_factor`; empty without a size, or if the run must not be used",
     )
     length_tests: list[LengthTest] = Field(
         description="`reference` (file or run); `lengths` between `circles`: corrected `measured_mm`, `reference_mm`, "
@@ -372,15 +400,24 @@ class BudgetFile(ResultFile):
                 position_um=Uncertainty.of(position, MICRO) if known else None,
                 rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
             )
+        angles = [
+            AngleUncertainty(
+                faces=list(row.measurand.faces),
+                angle_deg=_angle_deg(*(poses[face].rotation[:, 2] for face in row.measurand.faces)),
+                angle_mdeg=Uncertainty.of(row, MILLIDEGREES),
+            )
+            for row in budget.of_kind("angle")
+        ]
         distances = []
         for row in budget.of_kind("distance"):
             length = row.measurand.length_mm or 0.0
             own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
             distances.append(DistanceUncertainty(circles=list(row.measurand.circles), **own))
         circles, variance = {}, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
-        for label, own in zip(budget.joint.labels, variance, strict=True):
+        for label, own, freedom in zip(budget.joint.labels, variance, budget.circles_freedom, strict=True):
             xyz = enlarged * np.asarray(run.faces.circles[label])
-            circles[str(label)] = CircleUncertainty(xyz.tolist(), (MICRO * np.sqrt(own)).tolist())
+            sigma_um = (MICRO * np.sqrt(own)).tolist()
+            circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, coverage_factor(freedom))
         if any(is_refused(each) for each in (run, *others)):
             tests = [test.without_u() for test in tests]
         return cls(
@@ -394,6 +431,7 @@ class BudgetFile(ResultFile):
                 sha256=run.sha256.get(RUN_MARKER, ""),
                 faces_sha256=run.sha256.get("faces.json", ""),
                 changed=[*verified.missing, *verified.changed, *verified.added],
+                photographs_sha256=dict(_digests(run)),
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
@@ -412,11 +450,23 @@ class BudgetFile(ResultFile):
             definitions=_definitions(run),
             correction_ppm=PPM * conditions.correction if known else None,
             faces={} if refused else faces,
+            angles=[] if refused else angles,
             distances=[] if refused or not known else distances,
             circles={} if refused or not known else circles,
             length_tests=TypeAdapter(list[LengthTest]).validate_python([asdict(test) for test in tests]),
             notes=notes_of(budget, verified, run),
         )
+
+
+def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _digests(run: SavedRun) -> Iterator[tuple[str, str]]:
+    """Yields the name and the SHA-256 of each photograph that is in its folder."""
+    for name in sorted(image.name for image in run.observations):
+        if (path := Path(run.photographs) / name).is_file():
+            yield name, digest_of(path)
 
 
 def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
@@ -441,7 +491,8 @@ def _definitions(run: SavedRun) -> list[str]:
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
-        "a distance a–b is that of the points with the labels a and b, face:circle, as target.toml names them",
+        "the angle of two faces is that between their Z axes",
+        "a distance a–b is that of the points a and b, face:circle, numbered as in the drawing",
         *(
             f"face {face.id}: the frame of its drawing, Z into the body"
             if face.printed is not None

@@ -10,6 +10,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
+from scipy.linalg import null_space
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from stcal.boards.board_designs import TAG_SIGMA_MM
 from stcal.boards.board_file import BoardSizeEntry, SizeEntry
@@ -38,8 +41,26 @@ from stcal.sfm.adjust.uncertainty import (
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
-FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
-"""Fields in the head of every budget, after those that are given, and empty if they are not."""
+FIELDS = {
+    "number": "certificate number",
+    "laboratory": "laboratory",
+    "address": "its address",
+    "place": "place of calibration",
+    "customer": "customer",
+    "item": "item",
+    "maker": "maker",
+    "type": "type",
+    "serial": "serial number",
+    "condition": "condition of the item",
+    "method": "method",
+    "instrument": "instrument",
+    "operator": "performed by",
+    "date": "date of calibration",
+    "issued": "date of issue",
+    "authorised": "authorised by",
+    "traceability": "traceability",
+}
+"""Fields of the head of a budget with their words, in the order of a certificate; empty if they are not given."""
 LONGEST_TEXT = 500
 DEFAULT = "; the default, which `design` writes too: measure it and state it"
 """Words for a σ that nobody has changed."""
@@ -309,24 +330,42 @@ def _growth(stated: StatedSize) -> float | None:
 
 
 COVERAGE_FACTOR = 2.0
+"""Coverage factor k for infinitely many degrees of freedom."""
+BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
+"""Probability that an error is beyond U by chance, and that any length of a test is beyond the limit."""
 LONGEST_DISTANCES = 5
 """Number of distances in a budget."""
 DRAWS = 100_000
 """Number of random draws for the coverage (JCGM 101:2008)."""
-Kind = Literal["position", "rotation", "distance"]
+Kind = Literal["position", "rotation", "angle", "distance"]
+PARALLEL = 1e-3
+"""Sine of an angle between two axes below which both directions across them count, as none of them leads its change."""
+
+
+def coverage_factor(freedom: float) -> float:
+    """Returns k for effective degrees of freedom: of Student's distribution, for the coverage that 2 has of a normal
+    one, 95.45 % (JCGM 100, G.3)."""
+    return float(student.isf(BY_CHANCE / 2, freedom)) if np.isfinite(freedom) else COVERAGE_FACTOR
+
+
+def effective_freedom(variance: float, estimated: float, freedom: float) -> float:
+    """Returns the effective degrees of freedom of a variance of which the part of type A, ``estimated``, has
+    ``freedom`` (Welch–Satterthwaite, JCGM 100, G.4)."""
+    return freedom * (variance / estimated) ** 2 if estimated else np.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurand:
-    """A face's position or rotation in the target frame, or a distance between two circles. The uncertainty of three
-    numbers is the root of the summed variances."""
+    """A face's position or rotation in the target frame, the angle between the Z axes of two faces, or a distance
+    between two circles. The uncertainty of three numbers is the root of the summed variances."""
 
     kind: Kind
-    name: str  # the face, or ``a – b``
+    name: str  # the face, or ``a – b`` of two faces or circles
     circles: tuple[CircleLabel, ...]
     length_mm: float | None  # of a distance, else None
     jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
     designed: np.ndarray  # (r, d) by the frame circles that were not mapped
+    faces: tuple[str, ...] = ()  # of an angle
 
     def __post_init__(self):
         freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
@@ -350,9 +389,14 @@ class Row:
     contributions: dict[str, float]  # by key of the source
     covariance: np.ndarray
     standard: float  # combined standard uncertainty
-    expanded: float  # with k = 2
+    expanded: float  # k times that
     coverage: float  # simulated, of ``expanded``
-    freedom: float  # effective degrees of freedom (Welch–Satterthwaite, JCGM 100 G.4)
+    freedom: float  # effective degrees of freedom
+
+    @property
+    def coverage_factor(self) -> float:
+        """k of ``expanded``."""
+        return coverage_factor(self.freedom)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -373,6 +417,8 @@ class Budget:
     sources: tuple[BudgetSource, ...]
     rows: tuple[Row, ...]
     circles_covariance_mm2: np.ndarray  # (c, 3, 3) by circle of ``joint``, target frame
+    circles_freedom: np.ndarray  # (c,) effective degrees of freedom of the circles
+    freedom: int  # degrees of freedom of what this run estimates
     views: tuple[GroupViews, ...]
     statement: Statement
     conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
@@ -426,19 +472,26 @@ def budget(
         sources += (BudgetSource(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
     rng, joint = np.random.default_rng(0), found.joint
     # Where photographs differ more than their pixels explain, it is they that are counted.
-    freedom = joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models)
+    freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
     rows = [
         _row(measurand, sources, own.designed_sigma_mm, freedom, rng)
         for measurand in measurands(found.joint, own, reference_face)
     ]
     views = tuple(_view(model) for model in found.joint.models)
-    circles = own.circle_covariance(np.sum([source.covariance_mm2 for source in sources], axis=0))
+    circles, estimated = (
+        own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
+        for kinds in ("AB", "A")
+    )
+    variances = [
+        (float(np.trace(whole)), float(np.trace(part))) for whole, part in zip(circles, estimated, strict=True)
+    ]
+    freedoms = np.array([effective_freedom(*each, freedom) for each in variances])
     conditions = conditions_of(statement, board)
-    return Budget(found.joint, reference_face, sources, tuple(rows), circles, views, statement, conditions)
+    return Budget(joint, reference_face, sources, tuple(rows), circles, freedoms, freedom, views, statement, conditions)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
-    """Returns positions and rotations of all faces except the reference face, and the longest distances."""
+    """Returns positions and rotations of all faces except the reference face, angles, and the longest distances."""
     other_faces = [face for face in own.target_from_face if face != reference_face]
     kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
     poses = [
@@ -446,7 +499,18 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
         for kind, rows in kinds
         for face in other_faces
     ]
-    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]]
+    angles = [_angle(own, a, b) for a, b in combinations(own.target_from_face, 2)]
+    longest = longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]
+    return [*poses, *angles, *(distance(joint, a, b) for a, b in longest)]
+
+
+def _angle(own: Derivatives, a: str, b: str) -> Measurand:
+    """Returns the measurand of the angle between two faces' Z axes: it grows by rotations about their common normal."""
+    first, second = (own.target_from_face[face].rotation[:, 2] for face in (a, b))
+    about = np.cross(first, second)[None]
+    about = about / np.linalg.norm(about) if np.linalg.norm(about) > PARALLEL else null_space(first[None]).T
+    jacobian, designed = (about @ (by[b][:3] - by[a][:3]) for by in (own.faces, own.face_designed))
+    return Measurand("angle", f"{a} – {b}", (), None, jacobian, designed, (a, b))
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
@@ -483,17 +547,20 @@ def _row(
     covariance = np.sum(list(covariances.values()), axis=0)
     variance = float(np.trace(covariance))
     estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
-    standard = float(np.sqrt(variance))
+    standard, effective = float(np.sqrt(variance)), effective_freedom(variance, estimated, freedom)
+    expanded = coverage_factor(effective) * standard
     values, vectors = np.linalg.eigh(covariance)
     errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    # The estimated variance scatters about the true one.
+    drawn = np.sqrt(rng.chisquare(effective, DRAWS) / effective) if np.isfinite(effective) else 1.0
     return Row(
         measurand,
         {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()},
         covariance,
         standard,
-        COVERAGE_FACTOR * standard,
-        float((np.linalg.norm(errors, axis=1) <= COVERAGE_FACTOR * standard).mean()),
-        max(freedom, 1) * (variance / estimated) ** 2 if estimated else np.inf,
+        expanded,
+        float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean()),
+        effective,
     )
 
 

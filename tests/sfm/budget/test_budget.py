@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import t as student
 
 from stcal.boards.board_file import board_toml, load_board
 from stcal.design import KnownDistance, ScaleReference, StatedSize
@@ -15,9 +16,12 @@ from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.report import document as pdf
 from stcal.report.text import significant
+from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.budget import combine
 from stcal.sfm.budget.budget_file import SHARED, BudgetFile, _unusual, against_run, against_stated
-from stcal.sfm.budget.budget_page import REQUIRED, as_exact, budget_report
+from stcal.sfm.budget.budget_page import budget_report
+from stcal.sfm.budget.budget_tables import as_exact
+from stcal.sfm.budget.certificate import REQUIRED
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run, load_run, verify
@@ -81,15 +85,15 @@ def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
 
 
 def test_contributions_add_up_as_squares(saved, plain):
-    assert len(plain.rows) == 3 + 3 + 5
+    assert len(plain.rows) == 3 + 3 + 6 + 5
     for face in BudgetFile.of(plain, saved, verify(saved.folder)).faces.values():
         for written in (face.position_um, face.rotation_mdeg):
             assert sum(written.share(key) for key in written.contributions) == pytest.approx(1)
     for row in plain.rows:
         assert min(row.contributions.values()) >= 0
         assert np.hypot.reduce(list(row.contributions.values())) == pytest.approx(row.standard)
-        assert row.expanded == 2 * row.standard
-        # 95.45 % for one number, up to 99.3 % for three alike; of 100 000 draws.
+        # Student's k for 95.45 %; up to 99.3 % for three numbers alike; of 100 000 draws.
+        assert row.expanded == pytest.approx(student.ppf(0.97725, row.freedom) * row.standard, rel=1e-5)
         assert 0.952 < row.coverage < 0.995
 
 
@@ -251,7 +255,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     words = "--statement", path, "--field", "instrument=X 5"
     code, text, _ = stcal_sfm("budget", small_run, *words, "-v", "--json", out)
     assert code == 0
-    assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
+    assert all(shown in text for shown in ("performed by: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
     file = json.loads(out.read_text())
     marker = json.loads((small_run / ".stcal/run.json").read_text())["sha256"]
     assert (file["run"]["sha256"], file["run"]["faces_sha256"]) == (marker[".stcal/run.json"], marker["faces.json"])
@@ -262,7 +266,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     assert first["corrected_mm"] == pytest.approx(first["length_mm"] * (1 - 14e-6), abs=1e-9)
     own = first["distance_um"]
     assert own["contributions"]["board_pitch"] == pytest.approx(10e-3 * first["length_mm"], rel=2e-3)
-    assert own["expanded"] == pytest.approx(2 * own["standard"])
+    assert own["expanded"] == pytest.approx(own["coverage_factor"] * own["standard"])
     pose = np.array(json.loads((small_run / "faces.json").read_text())["target_from_face"]["5"])
     assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)
     turn = Rotation.from_rotvec(file["faces"]["5"]["rotation_vector_deg"], degrees=True)
@@ -363,13 +367,16 @@ PITCH = "[board]\npitch_sigma_ppm = 50.0\n"
 
 
 def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,length_mm,sigma_mm"):
-    """Lengths of the run, each shorter by so many expanded uncertainties."""
+    """Lengths of the run, each shorter by so many expanded uncertainties; degrees of freedom grow as the stated σ does
+    (Welch–Satterthwaite)."""
     lines = [head]
     for i, j in longest_of(plain.joint.labels, plain.joint.xyz_model)[:rows]:
         a, b = plain.joint.labels[i], plain.joint.labels[j]
         length = float(np.linalg.norm(plain.joint.xyz_model[i] - plain.joint.xyz_model[j]))
-        u = next(r.standard for r in plain.of_kind("distance") if r.measurand.circles == (a, b))
-        cells = [a, b, f"{length - off_u * 2 * np.hypot(u, sigma_mm):.9f}", str(sigma_mm)]
+        own = next(r for r in plain.of_kind("distance") if r.measurand.circles == (a, b))
+        u = np.hypot(own.standard, sigma_mm)
+        k = student.ppf(0.977249868, own.freedom * (u / own.standard) ** 4)
+        cells = [a, b, f"{length - off_u * k * u:.9f}", str(sigma_mm)]
         lines.append(",".join(cells[: head.count(",") + 1]))
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -407,7 +414,7 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
     longest = plain.of_kind("distance")[0]
     assert alike.lengths[0].circles == longest.measurand.circles
     assert alike.lengths[0].error_um == 0
-    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * np.sqrt(2) * longest.expanded)
+    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * np.sqrt(2) * longest.expanded, rel=1e-3)
     path = tmp_path / "lab.toml"
     path.write_text(PITCH)
     stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
@@ -463,12 +470,12 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
     assert "+40.0 ppm" in html
     assert "not a certificate: nothing is stated of" in html
-    expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[6:]
+    expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[3:]
     assert len(expanded) == 3
     assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
     circle = next(iter(json.loads((small_run / "faces.json").read_text())["circles"]))
     assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
-    assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
+    assert re.search(r"SHA-256 of the result file</th><td[^>]*>[0-9a-f]{64}<", html)
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
 
@@ -481,12 +488,18 @@ def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_
     assert [as_exact(166.18664, 0.031), as_exact(236.457, 15.0), as_exact(1.23456, 0.0)] == ["166.187", "236", "1.2346"]
 
 
-def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_path):
-    """Of a sound run with lengths at 20 °C; its head has the answer, its end the definitions and the board."""
+@pytest.fixture
+def certified(small_run):
+    """The budget of a sound run, as if all were stated."""
     run = load_run(small_run)
     file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
     stated = [row.model_copy(update={"origin": "stated"}) for row in file.sources]
-    full = file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
+    return file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
+
+
+def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, certified):
+    run, full = load_run(small_run), certified
+    file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
     for one, lacks in (
         *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
         (file.model_copy(update={"fields": full.fields}), "board's pitch"),
@@ -499,12 +512,44 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     care = full.model_copy(update={"reserved": True})
     assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
     page = budget_report(full).page()
-    assert re.search("<h1>Certificate of calibration no. rule 7, with uncertainty budget: .*</h1>", page)
+    assert "<h1>Certificate of calibration no. rule 7</h1>" in page
     assert "not a certificate" not in page
-    assert page.index("May the run be used?") < page.index("<h2>")
     assert "origin at circle" in page
     assert run.folder.parent.name not in page
     assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]
+
+
+def test_what_a_certificate_never_says(certified):
+    """ISO/IEC 17025 keeps results of the item from what helps its user; each photograph has its hash."""
+    file, page = certified, budget_report(certified).page()
+    for word in (
+        "May the run",
+        "May I use",
+        "faces.json",
+        "target.toml",
+        "--",
+        "as `draw` numbers them",
+        '<img src=""',
+    ):
+        assert word not in re.sub("<style>.*?</style>|<script>.*?</script>", "", page, flags=re.DOTALL), word
+    assert '<td class="l"></td>' not in page
+    assert len(file.run.photographs_sha256) == sum(each.images for each in file.views)
+    assert all(digest in page for digest in file.run.photographs_sha256.values())
+    assert page.count("seen from outside") == 2 * len(file.faces) + 2  # as text and for those who do not see
+
+
+def test_an_angle_is_that_of_the_normals_and_its_uncertainty_what_draws_of_the_circles_say(saved, plain):
+    """Faces moved by draws from the covariance of all of them together."""
+    own = derivatives(plain.joint, adjusted_run(saved).start, saved.target_design, saved.faces.frame)
+    variances, axes = np.linalg.eigh(plain.joint.covariance_mm2)
+    draws = axes * np.sqrt(np.maximum(variances, 0)) @ np.random.default_rng(0).standard_normal((len(axes), 2000))
+    for row in plain.of_kind("angle"):
+        normals = [
+            Rotation.from_rotvec((own.faces[face][:3] @ draws).T).apply(own.target_from_face[face].matrix()[:3, 2])
+            for face in row.measurand.faces
+        ]
+        angles = np.arctan2(np.linalg.norm(np.cross(*normals), axis=1), np.sum(np.multiply(*normals), axis=1))
+        assert np.std(angles) == pytest.approx(row.standard, rel=0.06)  # 4 σ of 2000 draws
 
 
 def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():

@@ -1,0 +1,158 @@
+"""The certificate of calibration, for a customer and an auditor (ISO/IEC 17025:2017, 7.8.2 and 7.8.4; GUM)."""
+
+from functools import partial
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry.rigid import Rigid
+from stcal.report.document import Block, Document, Section, Table, bullets, columns, plot
+from stcal.report.svg import AXIS, AXIS_COLOURS, FAINT, INK, Axes, Drawing
+from stcal.report.text import NONE
+from stcal.sfm.budget.budget_file import BudgetFile
+from stcal.sfm.budget.budget_tables import contributions, facts, hashes, inputs, length_test, method, results, what_u_is
+from stcal.sfm.budget.combine import FIELDS
+
+REQUIRED = [name for name in FIELDS if name not in ("place", "item", "maker", "type", "instrument", "operator")]
+"""Fields without which a page is no certificate (ISO/IEC 17025:2017, 7.8.2.1 and 7.8.4.1)."""
+RELATES = (
+    "The results relate only to the item named above, in the state in which it was calibrated. The certificate may be "
+    "reproduced only as a whole."
+)
+STATED = {
+    "rows": "rows of dots",
+    "columns": "columns of dots",
+    "pitch_mm": "pitch of the dots, mm",
+    "pitch_sigma_ppm": "its standard uncertainty, ppm",
+    "temperature_c": "temperature, °C",
+    "temperature_sigma_k": "its standard uncertainty, K",
+    "expansion_ppm_per_k": "coefficient of expansion, ppm/K",
+    "expansion_sigma_ppm_per_k": "its standard uncertainty, ppm/K",
+    "reference_temperature_c": "reference temperature, °C",
+}
+"""Words for what is stated of board and target."""
+DIRECTIONS = 200
+"""Number of directions among which that of the drawing is chosen."""
+
+
+def certificate(file: BudgetFile) -> Document:
+    """Returns the certificate of a budget for which all is stated that it needs."""
+    images, groups = sum(each.images for each in file.views), len(file.views)
+    how = (
+        f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the centres of all circles and the "
+        f"poses of the camera were adjusted together (bundle adjustment by stcal {file.run.version}, uncertainties by "
+        f"stcal {file.version})"
+    )
+    tests = [block for test in file.length_tests for block in length_test(test)]
+    return Document(
+        f"Certificate of calibration no. {file.fields['number'].strip()}",
+        file.fields["laboratory"].strip(),
+        [
+            Section("Method and conditions", [file.fields["method"], how, _conditions(file), file.holds]),
+            Section("What is measured", [drawings(file), bullets(file.definitions), what_u_is(file)]),
+            Section("Results", [*results(file), "End of the results; the annex follows"], terminal=True),
+            Section("Annex: test of lengths", tests, terminal=True),
+            Section("Annex: uncertainty budget", [method(file), inputs(file), *contributions(file)], terminal=True),
+            Section("Annex: data", [hashes(file), photographs(file), "End of the certificate"]),
+        ],
+        banner=[facts(_head(file)), RELATES],
+    )
+
+
+def _head(file: BudgetFile) -> list[list[str]]:
+    """Returns the fields that are given, in the order of :data:`FIELDS`, then others."""
+    given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
+    return [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
+
+
+def _conditions(file: BudgetFile) -> Table:
+    """Returns what is stated of the bodies, a column for each."""
+    bodies = dict.fromkeys(row.body for row in file.stated)
+    values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
+    rows = [
+        [words, *(values.get((body, key), NONE) for body in bodies)]
+        for key, words in STATED.items()
+        if any((body, key) in values for body in bodies)
+    ]
+    return Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
+
+
+def photographs(file: BudgetFile) -> Table:
+    """Returns the photographs with their hashes."""
+    return Table(["<photograph", "<SHA-256"], list(file.run.photographs_sha256.items()), css="text")
+
+
+def drawings(file: BudgetFile) -> Block:
+    """Returns the item with its faces, and each face with its numbered circles, axes and origin."""
+    circles: dict[str, dict[str, np.ndarray]] = {}
+    for label, each in file.circles.items():
+        face, _, circle = label.partition(":")
+        circles.setdefault(face, {})[circle] = np.array(each.position_mm)
+    poses = {file.reference_face: Rigid(np.eye(3), np.zeros(3))} | {
+        name: Rigid(Rotation.from_rotvec(each.rotation_vector_deg, degrees=True), each.position_mm)
+        for name, each in file.faces.items()
+        if each.position_mm is not None
+    }
+    figures = [plot(partial(_item, circles, poses), "The item: its faces with the axes of their frames", css="")]
+    for face, own in circles.items():
+        xyz = dict(zip(own, poses[face].inverse() @ np.array(list(own.values())), strict=True))
+        out = float(np.sign((poses[face].translation - _middle(circles)) @ poses[face].rotation[:, 2])) or 1.0
+        figures.append(plot(partial(_face, xyz, out), f"Face {face}, seen from outside", css=""))
+    return columns(*([figure] for figure in figures), css="columns thumbs")
+
+
+def _middle(circles: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
+    return np.mean([np.mean(list(own.values()), axis=0) for own in circles.values()], axis=0)
+
+
+def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
+    """Draws the circles of a face in its own frame; ``out`` : -1 where its Z axis leads into the body, so that X is
+    drawn to the left."""
+    drawing = Drawing(3.3, 2.6)
+    xy = np.array(list(xyz.values()))[:, :2] * [out, 1.0]
+    reach = 0.25 * float(np.ptp(np.vstack([xy, [[0, 0]]]), axis=0).max())
+    tips = reach * np.array([[out, 0.0], [0.0, 1.0]])
+    axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
+    for tip, colour, name in zip(tips, AXIS_COLOURS, "XY", strict=False):
+        axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
+        axes.words(1.12 * tip[0], 1.12 * tip[1], name, colour=colour, weight="bold")
+    axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
+    for (x, y), name in zip(xy, xyz, strict=True):
+        axes.words(x, y, name, (0, 9))
+    return drawing
+
+
+def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid]) -> Drawing:
+    """Draws the faces with their frames from where most of them are seen; Y of the reference frame is up. Faces that
+    look away are pale."""
+    drawing, middle = Drawing(3.3, 2.6), _middle(circles)
+    normals = {}
+    for face in circles:
+        normal = poses[face].rotation[:, 2]
+        normals[face] = normal * (np.sign((poses[face].translation - middle) @ normal) or 1.0)
+    turn, height = np.pi * (1 + 5**0.5) * np.arange(DIRECTIONS), np.linspace(-1, 1, DIRECTIONS)  # evenly on a sphere
+    across = np.sqrt(1 - height**2)
+    towards = np.column_stack([across * np.cos(turn), height, across * np.sin(turn)])
+    facing = np.clip(towards @ np.array(list(normals.values())).T, 0, None)
+    viewer = towards[np.argmax(np.sqrt(facing).sum(1) + 0.1 * height)]
+    right = np.cross([0.0, 1.0, 0.0], viewer)
+    right /= np.linalg.norm(right)
+    onto = np.array([right, np.cross(viewer, right)])
+    places = {face: np.array(list(own.values())) @ onto.T for face, own in circles.items()}
+    reach = 0.16 * float(np.ptp(np.vstack(list(places.values())), axis=0).max())
+    axes = Axes.equal(
+        drawing, drawing.panels(left=14, right=14, top=14, bottom=14)[0], np.vstack(list(places.values()))
+    )
+    for face in sorted(circles, key=lambda face: normals[face] @ viewer):
+        seen, xy = normals[face] @ viewer > 0, places[face]
+        outline = xy[ConvexHull(xy).vertices] if len(xy) > 2 else xy
+        ink = INK if seen else FAINT
+        axes.lines([outline.T], AXIS if seen else FAINT, 1.0, fill="#eef2f6" if seen else "#ffffff")
+        axes.marks(xy[:, 0], xy[:, 1], "ring", 4, ink)
+        axes.words(xy[:, 0].mean(), xy[:, 1].mean(), face, size=11, weight="bold", colour=ink)
+        if seen:
+            start = onto @ poses[face].translation
+            for direction, colour in zip(poses[face].rotation.T, AXIS_COLOURS, strict=True):
+                axes.arrows(start[None], reach * (onto @ direction)[None], 1.2, colour)
+    return drawing
