@@ -37,7 +37,7 @@ from stcal.sfm.budget.combine import (
 )
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
-from stcal.sfm.report.judgement import Judgement, judgement_of
+from stcal.sfm.report.judgement import Judgement, Use, judgement_of
 from stcal.sfm.runs.saved import SavedRun, Verified
 
 SHARED = ("board_pitch", "board_expansion", "target_expansion")
@@ -327,6 +327,7 @@ class BudgetFile(ResultFile):
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"')
+    verdict: Use = Field("yes", description="the same in a word")
     reserved: bool = Field(False, description="whether that answer is to use it with care, also as a part")
     usable: bool = Field(description="false if the run must not be used: then no uncertainty is given")
     size_known: bool = Field(
@@ -436,6 +437,7 @@ class BudgetFile(ResultFile):
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
             use=answer.use,
+            verdict="no" if refused else answer.verdict,
             reserved=answer.reserved,
             usable=not refused,
             size_known=known,

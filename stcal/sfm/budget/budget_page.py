@@ -84,8 +84,7 @@ def budget_in_brief(file: BudgetFile) -> str:
 
 
 def _answer(file: BudgetFile) -> Answer:
-    word = "no" if not file.usable else "with care" if file.reserved else "yes"
-    return Answer(word, question="May the run be used?", said=file.use)
+    return Answer(file.verdict, question="May the run be used?", said=file.use)
 
 
 def _about(file: BudgetFile) -> str:
