@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -96,6 +97,7 @@ class Tried:
     partial: tuple[HandEye, ...] = ()
     shown: bool = False
     shown_without: tuple[bool, ...] = ()
+    KEYS: ClassVar = "candidate mean_mm reason"
 
     @property
     def mean_mm(self) -> float:

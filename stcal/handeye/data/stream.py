@@ -141,6 +141,15 @@ class Taken:
     why: tuple[str, ...]
     said: str
 
+    @property
+    def rows(self) -> list[int]:
+        """The places of the kept times."""
+        return np.flatnonzero(self.kept).tolist()
+
+    def left_out(self, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+        """Returns the names (k) of times without a pose, and why."""
+        return tuple((name, why) for name, why in zip(names, self.why, strict=True) if why)
+
 
 def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE_S) -> Taken:
     """Returns poses at times (k,) after the stream's origin. They are interpolated where the samples are close, else
