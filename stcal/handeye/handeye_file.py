@@ -156,7 +156,7 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        result, arm, held_out = outcome.result, outcome.arm, outcome.held_out
+        result, arm, held_out, pitch_mm = outcome.result, outcome.arm, outcome.held_out, outcome.pitch_mm
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
         if arm is not None:
             parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
@@ -177,7 +177,11 @@ class HandEyeFile(ResultFile):
             **result.transforms,
             "covariance": result.covariance,
             f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
-            "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": outcome.true_pitch_mm},
+            "board": {
+                "scale": result.scale,
+                "scale_sigma": result.sigma_scale,
+                "pitch_mm": pitch_mm and pitch_mm * result.scale,
+            },
             "camera": outcome.camera,
             "sigma": result.sigma,
             "estimated": result.estimated,

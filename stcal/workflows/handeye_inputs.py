@@ -315,9 +315,7 @@ class Files:
             return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
         self._require_no_images()
         source, stated = self.source, self.statements.setup
-        told = (
-            source if isinstance(source, ToldPairs) else read_pairs(source, self.statements, "image", self.quaternions)
-        )
+        told = source if isinstance(source, ToldPairs) else read_pairs(source, self.statements, self.quaternions)
         where = source.name if isinstance(source, Path) else told.pairs.where
         if stated and told.setup and stated != told.setup:
             raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")

@@ -430,7 +430,8 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays: dict[str, np.ndarray] = {}
     for key, item in parts.items():
-        if (array := numbers([_flat(value) for value in item] if isinstance(item, list) else item)) is None:
+        rows = [value if (of_pose := numbers(value)) is None else of_pose.ravel().tolist() for value in item]
+        if (array := numbers(rows if isinstance(item, list) else item)) is None:
             raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
         arrays[key] = array
     turn_key, at_key = sorted(arrays, key=lambda key: -arrays[key].size)
@@ -444,11 +445,6 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     require_finite(at, places, where)
     poses = Poses(proper(turn.reshape(-1, 3, 3), places, where), at)
     return PoseSide(poses, places, "3×3 matrices", frames=frames)
-
-
-def _flat(value: Any) -> Any:
-    array = numbers(value)
-    return value if array is None else array.ravel().tolist()
 
 
 def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | None:

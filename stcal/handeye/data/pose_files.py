@@ -377,12 +377,12 @@ class ToldPairs:
         return cls(pairs, (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines), **more)
 
 
-def read_pairs(source: Path | Table, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs:
+def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> ToldPairs:
     """Returns the pose pairs of one file, or of a table of the package's own.
 
     Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
     """
-    if isinstance(source, Table) or (content := read_content(source, statements, key, quaternions)) is None:
+    if isinstance(source, Table) or (content := read_content(source, statements, "image", quaternions)) is None:
         pairs = read_poses(source, quaternions)  # first: a table that is not understood states nothing
         require_unsaid(statements, str(source))
         return ToldPairs(pairs, ())
