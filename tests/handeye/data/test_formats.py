@@ -10,8 +10,8 @@ from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_robot
 from stcal.handeye.data.pose_partners import rows_of_images
 from stcal.workflows.handeye_inputs import Files, one_source
-from tests.handeye.test_cli import NOISE, poses_file
-from tests.handeye.written import FORMATS, REFUSED, easy_handeye, matrices
+from tests.handeye.test_cli import NOISE
+from tests.handeye.written import FORMATS, REFUSED, easy_handeye, matrices, poses_file
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.support.handeye import simulated
 
