@@ -18,16 +18,7 @@ from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
-from stcal.handeye.methods.closed_form import (
-    AX_XB,
-    AX_ZB,
-    EvolutionOptions,
-    Objective,
-    convex,
-    evolve,
-    polish,
-    solve_closed_form,
-)
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
 from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
@@ -337,18 +328,18 @@ class HandEyeProblem:
                     f"left for {method}; use method pose or shah",
                 )
         if method in (*AX_XB, *AX_ZB):
-            x, z = solve_closed_form(loop, method, unit_mm)
+            x, z = closed_form.solve_closed_form(loop, method, unit_mm)
         else:
             motions = Motions.consecutive(loop)
             if method == "zhao":
-                x = convex(motions, unit_mm)
+                x = closed_form.convex(motions, unit_mm)
             else:
-                objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
+                objective = closed_form.Objective(motions.with_log(method), unit_mm, evolution.weight)
                 about = any(b is not None and b.centre is None for b in (evolution.bounds_rad, evolution.bounds_mm))
-                known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if about else None
+                known_x = closed_form.solve_closed_form(loop, "park-martin", unit_mm)[0] if about else None
                 farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
-                x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
-                x = polish(objective, x) if method == "de-polished" else x
+                x = closed_form.evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
+                x = closed_form.polish(objective, x) if method == "de-polished" else x
             if method == "de":
                 notes = (*notes, OF_EVOLUTION)
             z = closed_form.mean_pose(loop.chain(x))

@@ -245,23 +245,18 @@ ROS = Known("m", "as in ROS", False)
 
 def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
     """Returns the poses in plain values; None where there are none."""
+    content = None
     if isinstance(value, Mapping):
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
-    elif not isinstance(value, list | np.ndarray) or not len(value):
-        return None
-    else:
-        content = _of_pairs(value, form, where) if isinstance(value, list) and isinstance(value[0], Mapping) else None
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        content = _of_pairs(value, form, where)
     if content is None and (side := _side_of(value, where)) is not None:
-        content = PoseContent(form, (side,))
-    if content is not None or not isinstance(value, Mapping):
-        return content
-    for key in HOLDERS:
-        if isinstance(value.get(key), Mapping | list | np.ndarray):
-            content = read_tree(value[key], form, statements, where)
-            if content is not None:
-                others = tuple(str(unused_key) for unused_key in value if unused_key != key)
-                return replace(content, passed_over=(*content.passed_over, *others))
-    return None
+        return PoseContent(form, (side,))
+    for key in HOLDERS if content is None and isinstance(value, Mapping) else ():
+        if (held := read_tree(value.get(key), form, statements, where)) is not None:
+            others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+            return replace(held, passed_over=(*held.passed_over, *others))
+    return content
 
 
 def numbers(value: Any) -> np.ndarray | None:

@@ -165,10 +165,8 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     for k, time in enumerate(seconds):
         reason = f"{gap_s[k]:.4g} s {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
         if covered[k]:
-            reason = (
-                f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed; the nearest sample is "
-            )
-            reason += f"{gap_s[k]:.4g} s away"
+            reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed"
+            reason += f"; the nearest sample is {gap_s[k]:.4g} s away"
         why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
     parts = [f"{same.sum()} at a sample"] if same.any() else []
     if between.any():
