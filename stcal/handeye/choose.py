@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -84,23 +85,29 @@ BY_VIEWS = (
 class Tried:
     """A way of solving that was tried.
 
-    ``error_mm`` : (s, k) its errors on held-out poses, (0, 0) if it fails, and then ``reason``; ``result`` : from all
+    ``error_mm`` : (s, k) its errors on held-out poses, (0, 0) if it fails by its ``error``; ``result`` : from all
     poses; ``partial`` : results without the poses of each split; ``shown`` : whether all poses contradict each file
     whose content is solved for; ``shown_without`` : (s,) whether the poses besides those of each split do.
     """
 
     candidate: Way
     error_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    reason: str = ""
     result: HandEye | None = None
     partial: tuple[HandEye, ...] = ()
     shown: bool = False
     shown_without: tuple[bool, ...] = ()
+    error: StcalError | None = None
+    KEYS: ClassVar = "candidate mean_mm reason"
 
     @property
     def mean_mm(self) -> float:
         """Mean of all errors, or NaN if there are none."""
         return float(self.error_mm.mean()) if self.error_mm.size else float("nan")
+
+    @property
+    def reason(self) -> str:
+        """Why the way fails; empty if it does not."""
+        return str(self.error or "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,17 +129,16 @@ class ChosenWay:
     notes: tuple[str, ...] = ()
 
 
-def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried | StcalError:
-    """Returns the results of a candidate from all poses and without those of each split, or the error if it fails."""
+def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried:
     try:
         solution = problem.solved(candidate.method)
         partial = tuple(solution.without(out) for out in rows)
     except StcalError as error:
-        return error
+        return Tried(candidate, error=error)
     errors = np.array([deciding_error(part, problem[out]) for part, out in zip(partial, rows, strict=True)])
     share = 1 - rows.shape[1] / len(problem)
     shown_without = tuple(_shown(part, problem, share) for part in partial)
-    return Tried(candidate, errors, "", solution.result, partial, _shown(solution.result, problem), shown_without)
+    return Tried(candidate, errors, solution.result, partial, _shown(solution.result, problem), shown_without)
 
 
 def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool:
@@ -163,7 +169,6 @@ def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tri
 
 
 def _first_of(tried: list[Tried], rows: np.ndarray) -> Tried:
-    """Returns the first of the tried that is not behind the best of them by more than chance."""
     best = min(tried, key=lambda each: float(each.error_mm[rows >= 0].mean()))
     return next(each for each in tried if _behind(each, best, rows) <= BY_CHANCE)
 
@@ -200,30 +205,29 @@ def choose(
     problem = problem.mended()
     for out in rows:
         with naming_held_out(problem, out):
-            problem.without(out).require_observable()
+            _ = problem.without(out).seen
     every, four_dof = BY_POSES if problem.views is None else BY_VIEWS, problem.options.four_dof
     candidates = [way for way in every if (prior or not way.camera) and not (four_dof and way in CLOSED_FORMS)]
     jobs = [(candidate.of(problem, prior), candidate, rows) for candidate in candidates]
-    finished: dict[Way, Tried | StcalError] = {}
+    finished: dict[int, Tried] = {}
     for i, found in run_parallel(_try, jobs, 1 if problem.views is None else workers):
-        if i == 0 and isinstance(found, StcalError):  # what the first one cannot use, the others should not
-            raise found
-        finished[candidates[i]] = found
+        if i == 0 and found.error:  # what the first one cannot use, the others should not
+            raise found.error
+        finished[i] = found
         progress(len(finished), len(jobs))
-    able = [each for candidate in candidates if isinstance(each := finished[candidate], Tried)]
+    tried = [finished[i] for i in range(len(jobs))]
+    able = [each for each in tried if not each.error]
     chosen = _best(able, rows)
     try:  # of a closed form the σ cost a solution for each pose: they are made for the chosen one alone
         result = _with_sigma(chosen, chosen.candidate.of(problem, prior))
     except StcalError as error:
-        finished[chosen.candidate] = error
+        tried[tried.index(chosen)] = Tried(chosen.candidate, error=error)
         able = [each for each in able if each.candidate not in CLOSED_FORMS]
         chosen = _best(able, rows)
         result = _with_sigma(chosen, problem)
     best_of_splits = (_best(able, rows, k).partial[k] for k in range(len(rows)))
     errors = [errors_of(part, problem[out]) for part, out in zip(best_of_splits, rows, strict=True)]
     held_out = HeldOutPoses.of_splits(rows, errors)
-    ways = ((way, finished[way]) for way in candidates)
-    tried = tuple(each if isinstance(each, Tried) else Tried(way, reason=str(each)) for way, each in ways)
     others = (each for each in able if each is not chosen and each.candidate not in CLOSED_FORMS)
     rivals = [each for each in others if _behind(each, chosen, rows) <= AS_GOOD]
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
@@ -231,7 +235,8 @@ def choose(
     result = replace(held_out, mount_from_camera=of_splits).widened(result)
     result, notes = widened(result, chosen.candidate, rivals)
     where = "of the board's origin" if problem.views is None else "at the board"
-    return ChosenWay(tried, chosen.candidate, result, held_out, _sentence(tried, chosen, result, where), notes)
+    sentence = _sentence(tried, chosen, result, where)
+    return ChosenWay(tuple(tried), chosen.candidate, result, held_out, sentence, notes)
 
 
 def _with_sigma(tried: Tried, problem: HandEyeProblem) -> HandEye:
@@ -261,7 +266,7 @@ def widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye,
     return result.widened(factor), tuple(notes)
 
 
-def _sentence(tried: tuple[Tried, ...], chosen: Tried, result: HandEye, where: str) -> str:
+def _sentence(tried: list[Tried], chosen: Tried, result: HandEye, where: str) -> str:
     """Returns the choice, its gain, and what it says about camera file, board and robot, in one sentence."""
     way, plain = chosen.candidate, tried[0]
     first = f"{len(tried)} ways of solving were compared by poses held out; the best, {way.in_words()}, errs by "

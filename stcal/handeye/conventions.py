@@ -127,15 +127,14 @@ def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, tu
     """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
     yield from _variants(loop, setup, by_images)
     for side, role in SIDES[: 1 if by_images else 2]:
-        read = _stated(loop, side)
         for one, other in permutations(ANGLES, 2):
             words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
-            changed = partial(lambda *of: _with_stated(loop, of[0], _with_angles(*of[1:])), side, read, one, other)
-            yield Candidate(words, changed, 1)
+            yield Candidate(words, _changed(loop, partial(_with_angles, one, other), side), 1)
+        read = loop.camera_from_board if side == "board" else _by_robot(loop)
         for names, places in other_axes(read.translation) if turns_agree else ():
             words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
-            changed = partial(_with_stated, loop, side, Poses(read.rotation, places))
-            yield Candidate(words, changed, 1)
+            placed = partial(lambda places, poses: Poses(poses.rotation, places), places)
+            yield Candidate(words, _changed(loop, placed, side), 1)
     if not turns_agree:
         opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
         other_loop, words = Loop.of(pairs, opposite), f"with --setup {opposite}"
@@ -144,7 +143,7 @@ def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, tu
             yield Candidate(f"{words} and {each.words}", each.change, 2)
 
 
-def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
+def _with_angles(read: str, meant: str, poses: Poses) -> Poses:
     """Returns poses whose angles were read in one sequence, or as rotation vectors, and meant in another."""
     rotation = Rotation.from_matrix(poses.rotation)
     with warnings.catch_warnings():
@@ -154,18 +153,21 @@ def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
     return Poses(turns.as_matrix(), poses.translation)
 
 
-def _stated(loop: Loop, side: str) -> Poses:
-    """Returns the poses of a side as their file states them."""
-    if side == "board":
-        return loop.camera_from_board
+def _by_robot(loop: Loop) -> Poses:
     return loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount
 
 
-def _with_stated(loop: Loop, side: str, poses: Poses) -> Loop:
-    """Returns the loop with other poses of a side, as a file would state them."""
-    if side == "board":
-        return replace(loop, camera_from_board=poses)
-    return replace(loop, stand_from_mount=poses.inverse() if loop.inverted else poses)
+def _changed(loop: Loop, change: Callable[[Poses], Poses], *sides: str) -> Callable[[], Loop]:
+    """Returns a function that gives the loop with changed poses of sides, as a file would state them."""
+
+    def changed() -> Loop:
+        hand, eye = loop.stand_from_mount, loop.camera_from_board
+        if "robot" in sides:
+            flange = change(_by_robot(loop))
+            hand = flange.inverse() if loop.inverted else flange
+        return replace(loop, stand_from_mount=hand, camera_from_board=change(eye) if "board" in sides else eye)
+
+    return changed
 
 
 def _inverted(loop: Loop, setup: Setup, by_images: bool) -> Candidate:
@@ -182,7 +184,7 @@ def _inverted(loop: Loop, setup: Setup, by_images: bool) -> Candidate:
     return Candidate(
         f"with one side inverted: either these are {named}: rename them in the file, or give --poses-are where the "
         f"file does not name them; or all are named rightly: give --setup {kind}",
-        lambda: replace(loop, camera_from_board=seen.inverse()),
+        _changed(loop, Poses.inverse, "board"),
     )
 
 
@@ -191,46 +193,43 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
     another order. ``by_images`` : the board's poses were computed here from images."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     yield _inverted(loop, setup, by_images)
-    places = {"robot": ("stand_from_mount", hand), "board": ("camera_from_board", eye)}
     # Residuals show only the ratio of two units; lengths beyond a hall tell which side it is.
     for (side, _), (other, role) in (SIDES, SIDES[::-1]):
         factor, which, times = 1000.0, side, "times"
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
-        if np.median(np.linalg.norm(places[other][1].translation, axis=1)) > HALL_MM:
+        if np.median(np.linalg.norm((eye if other == "board" else hand).translation, axis=1)) > HALL_MM:
             factor, which, times = 1e-3, other, "divided by"
             unit = f"{role}=mm"
             remedy = f"if they are mm, name the columns x_mm …, or give --length-unit {unit} where none states a unit"
-        name, poses = places[which]
-        scaled = partial(replace, loop, **{name: Poses(poses.rotation, factor * poses.translation)})
-        yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", scaled)
+        scaled = partial(lambda factor, poses: Poses(poses.rotation, factor * poses.translation), factor)
+        yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", _changed(loop, scaled, which))
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    seen = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
-    mirrored_board = partial(replace, loop, camera_from_board=seen)
+    mirrored_board = _changed(
+        loop, lambda seen: Poses(MIRROR @ seen.rotation @ MIRROR, seen.translation @ MIRROR), "board"
+    )
     yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", mirrored_board)
-    for which, late, robot_rows, board_rows in (
-        ("below", "robot's", slice(1, None), slice(-1)),
-        ("above", "board's", slice(-1), slice(1, None)),
-    ):
+    rows = slice(1, None), slice(-1)
+    for which, late, (of_robot, of_board) in (("below", "robot's", rows), ("above", "board's", rows[::-1])):
         yield Candidate(
             f"with each pose of the board beside that of the flange one row {which}: move the {late} poses up by one "
             "row, or the names of their images",
-            partial(Loop, hand[robot_rows], eye[board_rows], loop.inverted),
+            partial(Loop, hand[of_robot], eye[of_board], loop.inverted),
         )
     for reading in (*ORDERS, CONJUGATED):
         quaternions = f"quaternions {'conjugated' if reading.conjugated else 'in another order'}: if {reading.held}"
-        order, changed = "xyzw" if reading is LAST else "wxyz", loop
+        order = "xyzw" if reading is LAST else "wxyz"
         for side, role in SIDES[: 1 if by_images else 2]:
-            poses = reading.poses(_stated(loop, side))
             remedy = f"name the columns so; for a file without names of columns give --rotation {role}={order}"
             remedy = reading.remedy if reading.conjugated or by_images else remedy
-            yield Candidate(f"with the {side}'s {quaternions}, {remedy}", partial(_with_stated, loop, side, poses))
-            changed = _with_stated(changed, side, poses)
+            yield Candidate(f"with the {side}'s {quaternions}, {remedy}", _changed(loop, reading.poses, side))
         if not by_images:
-            yield Candidate(f"with all {quaternions}, {reading.remedy}", partial(replace, changed))
+            yield Candidate(
+                f"with all {quaternions}, {reading.remedy}", _changed(loop, reading.poses, "robot", "board")
+            )
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:

@@ -2,23 +2,24 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.choose import Way
+from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.pose_pairs import FRAMES, Setup
 from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.handeye_problem import HandEye
-from stcal.handeye.remarks import Finding, Word
-from stcal.handeye.validate import Compared
-from stcal.io.json import Finite, Matrix, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
+from stcal.handeye.remarks import Observability, Verdict
+from stcal.handeye.time_offset import TimeOffset
+from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
+from stcal.io.json import Finite, Matrix6, Named, NamedReason, Part, Pose, ResultFile, Vector3
 from stcal.io.static_transforms import (
     Static,
     fixed_joint,
@@ -33,29 +34,6 @@ from stcal.io.static_transforms import (
 from stcal.io.toml import opencv_matrix
 
 
-class HandEyeVerdictPart(Part):
-    word: Word
-    sentence: Annotated[str, BeforeValidator(lambda said: said if isinstance(said, str) else said())]
-    findings: list[Finding]
-
-
-class BoardSize(Part):
-    scale: float
-    scale_sigma: Finite
-    pitch_mm: float | None
-
-
-class AdjustedCamera(Part):
-    model: str
-    parameters: dict[str, float]
-    sigma: dict[str, float]
-
-
-class RmsResidual(Part):
-    rotation_rad: float
-    translation_mm: float
-
-
 class PoseRow(Part):
     name: str
     used: bool
@@ -64,73 +42,18 @@ class PoseRow(Part):
     corner_rms_px: Finite = None
 
 
-class HeldOutMeans(Part):
-    splits: int
-    poses: int
-    rotation_rad: float
-    translation_mm: float
-    board_mm: float | None = None
-    pose_mm: float | None = None
-    agreeing: dict[str, float] | None
-
-
-class HeldOutMotionErrors(Part):
-    fitted: int
-    names: list[tuple[str, str]]
-    rotation_rad: Vector
-    translation_mm: Vector
-
-
-class SeenTurns(Part):
-    turns_rad: Vector3
-    axes: Matrix3
-    sigma_rad: Finite
-    sigma_mm: Finite
-
-
-class SplitErrors(Part):
-    rows: Annotated[list[list[int]], BeforeValidator(lambda rows: np.asarray(rows).tolist())]
-    rotation_rad: Matrix
-    translation_mm: Matrix
-    board_mm: Matrix | None
-    pose_mm: Matrix | None
+SPLITS = Named("rows rotation_rad translation_mm board_mm pose_mm")
 
 
 class MethodRow(Part):
     method: str
     reason: str
-    held_out: HeldOutMeans | None
+    held_out: dict[str, Any] | None
     flange_from_camera: Pose | None = None
     base_from_camera: Pose | None = None
     base_from_board: Pose | None = None
     flange_from_board: Pose | None = None
-    splits: SplitErrors | None
-
-
-class TriedRow(Part):
-    candidate: Way
-    mean_mm: Finite
-    reason: str
-
-
-class ChosenWayPart(Part):
-    chosen: Way
-    sentence: str
-    tried: list[TriedRow]
-
-
-class ArmPart(Part):
-    robot: str
-    parameters: dict[str, float]
-    sigma: dict[str, float]
-    plain: HeldOutMeans | None
-
-
-class TimeOffsetPart(Part):
-    seconds: float
-    sigma_s: float
-    speed_mm_s: float
-    speed_rad_s: float
+    splits: Annotated[HeldOutPoses, SPLITS] | None
 
 
 MEANS = "`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`"
@@ -142,7 +65,7 @@ class HandEyeFile(ResultFile):
     format: Literal["stcal handeye 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
     where: str = Field(alias="from", description="names of the files")
-    verdict: HandEyeVerdictPart = Field(
+    verdict: Annotated[Verdict, Named("word sentence findings")] = Field(
         description="`word`: `good`, `use with care` or `do not use`; a `sentence` with the reasons; `findings`, each "
         "with `title`, `word`, what was `said`, `value` and `limit`, `remedy`"
     )
@@ -158,11 +81,11 @@ class HandEyeFile(ResultFile):
     base_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     flange_from_board: Pose | None = Field(None, description="`Z` of eye-to-hand")
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
-    board: BoardSize = Field(
+    board: dict[str, Any] = Field(
         description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
         "dots or squares, times `scale`; null for tags and poses"
     )
-    camera: AdjustedCamera | None = Field(
+    camera: dict[str, Any] | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
         "s1 … s4, OpenCV pixel origin; `sigma` of those of the model"
     )
@@ -175,7 +98,7 @@ class HandEyeFile(ResultFile):
     )
     estimated: list[str] = Field(description="which of them were estimated")
     corner_px_is_factor: bool = Field(description="whether `corner_px` is the factor of the corners' own σ")
-    rms: RmsResidual = Field(description="`rotation_rad`, `translation_mm` of the residuals of the poses used")
+    rms: dict[str, Any] = Field(description="`rotation_rad`, `translation_mm` of the residuals of the poses used")
     poses: list[PoseRow] = Field(
         description="`name` (`line 7`, or the image), `used`, residual `rotation_rad` (rotation vector) and "
         "`translation_mm` at the board's origin, by which the chain through this pose misses `Z`; with method "
@@ -183,42 +106,42 @@ class HandEyeFile(ResultFile):
     )
     outliers: list[str] = Field(description="names of poses that contradict the others and were left out")
     left_out: list[NamedReason] = Field(description="`name`, `reason` of images and rows that did not take part")
-    held_out: HeldOutMeans | None = Field(
+    held_out: dict[str, Any] | None = Field(
         description="`splits`, `poses` in each, and means: `rotation_rad`, `translation_mm` of the board's origin; "
         "with images `board_mm`: the distance from each corner to the point where the camera's ray to it meets the "
         "board as placed by the robot, mean over the corners, and `pose_mm`: distance of the corners by the robot "
         "from those by the pose that the image gives alone; `agreeing`: means without `outliers`, null without any"
     )
-    motions: HeldOutMotionErrors | None = Field(
+    motions: Annotated[HeldOutMotions, Named()] | None = Field(
         None,
         description="with `--motions-held-out`: number of `fitted` motions; `names` of the poses from which and to "
         "which each other motion leads, and errors `rotation_rad`, `translation_mm` of X B X⁻¹ against A",
     )
-    arm: ArmPart | None = Field(
+    arm: dict[str, Any] | None = Field(
         None,
         description="with `--with-kinematics`: name of the `robot`, `parameters` by which its axes are off its file, "
         "small motions of their frames (`J2 rx`: rad, `J2 x`: mm), their `sigma`, and `plain`: as `held_out` "
         f"({MEANS}), on the same poses, of the solution without them",
     )
-    choice: ChosenWayPart | None = Field(
+    choice: Annotated[ChosenWay, Named("chosen sentence tried")] | None = Field(
         None,
         description="where no method was named: the way of solving that was `chosen` by errors on poses held out "
         "(`method`, and whether `camera` and `scale` were solved for), a `sentence` on it, and all that were `tried`: "
         "`candidate`, `mean_mm` (3-D at the board; of poses, of the board's origin), `reason` why it fails",
     )
-    time_offset: TimeOffsetPart | None = Field(
+    time_offset: Annotated[TimeOffset, Named("seconds sigma_s speed_mm_s speed_rad_s")] | None = Field(
         None,
         description="with `--time-offset`: `seconds` by which the robot's clock is ahead of the camera's, so that an "
         "image stamped t was taken at t + `seconds` of the robot's; `sigma_s`, which σ of `X` and `Z` hold; RMS "
         "`speed_mm_s`, `speed_rad_s` of the flange at the images",
     )
-    observability: SeenTurns | None = Field(
+    observability: Annotated[Observability, Named("turns_rad axes sigma_rad sigma_mm")] | None = Field(
         description="`turns_rad` RMS between poses about the principal `axes`, rows, of the flange; `sigma_rad`, "
         "`sigma_mm` of the worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
     understood: list[str] = Field([], description="only of files of other programs: what each was taken for")
-    splits: SplitErrors | None = Field(
+    splits: Annotated[HeldOutPoses, SPLITS] | None = Field(
         None,
         description="only in `--json`: `rows` of `poses` that each split held out, and the errors of each: "
         "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`",
@@ -233,7 +156,7 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        result, arm, held_out = outcome.result, outcome.arm, outcome.held_out
+        result, arm, held_out, pitch_mm = outcome.result, outcome.arm, outcome.held_out, outcome.pitch_mm
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
         if arm is not None:
             parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
@@ -254,12 +177,16 @@ class HandEyeFile(ResultFile):
             **result.transforms,
             "covariance": result.covariance,
             f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
-            "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": outcome.true_pitch_mm},
+            "board": {
+                "scale": result.scale,
+                "scale_sigma": result.sigma_scale,
+                "pitch_mm": pitch_mm and pitch_mm * result.scale,
+            },
             "camera": outcome.camera,
             "sigma": result.sigma,
             "estimated": result.estimated,
             "corner_px_is_factor": outcome.own_sigmas,
-            "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
+            "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),
             "poses": poses,
             "outliers": outcome.outliers(),
             "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],

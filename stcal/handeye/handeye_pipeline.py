@@ -114,11 +114,6 @@ class Outcome:
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
 
     @property
-    def true_pitch_mm(self) -> float | None:
-        """Pitch of dots or squares in the board's true size."""
-        return None if self.pitch_mm is None else self.pitch_mm * self.result.scale
-
-    @property
     def camera(self) -> dict | None:
         """COLMAP ``model``, ``parameters`` and their ``sigma`` by name, of intrinsics that were solved for."""
         found = self.result.reprojection

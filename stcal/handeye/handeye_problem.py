@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,16 +18,7 @@ from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.bundle import ROBOT, ArmModel
-from stcal.handeye.methods.closed_form import (
-    AX_XB,
-    AX_ZB,
-    EvolutionOptions,
-    Objective,
-    convex,
-    evolve,
-    polish,
-    solve_closed_form,
-)
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
 from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
@@ -215,7 +206,7 @@ class HandEyeOptions(ByValue):
         return bool(self.intrinsics or self.with_scale or self.four_dof or self.arm)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class HandEyeProblem:
     """What is solved: ``pairs`` of poses in a ``setup``, the ``views`` from which they were computed, and ``options``;
     ``notes`` : on repairs; ``part`` : whether the poses are a part of others, of which conventions were judged."""
@@ -239,10 +230,15 @@ class HandEyeProblem:
         """Returns the problem without the poses ``out``, (k,)."""
         return replace(self[np.setdiff1d(np.arange(len(self)), out)], part=True)
 
-    @property
+    @cached_property
     def loop(self) -> Loop:
         """The poses in the terms of the equation."""
         return Loop.of(self.pairs, self.setup)
+
+    @cached_property
+    def seen(self) -> Observability:
+        """What the poses determine; raises DegenerateError if that is not enough."""
+        return check(self.loop, self.setup, self.pairs.where, self.options.four_dof)
 
     def mended(self) -> "HandEyeProblem":
         """Returns the problem with the numberings of a symmetric board corrected, and a note on that."""
@@ -251,10 +247,6 @@ class HandEyeProblem:
         mended = repair(self.pairs, self.setup, self.options.symmetries, self.views)
         options, notes = replace(self.options, symmetries=()), (*self.notes, *mended.notes())
         return replace(self, pairs=mended.pairs, views=mended.views, options=options, notes=notes)
-
-    def require_observable(self) -> Observability:
-        """Returns what the poses determine; raises DegenerateError if that is not enough."""
-        return check(self.loop, self.setup, self.pairs.where, self.options.four_dof)
 
     def solved(self, method: str | None = None) -> "Solved":
         """Returns the result of one method, ``reprojection`` with views, else ``pose``, if None, with the state from
@@ -271,7 +263,7 @@ class HandEyeProblem:
         if options.arm is not None and method != "reprojection":
             said = f"hand-eye: {method} does not solve for the arm; give views, and method reprojection"
             raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
-        seen = self.require_observable()
+        seen = self.seen  # what the poses must determine
         if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
             said = f"{len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
             raise DegenerateError("E-HANDEYE-FEW-POSES", f"{pairs.where}: {said}")
@@ -285,56 +277,17 @@ class HandEyeProblem:
                 return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
             return closed_form.robust(loop, with_scale)
 
-        loop, by_images = problem.loop, problem.views is not None
         if not self.part:
-            doubts = check_conventions(problem.pairs, loop, self.setup, guess, options.with_scale, by_images)
+            by_images = problem.views is not None
+            doubts = check_conventions(problem.pairs, problem.loop, self.setup, guess, options.with_scale, by_images)
             problem = replace(problem, notes=(*problem.notes, *doubts))
-        task = _Task(problem, loop, seen)
         if method not in SCALED:
-            return task.by_equations(method)
-        first = guess(loop, options.with_scale)
-        return (
-            task.by_poses(first) if problem.views is None or method == "pose" else task.by_views(first, problem.views)
-        )
+            x, z, notes = problem._by_equations(method)
+            return problem._solved(method, x, z, problem.loop.residuals(x, z), notes)
+        first, views = guess(problem.loop, options.with_scale), problem.views
+        return problem._by_poses(first) if views is None or method == "pose" else problem._by_views(first, views)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solved:
-    """``result`` of a ``task``, and the ``solution`` behind it where the method adjusts poses or corners."""
-
-    task: "_Task"
-    result: HandEye
-    solution: PoseSolution | AdjustedCorners | None = None
-
-    def without(self, out: np.ndarray) -> HandEye:
-        """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
-        all poses. Adjustments take one step; other methods are solved again. Raises StcalError: they fail."""
-        task, solution, board = self.task, self.solution, None
-        if solution is None:
-            problem = task.problem.without(out)
-            again = replace(task, problem=problem, loop=problem.loop).by_equations(self.result.method).result
-            x, z = again.mount_from_camera, again.stand_from_board
-            return replace(self.result, mount_from_camera=x, stand_from_board=z)
-        if isinstance(solution, AdjustedCorners):
-            state = solution.without(out)
-            board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
-        else:
-            state = solution.without(task.loop, out)
-        x, z = state.mount_from_camera, state.stand_from_board
-        if task.problem.options.four_dof:
-            x, z = closed_form.slid(x, z, task.seen.mount_axis, task.loop)
-        return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Task:
-    """A ``problem`` after repair, with its ``loop``, and what its poses determine, ``seen``."""
-
-    problem: HandEyeProblem
-    loop: Loop
-    seen: Observability
-
-    def solved(
+    def _solved(
         self,
         method: str,
         x: Rigid,
@@ -344,9 +297,9 @@ class _Task:
         covariance: np.ndarray | None = None,
         solution: PoseSolution | AdjustedCorners | None = None,
         **more: Any,
-    ) -> Solved:
+    ) -> "Solved":
         """Returns X and Z as a result, with their ``covariance`` (12, 12) or more; ``more`` : further fields of it."""
-        names = self.problem.pairs.names
+        names = self.pairs.names
         outliers = np.zeros(len(names), bool)
         if solution is not None:
             outliers, notes = solution.outliers, notes if solution.settled else (*notes, UNSETTLED)
@@ -354,11 +307,11 @@ class _Task:
         if covariance is not None:
             more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
         more |= {"observability": self.seen, "notes": notes}
-        return Solved(self, HandEye(method, self.problem.setup, x, z, residuals, names, outliers, **more), solution)
+        return Solved(self, HandEye(method, self.setup, x, z, residuals, names, outliers, **more), solution)
 
-    def by_equations(self, method: str) -> Solved:
-        """Solves AX = XB or AX = ZB by the named method."""
-        options, pairs, loop, notes = self.problem.options, self.problem.pairs, self.loop, self.problem.notes
+    def _by_equations(self, method: str) -> tuple[Rigid, Rigid, tuple[str, ...]]:
+        """Returns X and Z, by AX = XB or AX = ZB and the named method, and notes."""
+        options, pairs, loop, notes = self.options, self.pairs, self.loop, self.notes
         if options.four_dof:
             said = f"hand-eye: {method} needs turns about two axes; of four axes use pose"
             raise DegenerateError("E-HANDEYE-AXES", said)
@@ -375,37 +328,38 @@ class _Task:
                     f"left for {method}; use method pose or shah",
                 )
         if method in (*AX_XB, *AX_ZB):
-            x, z = solve_closed_form(loop, method, unit_mm)
+            x, z = closed_form.solve_closed_form(loop, method, unit_mm)
         else:
             motions = Motions.consecutive(loop)
             if method == "zhao":
-                x = convex(motions, unit_mm)
+                x = closed_form.convex(motions, unit_mm)
             else:
-                objective = Objective(motions.with_log(method), unit_mm, evolution.weight)
-                known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if evolution.needs_closed_form() else None
+                objective = closed_form.Objective(motions.with_log(method), unit_mm, evolution.weight)
+                about = any(b is not None and b.centre is None for b in (evolution.bounds_rad, evolution.bounds_mm))
+                known_x = closed_form.solve_closed_form(loop, "park-martin", unit_mm)[0] if about else None
                 farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
-                x = evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
-                x = polish(objective, x) if method == "de-polished" else x
+                x = closed_form.evolve(objective, evolution, float(np.linalg.norm(farthest, axis=1).max()), known_x)
+                x = closed_form.polish(objective, x) if method == "de-polished" else x
             if method == "de":
                 notes = (*notes, OF_EVOLUTION)
             z = closed_form.mean_pose(loop.chain(x))
-        return self.solved(method, x, z, self.loop.residuals(x, z), notes)
+        return x, z, notes
 
-    def by_poses(self, first: LoopState) -> Solved:
+    def _by_poses(self, first: LoopState) -> "Solved":
         """Solves by least squares of the poses' errors, from ``first`` X, Z and scale."""
-        problem, options, loop, scaled = self.problem, self.problem.options, self.loop, self.problem.options.with_scale
-        solution, noise, notes = self.by_true_robot(lambda loop, noise: adjust_poses(loop, first, noise, scaled))
+        options, loop, scaled = self.options, self.loop, self.options.with_scale
+        solution, noise, notes = self._by_true_robot(lambda loop, noise: adjust_poses(loop, first, noise, scaled))
         state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
-        notes, covariance, common = problem.notes + notes, generalised_inverse(solution.normal), None
+        notes, covariance, common = self.notes + notes, generalised_inverse(solution.normal), None
         if not options.four_dof and (clusters := by_places(loop, solution)):
             covariance, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
         sigma_scale = float(np.sqrt(covariance[12, 12])) if scaled else None
         if sigma_scale is not None:
-            require_scale(state.scale, sigma_scale, loop, problem.pairs.where)
+            require_scale(state.scale, sigma_scale, loop, self.pairs.where)
         if options.four_dof:
-            x, z, covariance, notes = self.without_slide(x, z, solution.normal)
+            x, z, covariance, notes = self._without_slide(x, z, solution.normal)
         inverse = covariance
-        notes += self.remarks(x, solution.outliers, solution.residuals, solution.scale_hint)
+        notes += self._remarks(x, solution.outliers, solution.residuals, solution.scale_hint)
         if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
             notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
         if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -418,31 +372,31 @@ class _Task:
         if loop.camera_common is not None:
             added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
             common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
-        if problem.views is not None and options.camera is not None:
-            error = of_poses(loop, solution, problem.views, options.camera)
+        if self.views is not None and options.camera is not None:
+            error = of_poses(loop, solution, self.views, options.camera)
             covariance = covariance + error.covariance(inverse) - inverse
         stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
         sigma = {name: value for name, value in stated.items() if value} | solution.sigma
         more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
         more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
-        return self.solved("pose", x, z, solution.residuals, notes, **more)
+        return self._solved("pose", x, z, solution.residuals, notes, **more)
 
-    def by_views(self, first: LoopState, views: Views) -> Solved:
+    def _by_views(self, first: LoopState, views: Views) -> "Solved":
         """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
-        options, pairs = self.problem.options, self.problem.pairs
+        options, pairs = self.options, self.pairs
 
         def adjusted(loop: Loop, noise: Noise) -> AdjustedCorners:
             prior, scaled, flange = options.intrinsics, options.with_scale, pairs.base_from_flange
             return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera, options.arm)
 
-        solution, _, notes = self.by_true_robot(adjusted)
+        solution, _, notes = self._by_true_robot(adjusted)
         state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
         if sigma_scale is not None:
             require_scale(state.scale, sigma_scale, self.loop, pairs.where)
         x, z = state.mount_from_camera, state.stand_from_board
-        notes, covariance = self.problem.notes + notes, solution.covariance
+        notes, covariance = self.notes + notes, solution.covariance
         if options.four_dof:
-            x, z, covariance, notes = self.without_slide(x, z, solution.normal())
+            x, z, covariance, notes = self._without_slide(x, z, solution.normal())
         if solution.camera_error is not None:
             covariance = solution.camera_error.covariance(covariance)
         closed = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
@@ -455,7 +409,7 @@ class _Task:
                 covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
                 if sigma_scale is not None:
                     sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
-        notes += self.remarks(x, outliers, residuals, solution.scale_hint)
+        notes += self._remarks(x, outliers, residuals, solution.scale_hint)
         if solution.camera_gain > CAMERA_GAIN:
             notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
         doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
@@ -464,12 +418,12 @@ class _Task:
             notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
         more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
         more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
-        return self.solved("reprojection", x, z, residuals, notes, **more)
+        return self._solved("reprojection", x, z, residuals, notes, **more)
 
-    def by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
         """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
         contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
-        noise, loop = self.problem.options.noise, self.loop
+        noise, loop = self.options.noise, self.loop
         solution, stated = solved(loop, noise), loop.robot_covariance
         if stated is not None:
             rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
@@ -502,13 +456,13 @@ class _Task:
         )
         return free, unknown, (note,)
 
-    def remarks(
+    def _remarks(
         self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
     ) -> tuple[str, ...]:
         """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
-        if self.problem.part:
+        if self.part:
             return ()
-        pairs, options, loop, good = self.problem.pairs, self.problem.options, self.loop, ~outliers
+        pairs, options, loop, good = self.pairs, self.options, self.loop, ~outliers
         tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
         notes = remarks.of_outliers(pairs.names, outliers, residuals, tilted)
         moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
@@ -517,13 +471,41 @@ class _Task:
             notes += remarks.of_size(loop[good], hint, options.noise)
         return notes + remarks.of_distance(loop)
 
-    def without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
+    def _without_slide(
+        self, x: Rigid, z: Rigid, normal: np.ndarray
+    ) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
         """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
-        axis, frames = self.seen.mount_axis, FRAMES[self.problem.setup]
+        axis, frames = self.seen.mount_axis, FRAMES[self.setup]
         x, z = closed_form.slid(x, z, axis, self.loop)
         held = normal.copy()
         held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
         note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which "
         note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along "
         note += "that axis"
-        return x, z, generalised_inverse(held), (*self.problem.notes, note)
+        return x, z, generalised_inverse(held), (*self.notes, note)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """``result`` of a ``problem``, and the ``solution`` behind it where the method adjusts poses or corners."""
+
+    problem: HandEyeProblem
+    result: HandEye
+    solution: PoseSolution | AdjustedCorners | None = None
+
+    def without(self, out: np.ndarray) -> HandEye:
+        """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
+        all poses. Adjustments take one step; other methods are solved again. Raises StcalError: they fail."""
+        problem, solution, board = self.problem, self.solution, None
+        if solution is None:
+            x, z, _ = problem.without(out)._by_equations(self.result.method)
+            return replace(self.result, mount_from_camera=x, stand_from_board=z)
+        if isinstance(solution, AdjustedCorners):
+            state = solution.without(out)
+            board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
+        else:
+            state = solution.without(problem.loop, out)
+        x, z = state.mount_from_camera, state.stand_from_board
+        if problem.options.four_dof:
+            x, z = closed_form.slid(x, z, problem.seen.mount_axis, problem.loop)
+        return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)

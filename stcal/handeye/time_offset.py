@@ -105,8 +105,7 @@ def estimate_offset(
                 f"{np.degrees(noises[0]):.2g}°: no time offset can be determined; leave --time-offset out, or take "
                 "images while the robot moves",
             )
-    offset = _scanned(pairs, stream, seconds, setup, with_scale)
-    state = None
+    offset, state = _scanned(pairs, stream, seconds, setup, with_scale), None
     for _ in range(ROUNDS):
         within = _inside(stream, seconds + offset)
         if within.sum() < LEAST_POSES:

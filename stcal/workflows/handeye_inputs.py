@@ -12,19 +12,19 @@ from stcal.boards.target_file import load_boards
 from stcal.errors import InputError
 from stcal.geometry.arrays import TWIST, require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
-from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.data.pose_content import Said, require_each_once
+from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views
+from stcal.handeye.data.pose_content import PoseSide, Said, require_each_once
 from stcal.handeye.data.pose_files import (
     ToldPairs,
     own_told,
-    partners,
     read_pairs,
     read_robot,
     read_two,
     require_own,
-    trailing_number,
+    require_unsaid,
 )
-from stcal.handeye.data.pose_pairs import SIDES, Setup, read_side
+from stcal.handeye.data.pose_pairs import Setup
+from stcal.handeye.data.pose_partners import rows_of_images
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import motions_missing
@@ -32,7 +32,8 @@ from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
-from stcal.io.table import LENGTHS, Table, read_table
+from stcal.io.rotations import places_of
+from stcal.io.table import Table, read_table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain
@@ -40,113 +41,6 @@ from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, fla
 from stcal.robot.kinematics.measurements import joint_values
 from stcal.robot.kinematics.robot_model import Chain
 from stcal.workflows.board_views import Board, detect_boards, kind_of
-
-TIME = "time_s"
-"""Column of a stream of poses, in place of ``image``."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RobotPoses:
-    """``images`` : image of each pose; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` :
-    place of each pose in ``where``, for messages; ``understood`` : how the file was read; ``own`` : whether it is a
-    table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images``, the
-    poses belong to the images in their order. At the times of images: ``left_out`` : (image, why); ``stream``,
-    ``seconds`` : the stream and the time of each image, by name."""
-
-    images: tuple[str, ...]
-    base_from_flange: Poses
-    covariance: np.ndarray | None
-    places: tuple[str, ...]
-    where: str
-    understood: str = ""
-    own: bool = True
-    timed: bool = False
-    left_out: tuple[tuple[str, str], ...] = ()
-    stream: Stream | None = None
-    seconds: dict[str, float] | None = None
-
-    @property
-    def file(self) -> str:
-        return Path(self.where.removeprefix("robot poses ")).name
-
-    def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
-        """Returns the row by image, the images of rows without a partner, and how they were matched.
-
-        The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
-        the ends of names; poses without names, by order. The last result is empty where images are matched by name.
-        """
-        if not self.images:
-            if len(names) != len(self.base_from_flange):
-                raise InputError(
-                    "E-NAMES-COUNT",
-                    f"{self.where}: {len(self.base_from_flange)} poses without names for {len(names)} images; as many, "
-                    "or a name for each, needed",
-                )
-            numbers = [trailing_number(name) for name in names]
-            order = list(range(len(names)))
-            if None not in numbers and len(set(numbers)) == len(numbers):
-                order.sort(key=lambda i: numbers[i] or 0)
-            description = f"by order, for the poses have no names: {self.places[0]} is of {names[order[0]]}"
-            return {names[i]: row for row, i in enumerate(order)}, (), description
-        rows, missing = self.rows(names)
-        if rows or (matches := partners(self.images, names)) is None:
-            return rows, missing, ""
-        rows = {names[j]: i for i, j in matches[0]}
-        used = set(rows.values())
-        return rows, tuple(name for i, name in enumerate(self.images) if i not in used), matches[1]
-
-    def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
-        """Returns the row of each of ``names`` that has one, and the images of rows that are not among them. Names may
-        lack folder and ending where that leaves one image."""
-        short: dict[str, list[str]] = {}
-        for name in names:
-            file_name = name.rsplit("/", 1)[-1]
-            for key in {file_name, file_name.rsplit(".", 1)[0]}:
-                short.setdefault(key, []).append(name)
-        row_of_image, missing = {}, []
-        for row, image in enumerate(self.images):
-            fitting = [image] if image in names else short.get(image, [])
-            if len(fitting) > 1:
-                raise InputError(
-                    "E-IMAGE-NAME-AMBIGUOUS",
-                    f"{self.where}: {self.places[row]}: {image} may be {fitting[0]} or {fitting[1]}; give its path",
-                )
-            if fitting and fitting[0] in row_of_image:
-                both = f"{self.places[row_of_image[fitting[0]]]} and {self.places[row]}"
-                raise InputError(
-                    "E-POSE-REPEATED", f"{self.where}: {both}: both are of image {fitting[0]!r}; one row needed"
-                )
-            if fitting:
-                row_of_image[fitting[0]] = row
-            else:
-                missing.append(image)
-        return row_of_image, tuple(missing)
-
-
-def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: Said | None = None) -> RobotPoses:
-    """Read the robot's poses in any format of :mod:`stcal.handeye.data.pose_files`.
-
-    A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
-
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
-    ``statements`` : the user's statements about what a file of another program does not state itself.
-    """
-    path, statements = Path(path), statements or Said()
-    poses = read_robot(path, statements, "image", quaternions)
-    where = f"robot poses {path}"
-    if poses is not None:
-        return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
-    if statements.options():
-        require_own(path, quaternions)
-        _require_unsaid(statements, where)
-    table = read_table(path, "robot poses", quaternions)
-    timed = "image" not in table and TIME in table
-    images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
-    require_each_once(images, places, table.where, "image ")
-    poses, covariance, _ = read_side(table, *SIDES[0])
-    frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
-    understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
-    return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,69 +54,55 @@ class Timing:
     offset: bool = False
 
 
-def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> RobotPoses:
-    """Returns poses at the times of images, where both have times that are not simply equal; as they are if ``timing``
-    is None. Raises InputError: an option needs times, or no image lies within the stream."""
-    if timing is None:
-        return robot
-    images = _times_of_images(names, timing)
-    samples = [time_of(name) for name in robot.images] if robot.timed else stamps_of(robot.images)
-    needed = timing.offset or timing.image_times or robot.timed
-    if needed and images is None:
-        raise InputError(
-            "E-IMAGE-NAME-TIME",
-            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); name "
-            "images by seconds (1689.25.png), or give --image-times",
-        )
-    if needed and (samples is None or None in samples):
-        first = f", but {robot.images[0]} …" if robot.images else ""
-        raise InputError(
-            "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
-        )
-    if images is None or samples is None or None in samples:
-        return robot
-    if not robot.timed and any(stem_of(name) != name for name in robot.images):  # poses of images by their names
-        return robot
-    times = [time for time in samples if time is not None]
-    exact = not timing.offset and all(time in times for time in images.values())
-    if exact:  # rows without an image are no mistake
-        rows = [times.index(time) for time in images.values()]
-        robot_then = replace(
-            robot,
-            images=tuple(images),
-            base_from_flange=robot.base_from_flange[rows],
-            covariance=None if robot.covariance is None else robot.covariance[rows],
-            places=tuple(robot.places[i] for i in rows),
-            understood=f"{robot.understood}; {len(rows)} of them at the times of images",
-            own=False,
-            timed=False,
-        )
-        if not len(images) < len(times) == len(set(times)):
-            return robot_then
-    stream = Stream.of(times, robot.base_from_flange, robot.file)
-    seconds = stream.after_origin(list(images.values()))
-    clock = {"stream": stream, "seconds": dict(zip(images, seconds.tolist(), strict=True))}
-    if exact:
-        return replace(robot_then, **clock)
-    interpolated, seen = taken_at(stream, seconds, timing.tolerance_s), list(images)
-    if not interpolated.kept.any():
-        raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {seen[0]}: {interpolated.why[0]}")
-    kept = tuple(seen[i] for i in np.flatnonzero(interpolated.kept))
+LeftOut = tuple[tuple[str, str], ...]
+"""Names of images or rows, and why they do not take part."""
+Clock = tuple[Stream, dict[str, float]]
+"""The robot's stream, and the time of each image after its origin, by name."""
+
+
+def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tuple[PoseSide, LeftOut, Clock | None]:
+    """Returns poses at the times of images, where both have times that are not simply equal; else as they are. Raises
+    InputError: an option needs times, or no image lies within the stream."""
+    images, where = _times_of_images(names, timing), f"robot poses {robot.where}"
+    samples = [time_of(name) for name in robot.names] if robot.timed else stamps_of(robot.names)
+    known = [] if samples is None else [time for time in samples if time is not None]
+    untimed = not known or len(known) < len(robot)
+    if timing.offset or timing.image_times or robot.timed:
+        if images is None:
+            said = f"its name is not a time, but the robot's poses are matched by time ({Path(robot.where).name}); name"
+            remedy = "images by seconds (1689.25.png), or give --image-times"
+            raise InputError("E-IMAGE-NAME-TIME", f"image {names[0]}: {said} {remedy}")
+        if untimed:
+            first = f", but {robot.names[0]} …" if robot.names else ""
+            said = f"{where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
+            raise InputError("E-POSES-UNTIMED", said)
+    by_name = not robot.timed and any(stem_of(name) != name for name in robot.names)
+    if images is None or untimed or by_name:
+        return robot, (), None
+
+    def clock() -> Clock:
+        stream = Stream.of(known, robot.poses, Path(robot.where).name)
+        return stream, dict(zip(images, stream.after_origin(list(images.values())).tolist(), strict=True))
+
+    read = {"own": False, "timed": False}
+    if not timing.offset and all(time in known for time in images.values()):  # rows without an image are no mistake
+        rows = [known.index(time) for time in images.values()]
+        read |= {
+            "names": tuple(images),
+            "understood": f"{robot.understood}; {len(rows)} of them at the times of images",
+        }
+        dense = len(images) < len(known) == len(set(known))
+        return replace(robot[rows], **read), (), clock() if dense else None
+    stream, seconds = clock()
+    taken, seen = taken_at(stream, np.array(list(seconds.values())), timing.tolerance_s), tuple(images)
+    if not taken.kept.any():
+        raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {seen[0]}: {taken.why[0]}")
+    kept = tuple(seen[i] for i in taken.rows)
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    left_out = [(name, why) for name, why in zip(seen, interpolated.why, strict=True) if why]
-    left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
-    return replace(
-        robot,
-        images=kept,
-        base_from_flange=interpolated.base_from_flange,
-        covariance=None,
-        places=tuple(f"time of {name}" for name in kept),
-        understood=f"{robot.understood}{note}; {interpolated.said}",
-        own=False,
-        timed=False,
-        left_out=tuple(left_out),
-        **clock,
-    )
+    read |= {"names": kept, "places": tuple(f"time of {name}" for name in kept), "covariance": None}
+    read |= {"poses": taken.base_from_flange, "understood": f"{robot.understood}{note}; {taken.said}"}
+    untimed_images = tuple((name, f"no time in {timing.image_times}") for name in names if name not in images)
+    return replace(robot, **read), taken.left_out(seen) + untimed_images, (stream, seconds)
 
 
 def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:
@@ -238,19 +118,13 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     for name in names:
         file_name = name.rsplit("/", 1)[-1]
         text = next((stated[key] for key in (name, file_name, file_name.rsplit(".", 1)[0]) if key in stated), None)
-        if text is None:
-            continue
-        time = time_of(text)
-        if time is None:
-            raise InputError(
-                "E-TABLE-NUMBER", f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed"
-            )
-        time_of_image[name] = time
+        if text is not None and (time := time_of(text)) is None:
+            said = f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed"
+            raise InputError("E-TABLE-NUMBER", said)
+        time_of_image |= {} if text is None else {name: time}
     if not time_of_image:
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here",
-        )
+        said = f"no row is of an image: {next(iter(stated))} … there, {names[0]} … here"
+        raise InputError("E-POSES-UNMATCHED", f"{table.where}: {said}")
     return time_of_image
 
 
@@ -293,18 +167,18 @@ class Arm:
         return replace(self.robot, world_from_base=Rigid()).chain()
 
 
-def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
+def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[PoseSide, Arm]:
     """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV).
 
     Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
     """
     table = read_table(path, "robot poses", quaternions)
     arm = Arm(robot, joint_values(table, robot))
-    images, places = tuple(table.text("image")), tuple(f"line {line}" for line in table.lines)
+    images, places = tuple(table.text("image")), places_of(table)
     require_each_once(images, places, table.where, "image ")
     understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
     flange = arm.poses(np.zeros(len(arm.angles)))
-    return RobotPoses(images, flange, None, places, table.where, understood, own=False), arm
+    return PoseSide(flange, places, "", names=images, where=str(path), understood=understood), arm
 
 
 PREFIXES = "base_from_flange_", "camera_from_board_"
@@ -328,7 +202,7 @@ class HandEyeInput:
     symmetries: tuple[Rigid, ...] = ()
     prior: CameraPrior | None = None
     pitch_mm: float | None = None
-    left_out: tuple[tuple[str, str], ...] = ()
+    left_out: LeftOut = ()
     understood: tuple[str, ...] = ()
     setup: Setup | None = None
     arm: Arm | None = None
@@ -349,7 +223,7 @@ def one_source(
         return told, ()
     for path in (first, second):
         require_own(path, quaternions)
-    _require_unsaid(statements, f"{first}, {second}")
+    require_unsaid(statements, f"{first}, {second}")
     joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
 
@@ -439,17 +313,10 @@ class Files:
         """Returns the pairs of poses, and the views of the board if there are images."""
         if isinstance(self.source, Path) and self.source.is_dir():
             return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
-        source, statements = self.source, self.statements
         self._require_no_images()
-        if isinstance(source, Table):
-            return HandEyeInput(source.where, read_poses(source, self.quaternions), setup=statements.setup)
-        if isinstance(source, ToldPairs):
-            told = source
-        elif (told := read_pairs(source, statements, quaternions=self.quaternions)) is None:
-            pairs = read_poses(source, self.quaternions)  # first: a table that is not understood states nothing
-            _require_unsaid(statements, str(source))
-            return HandEyeInput(source.name, pairs, setup=statements.setup)
-        where, stated = told.pairs.where, statements.setup
+        source, stated = self.source, self.statements.setup
+        told = source if isinstance(source, ToldPairs) else read_pairs(source, self.statements, self.quaternions)
+        where = source.name if isinstance(source, Path) else told.pairs.where
         if stated and told.setup and stated != told.setup:
             raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")
         more = {"left_out": told.left_out, "understood": told.understood, "timed": told.timed}
@@ -483,7 +350,7 @@ class Files:
         source = self.source
         if isinstance(source, Path) and source.is_dir():
             own = _Photographs.of(self, source)
-            stated, flange = self.statements.setup, own.robot.base_from_flange[list(own.row_of.values())]
+            stated, flange = self.statements.setup, own.robot.poses[list(own.row_of.values())]
             lines, left_out, with_pose = own.lines(), own.left_out, f"{len(own.row_of)} of {len(own.images)}"
             count = f"images: {with_pose} with a pose of the robot; the board was not looked for"
         else:
@@ -498,20 +365,12 @@ class Files:
         return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 
-def _require_unsaid(statements: Said, where: str) -> None:
-    if statements.options():
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
-            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm)",
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Photographs:
     """The ``images`` of a folder with the robot's poses, before the board is looked for.
 
-    ``row_of`` : row of the robot's pose by image; ``matching`` : how these were matched; ``left_out`` : (image, why).
+    ``row_of`` : row of the robot's pose by image; ``understood`` : how the poses were read and matched; ``clock`` :
+    where they were taken by time; ``left_out`` : (image, why).
     """
 
     files: Files
@@ -519,11 +378,12 @@ class _Photographs:
     design: Board
     model: CameraModel
     images: list[ImageFile]
-    robot: RobotPoses
+    robot: PoseSide
     arm: Arm | None
     row_of: dict[str, int]
-    matching: str
-    left_out: tuple[tuple[str, str], ...]
+    understood: tuple[str, ...]
+    clock: Clock | None
+    left_out: LeftOut
 
     @classmethod
     def of(cls, files: Files, folder: Path) -> "_Photographs":
@@ -532,7 +392,7 @@ class _Photographs:
             missing = ", ".join(name for name, path in files._of_images().items() if path is None)
             raise InputError("E-OPTION-MISSING", f"image folder {folder}: {missing} needed with images")
         if files.robot is None:
-            robot = read_robot_poses(poses, files.quaternions, files.statements)
+            robot = read_robot(poses, files.statements, files.quaternions)
         elif timing.offset or timing.image_times is not None:
             raise InputError(
                 "E-OPTION-CONFLICT",
@@ -543,27 +403,25 @@ class _Photographs:
             robot, arm = read_arm(poses, files.robot, files.quaternions)
         design, model = load_boards(board), read_camera(camera)
         images, skipped = find_images(folder)
-        robot = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
-        late = dict(robot.left_out)
-        names = [image.name for image in images if image.name not in late]
-        row_of, missing, matching = robot.pairing(names)
+        names, late, clock = [image.name for image in images], (), None
+        if arm is None:
+            robot, late, clock = robot_at_images(robot, names, timing)
+        names = [name for name in names if name not in dict(late)]
+        row_of, missing, how = rows_of_images(robot, names)
         if not row_of:
-            said = f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here"
-            raise InputError("E-POSES-UNMATCHED", f"{said}; correct them")
-        left_out = [(each.name, each.reason) for each in skipped]
-        left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
+            said = f"no row is of an image in {folder}: {robot.names[0]} … there, {names[0]} … here"
+            raise InputError("E-POSES-UNMATCHED", f"robot poses {robot.where}: {said}; correct them")
+        left_out = [*((each.name, each.reason) for each in skipped), *late]
+        left_out += [(name, f"no row in {poses.name}") for name in names if name not in row_of]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        return cls(files, folder, design, model, images, robot, arm, row_of, matching, tuple(left_out))
-
-    def robot_lines(self) -> tuple[str, ...]:
-        matched = (f"images matched {self.matching}",) if self.matching else ()
-        return f"robot: {self.robot.understood}", *matched
+        understood = (f"robot: {robot.understood}", *([f"images matched {how}"] if how else []))
+        return cls(files, folder, design, model, images, robot, arm, row_of, understood, clock, tuple(left_out))
 
     def lines(self) -> list[str]:
         (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
         camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
         size = f"{width} × {height} px, focal length {focal_px:.6g} px"
-        return [*self.robot_lines(), f"camera: {camera}: {size}", f"board: {board}: {kind_of(self.design)}"]
+        return [*self.understood, f"camera: {camera}: {size}", f"board: {board}: {kind_of(self.design)}"]
 
     def pairs(self, workers: int | None, progress: Progress) -> HandEyeInput:
         """Returns the pairs of all images that show the board and have a pose."""
@@ -575,11 +433,11 @@ class _Photographs:
             raise InputError("E-IMAGES-NO-BOARD", f"{said}: {': '.join(without_board[0])}")
         camera, rows = detections.camera, np.array([self.row_of[name] for name in found])
         views = Views(camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values()))
-        pairs = pairs_of_views(self.robot.base_from_flange[rows], views, tuple(found), str(self.folder))
+        pairs = pairs_of_views(self.robot.poses[rows], views, tuple(found), str(self.folder))
         if self.robot.covariance is not None:
             pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
-        understood = () if self.robot.own else self.robot_lines()
-        stream, seconds = self.robot.stream, self.robot.seconds
+        understood = () if self.robot.own else self.understood
+        timed = self.clock and Timed(self.clock[0], np.array([self.clock[1][name] for name in found]))
         stated = ("pitch_mm", "square_mm", "spacing_mm")  # by which boards state their size
         pitch_mm = next((getattr(self.design, key) for key in stated if hasattr(self.design, key)), None)
         return HandEyeInput(
@@ -593,7 +451,5 @@ class _Photographs:
             (*understood, *(f"board: {part}" for part in detections.unused())),
             self.files.statements.setup,
             arm=self.arm and self.arm[rows],
-            timed=None
-            if stream is None or seconds is None
-            else Timed(stream, np.array([seconds[name] for name in found])),
+            timed=timed,
         )

@@ -20,7 +20,7 @@ from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
 from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, refitted, splits
+from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, splits
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
@@ -147,11 +147,8 @@ def with_arm(
     ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
     """
     problem = replace(problem, options=replace(problem.options, arm=arm, intrinsics=prior))
-    result, held_out, notes = problem.solved("reprojection").result, None, outcome.notes
-    if len(rows):
-        held_out = refitted(problem, "reprojection", rows, workers, progress)
-        result = held_out.widened(result)
-    adjusted = result.reprojection
+    solved, notes = validated(problem, "reprojection", rows, None, False, workers, progress), outcome.notes
+    result, held_out, adjusted = solved.result, solved.held_out, solved.result.reprojection
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
     values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
@@ -162,6 +159,7 @@ def with_arm(
         if now >= before:
             gain = f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
             notes += (f"{gain}them): leave --with-kinematics out, or take more poses",)
+    notes += solved.notes
     return replace(outcome, result=result, held_out=held_out, options=problem.options, notes=notes, arm=found)
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import photograph
+from tests.handeye.written import table
 from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 
 BOARD = 'type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20\n'
@@ -77,13 +77,7 @@ def photographs(folder: Path, sheet: np.ndarray, first_mm: float, seen: Poses, b
     base_from_flange = BASE_FROM_BOARD @ seen.inverse() @ FLANGE_FROM_CAMERA.inverse()
     for i, pose in enumerate(seen):
         cv2.imwrite(str(found.images / f"{i}.png"), take(sheet, first_mm, pose))
-    write_poses(found.poses, {f"{i}.png": flange for i, flange in enumerate(base_from_flange)})
+    table(found.poses, {"base_from_flange": base_from_flange}, image=[f"{i}.png" for i in range(len(seen))])
     write_cameras_txt(found.camera, Camera.of(CAMERA, "PINHOLE"))
     found.board.write_text(board_toml)
     return found
-
-
-def write_poses(path: Path, poses: dict[str, Rigid], column: str = "image") -> None:
-    rows = [",".join([column, *(f"base_from_flange_{c}" for c in POSE)])]
-    rows += [",".join([name, *pose_cells(pose)]) for name, pose in poses.items()]
-    path.write_text("\n".join(rows) + "\n")

@@ -45,15 +45,6 @@ def scene(seed: int, setup: str = "eye-in-hand", count: int = 16):
     return truth, replace(truth.pairs, base_from_flange=forward(robot, q)), errors, Arm(robot, q)
 
 
-def test_the_slope_is_that_of_the_poses():
-    _, _, _, arm = scene(1, count=4)
-    step = 1e-6
-    numeric = [arm.poses(step * unit).difference(arm.poses(-step * unit)) / (2 * step) for unit in np.eye(24)]
-    slope = arm.slope(np.zeros(24))
-    assert np.abs(np.stack(numeric, axis=2) - slope).max() < 1e-3  # of lengths up to 2000 mm
-    assert np.abs(arm.slope(np.full(24, 1e-3)) - slope).max() > 0.1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("setup", SETUPS)
 def test_what_the_arm_errs_is_found(setup):

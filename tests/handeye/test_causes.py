@@ -213,7 +213,7 @@ def test_poses_at_one_place_of_the_robot_count_once(method):
     """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of
     the squared error over the covariance is 18 by poses, and 5.9 by corners."""
     squares = []
-    for seed in range(16):
+    for seed in range({"pose": 16, "reprojection": 6}[method]):
         rng = np.random.default_rng(seed)
         make = {"pose": simulated, "reprojection": simulated_views}[method]
         truth = make(rng, 6, "eye-in-hand", (1.7e-3, 0.6), **({"corner_px": 0.1} if method == "reprojection" else {}))

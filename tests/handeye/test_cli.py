@@ -10,28 +10,14 @@ from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
 from stcal.io.cameras.read import read_camera
-from stcal.io.table import POSE, pose_cells
+from stcal.io.table import pose_cells
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
+from tests.handeye.written import poses_file, sides_of, table
 from tests.outcome import COMPUTATION, INPUT, assert_error
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
-
-
-def write(path, sides: dict[str, Poses], edit=None):
-    """A file of poses by name; ``edit`` changes the rows of cells."""
-    header = [f"{name}_{column}" for name in sides for column in POSE]
-    rows = [[cell for pose in row for cell in pose_cells(pose)] for row in zip(*sides.values(), strict=True)]
-    if edit:
-        edit(rows)
-    path.write_text("\n".join(",".join(line) for line in [header, *rows]) + "\n")
-    return path
-
-
-def poses_file(path, truth, edit=None):
-    pairs = truth.pairs
-    return write(path, {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}, edit)
 
 
 def in_sigmas(data: dict, name: str, true: Rigid) -> float:
@@ -265,9 +251,9 @@ def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
 def test_an_answer_not_to_use_has_a_remedy_and_fails_where_strict(command, tmp_path):
     """Both sides inverted, as after the wrong one of two pieces of advice."""
     truth = simulated(np.random.default_rng(10), 12, **NOISE)
-    sides = {name: getattr(truth.pairs, name).inverse() for name in ("base_from_flange", "camera_from_board")}
+    sides = {name: poses.inverse() for name, poses in sides_of(truth.pairs).items()}
     quick = ("--method", "pose", "--splits", 2)
-    words = (write(tmp_path / "poses.csv", sides), *quick)
+    words = (table(tmp_path / "poses.csv", sides), *quick)
     code, out, _ = command(*words)
     starts = ("May I use it?", "what to do:")
     verdict, remedy = (next(line for line in out.splitlines() if line.startswith(start)) for start in starts)

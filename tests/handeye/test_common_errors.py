@@ -11,9 +11,10 @@ from stcal.handeye.data.pose_pairs import read_poses
 from stcal.handeye.handeye_problem import HandEyeOptions, HandEyeProblem
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
-from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
+from stcal.io.table import COVARIANCE, common_columns
 from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye
+from tests.handeye.written import table
 from tests.support.handeye import handeye as handeye_by
 from tests.support.handeye import simulated, squared
 
@@ -83,15 +84,12 @@ def test_they_are_read_from_what_measure_writes(tmp_path):
     """Also where the file states the inverse transforms, whose errors differ."""
     pairs, _ = draw(0)
     flange, board = pairs.base_from_flange, pairs.camera_from_board
-    rows, columns = np.triu_indices(6), (*POSE, *COVARIANCE, *common_columns(3))
-    lines = [",".join(["image", *columns])]
-    for i, pose in enumerate(board):
-        numbers = (*pairs.camera_from_board_covariance[i][rows], *pairs.camera_from_board_common[i].T.ravel())
-        lines.append(",".join([f"{i}.jpg", *pose_cells(pose), *map(repr, map(float, numbers))]))
-    (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n")
-    lines = [",".join(["image", *POSE])] + [",".join([f"{i}.jpg", *pose_cells(p)]) for i, p in enumerate(flange)]
-    (tmp_path / "robot.csv").write_text("\n".join(lines) + "\n")
-    joined = join_tables(tmp_path / "robot.csv", tmp_path / "poses.csv", "image", PREFIXES)
+    (i, j), images = np.triu_indices(6), [f"{k}.jpg" for k in range(len(board))]
+    errors = dict(zip(COVARIANCE, pairs.camera_from_board_covariance[:, i, j].T.tolist(), strict=True))
+    common = np.swapaxes(pairs.camera_from_board_common, 1, 2).reshape(len(board), -1)
+    errors |= dict(zip(common_columns(3), common.T.tolist(), strict=True))
+    robot = table(tmp_path / "robot.csv", {"": flange}, image=images)
+    joined = join_tables(robot, table(tmp_path / "poses.csv", {"": board}, image=images, **errors), "image", PREFIXES)
     as_read = read_poses(joined.table)
     assert np.allclose(as_read[[3, 5]].camera_from_board_common, pairs.camera_from_board_common[[3, 5]], rtol=1e-9)
     columns = {

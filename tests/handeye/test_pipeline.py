@@ -13,9 +13,9 @@ from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.plan import HandEyePlanFile
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
-from stcal.io.table import POSE, pose_cells
 from stcal.workflows.handeye_inputs import HandEyeInput
-from tests.handeye.test_cli import NOISE, poses_file
+from tests.handeye.test_cli import NOISE
+from tests.handeye.written import poses_file, table
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated, simulated_views
 
@@ -100,18 +100,15 @@ def test_what_is_no_input_is_refused(poses):
 
 
 def test_two_files_of_poses(written, poses, tmp_path):
-    table = stcal.load_table(poses)
-    paths = []
-    for name, prefix in (("robot", "base_from_flange_"), ("camera", "camera_from_board_")):
-        rows = [f"p{i}," + ",".join(pose_cells(pose)) for i, pose in enumerate(table.poses(prefix))]
-        rows += [] if name == "robot" else ["p99," + rows[0].partition(",")[2]]
-        paths.append(tmp_path / f"{name}.csv")
-        paths[-1].write_text("\n".join([",".join(["image", *POSE]), *rows]), encoding="utf-8")
-    answer = written("--a", paths[0], "--b", paths[1], "--splits", 0, "--method", "pose", "--setup", "eye-in-hand")
-    given = workflows.read_handeye(paths[0], second=paths[1], setup="eye-in-hand")
+    read, names = stcal.load_table(poses), [f"p{i}" for i in range(8)]
+    board = read.poses("camera_from_board_")
+    robot = table(tmp_path / "robot.csv", {"": read.poses("base_from_flange_")}, image=names)
+    camera = table(tmp_path / "camera.csv", {"": Poses.of([*board, board[0]])}, image=[*names, "p99"])
+    answer = written("--a", robot, "--b", camera, "--splits", 0, "--method", "pose", "--setup", "eye-in-hand")
+    given = workflows.read_handeye(robot, second=camera, setup="eye-in-hand")
     found = workflows.calibrate_handeye(given, "pose", repeats=0)
     assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
-    assert given.notes == (f"1 rows of {paths[1]} have no partner: image p99",)
+    assert given.notes == (f"1 rows of {camera} have no partner: image p99",)
 
 
 def test_plan_handeye(written, poses):

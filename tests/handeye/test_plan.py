@@ -14,7 +14,8 @@ from stcal.handeye.plan import judged_at, worst_sigma
 from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
-from tests.handeye.test_cli import NOISE, poses_file
+from tests.handeye.test_cli import NOISE
+from tests.handeye.written import poses_file
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.support.handeye import CAMERA, board_corners, disturbed, handeye, simulated, squared
 

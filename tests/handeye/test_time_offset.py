@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from tests.handeye.photographed import BOARD, write_poses
+from tests.handeye.photographed import BOARD
+from tests.handeye.written import table
 from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.support.handeye import handeye, squared
 from tests.support.handeye_stream import StreamTruth, simulated_stream
@@ -111,8 +112,8 @@ def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:
     (folder / "images").mkdir()
     for name in names:
         (folder / "images" / name).write_bytes(b"x")
-    poses = {f"{t:.3f}": pose for t, pose in zip(times, truth.stream.base_from_flange, strict=False)}
-    write_poses(folder / "robot.csv", poses, "time_s")
+    flange, stamps = truth.stream.base_from_flange[: len(times)], [f"{time:.3f}" for time in times]
+    table(folder / "robot.csv", {"base_from_flange": flange}, time_s=stamps)
     (folder / "board.toml").write_text(BOARD)
     (folder / "cameras.txt").write_text(CAMERA)
     files = [("--poses", "robot.csv"), ("--camera", "cameras.txt"), ("--board", "board.toml")]

@@ -9,10 +9,35 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses
+from stcal.io.table import POSE, pose_cells
 
 Arguments = list[str]
 """Of ``stcal handeye``."""
+
+
+def table(path: Path, sides: dict[str, Poses], edit: Callable | None = None, unit: str = "mm", **columns) -> Path:
+    """A CSV file of ``columns``, and of poses with their names before their columns; ``edit`` changes the rows."""
+    heads = [f"{name}_{c}".lstrip("_").replace("_mm", f"_{unit}") for name in sides for c in POSE]
+    per_unit = {"mm": 1, "m": 1000}[unit]
+    own = zip(*columns.values(), strict=True) if columns else [()] * len(next(iter(sides.values())))
+    rows = [
+        [*map(str, values), *(cell for p in poses for cell in pose_cells(Rigid(p.rotation, p.translation / per_unit)))]
+        for values, *poses in zip(own, *sides.values(), strict=True)
+    ]
+    if edit:
+        edit(rows)
+    path.write_text("\n".join(",".join(line) for line in [[*columns, *heads], *rows]) + "\n")
+    return path
+
+
+def poses_file(path: Path, truth, edit: Callable | None = None) -> Path:
+    return table(path, sides_of(truth.pairs), edit)
+
+
+def sides_of(pairs: HandEyePoses) -> dict[str, Poses]:
+    return {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}
 
 
 def matrices(poses) -> np.ndarray:
@@ -166,27 +191,6 @@ def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
     return ["--a", str(folder / "robot.yml"), "--b", str(folder / "camera.yml")]
 
 
-def kuka_export(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Semicolons, decimal commas, a number for each row, units in brackets, and a separator behind the last column."""
-    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("ZYX", degrees=True)
-    table = np.hstack([pairs.base_from_flange.translation, angles])
-    rows = [f"{i};{line(row, ';')};".replace(".", ",") for i, row in enumerate(table, 1)]
-    (folder / "robot.csv").write_text("\n".join(["Nr;X [mm];Y [mm];Z [mm];A [deg];B [deg];C [deg];", *rows]) + "\n")
-    named = {f"img{i:02d}.png": m.tolist() for i, m in enumerate(matrices(pairs.camera_from_board), 1)}
-    (folder / "camera.json").write_text(json.dumps(named))
-    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.json")]
-
-
-def tab_export(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Tabs and decimal commas, a line of Excel before them; KUKA's names without a unit."""
-    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("ZYX", degrees=True)
-    rows = [line(row, "\t").replace(".", ",") for row in np.hstack([pairs.base_from_flange.translation, angles])]
-    (folder / "robot.txt").write_text("\n".join(["sep=\t", "X\tY\tZ\tA\tB\tC", *rows]) + "\n")
-    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
-    given = ["--rotation", "robot=kuka-abc", "--length-unit", "robot=mm"]
-    return ["--a", str(folder / "robot.txt"), "--b", str(folder / "camera.npy"), *given]
-
-
 FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "OpenCV's arrays": opencv_arrays,
     "npz": stacks,
@@ -204,8 +208,6 @@ FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "rotation vector": robots("rotvec", "rotvec", ("rx", "ry", "rz"), "rad"),
     "rotation vector in capitals": robots("ur-rotvec", "rotvec", ("RX", "RY", "RZ")),
     "UR": of_ur,
-    "KUKA's export": kuka_export,
-    "tabs and decimal commas": tab_export,
 }
 EYE = "1 0 0 0.1\n0 1 0 0.2\n0 0 1 0.3\n0 0 0 1\n"
 LISTED = [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]

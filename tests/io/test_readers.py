@@ -16,14 +16,13 @@ from stcal.boards.target_file import load_boards, load_target
 from stcal.design import StatedSize
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import read_pairs, require_own
+from stcal.handeye.data.pose_files import read_pairs, read_robot
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
 from stcal.robot.descriptions import is_conf, kinematics_content, load_urdf, robot_of_conf, robot_of_kinematics
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.sfm.budget.combine import statement_of
-from stcal.workflows.handeye_inputs import read_robot_poses
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(
@@ -87,15 +86,12 @@ def of_kinematics(path: Path) -> np.ndarray:
 
 
 def of_robot_poses(path: Path) -> np.ndarray:
-    poses = read_robot_poses(path).base_from_flange
+    poses = read_robot(path, Said()).poses
     return np.hstack([poses.translation, poses.rotation.reshape(-1, 9)])
 
 
 def of_pairs(path: Path) -> np.ndarray:
     told = read_pairs(path, Said())
-    if told is None:
-        require_own(path)  # what a command does next
-    assert told is not None
     return np.hstack([told.pairs.base_from_flange.translation, told.pairs.camera_from_board.translation])
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -44,7 +44,9 @@ class PoseSide:
     rotations are written; ``unit``, ``frames`` : None where the file does not say; ``names`` : image or timestamp of
     each pose, if any; ``trajectory`` : whether poses are those of a moving body in a world; ``covariance`` : (m, 6, 6),
     mm and rad; ``common`` : (m, 6, k) errors that the poses have in common, contained in their covariances; ``where``,
-    ``understood`` : the file, and how it was read; ``guessed`` : the unit that was guessed from the size of lengths.
+    ``understood`` : the file, and how it was read; ``guessed`` : the unit that was guessed from the size of lengths;
+    ``own`` : whether the file is a table of the package; ``timed`` : whether ``names`` are times by the name of their
+    column.
     """
 
     poses: Poses
@@ -59,6 +61,8 @@ class PoseSide:
     where: str = ""
     understood: str = ""
     guessed: str = ""
+    own: bool = False
+    timed: bool = False
 
     def __len__(self) -> int:
         return len(self.places)
@@ -95,16 +99,16 @@ class PoseContent:
 class Said:
     """The user's statements about files that do not state these themselves.
 
-    ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
+    ``rotation`` : a name of :data:`stcal.io.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
     :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup``;
-    ``own`` : rotation and unit of one role's poses, where they differ.
+    ``own`` : ``rotation`` and ``length_unit`` of one role's poses, where they differ.
     """
 
     rotation: str | None = None
     length_unit: str | None = None
     frames: tuple[str, ...] = ()
     setup: Setup | None = None
-    own: tuple[tuple[Role, str, str], ...] = ()
+    own: Mapping[str, dict[str, str]] = field(default_factory=dict)
 
     @classmethod
     def of_options(
@@ -112,36 +116,32 @@ class Said:
     ) -> "Said":
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``."""
-        values: dict[tuple[str, str], str] = {}
+        own: dict[str, dict[str, str]] = {role: {} for role in ("", *ROLES)}
         for option, value in (*(("rotation", v) for v in rotation), *(("length_unit", v) for v in length_unit)):
-            role, equals, name = value.partition("=")
+            role, equals, name = value.partition("=") if "=" in value else ("", "", value)
             typed = f"--{option.replace('_', '-')} {value}"
             if equals and role not in ROLES:
                 raise InputError("E-OPTION-VALUE", f"{typed}: robot= or camera= needed before the name")
-            place, name = (role, option) if equals else ("", option), name if equals else role
-            if place in values:
+            if option in own[role]:
                 raise InputError("E-OPTION-REPEATED", f"{typed}: given twice; one for each of robot and camera")
-            values[place] = name
-        own: tuple[tuple[Role, str, str], ...] = tuple(
-            (role, option, name) for role in ROLES for (of, option), name in values.items() if of == role
-        )
-        return cls(values.get(("", "rotation")), values.get(("", "length_unit")), tuple(frames), setup, own)
+            own[role][option] = name
+        return cls(**own.pop(""), frames=tuple(frames), setup=setup, own=own)
 
     def of(self, role: Role) -> "Said":
         """Returns the statements that hold for poses of this role."""
-        return replace(self, own=(), **{name: value for entry_role, name, value in self.own if entry_role == role})
+        return replace(self, own={}, **self.own.get(role, {}))
 
     def options(self) -> list[str]:
         """Returns the names of the options that were given."""
-        every = {"--rotation": self.rotation, "--length-unit": self.length_unit, "--poses-are": self.frames}
-        of_one_role = {f"--{name.replace('_', '-')}" for _, name, _ in self.own}
-        return [name for name, value in every.items() if value or name in of_one_role]
+        every = {"rotation": self.rotation, "length_unit": self.length_unit, "poses_are": self.frames}
+        given = [name for name, value in every.items() if value or any(name in own for own in self.own.values())]
+        return [f"--{name.replace('_', '-')}" for name in given]
 
     def __post_init__(self):
         for name in self.frames:
             if name not in EVERY_FRAME:
                 raise InputError("E-OPTION-VALUE", f"--poses-are {name}: unknown; {', '.join(EVERY_FRAME)} needed")
-        for unit in (self.length_unit, *(value for _, name, value in self.own if name == "length_unit")):
+        for unit in (self.length_unit, *(own.get("length_unit") for own in self.own.values())):
             if unit and unit not in LENGTHS:
                 raise InputError("E-OPTION-VALUE", f"--length-unit {unit}: unknown; {', '.join(LENGTHS)} needed")
         if len({Known(name, "").role for name in self.frames}) < len(self.frames):
@@ -245,23 +245,18 @@ ROS = Known("m", "as in ROS", False)
 
 def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
     """Returns the poses in plain values; None where there are none."""
+    content = None
     if isinstance(value, Mapping):
         content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
-    elif not isinstance(value, list | np.ndarray) or not len(value):
-        return None
-    else:
-        content = _of_pairs(value, form, where) if isinstance(value, list) and isinstance(value[0], Mapping) else None
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        content = _of_pairs(value, form, where)
     if content is None and (side := _side_of(value, where)) is not None:
-        content = PoseContent(form, (side,))
-    if content is not None or not isinstance(value, Mapping):
-        return content
-    for key in HOLDERS:
-        if isinstance(value.get(key), Mapping | list | np.ndarray):
-            content = read_tree(value[key], form, statements, where)
-            if content is not None:
-                others = tuple(str(unused_key) for unused_key in value if unused_key != key)
-                return replace(content, passed_over=(*content.passed_over, *others))
-    return None
+        return PoseContent(form, (side,))
+    for key in HOLDERS if content is None and isinstance(value, Mapping) else ():
+        if (held := read_tree(value.get(key), form, statements, where)) is not None:
+            others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+            return replace(held, passed_over=(*held.passed_over, *others))
+    return content
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -430,7 +425,8 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays: dict[str, np.ndarray] = {}
     for key, item in parts.items():
-        if (array := numbers([_flat(value) for value in item] if isinstance(item, list) else item)) is None:
+        rows = [value if (of_pose := numbers(value)) is None else of_pose.ravel().tolist() for value in item]
+        if (array := numbers(rows if isinstance(item, list) else item)) is None:
             raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
         arrays[key] = array
     turn_key, at_key = sorted(arrays, key=lambda key: -arrays[key].size)
@@ -444,11 +440,6 @@ def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
     require_finite(at, places, where)
     poses = Poses(proper(turn.reshape(-1, 3, 3), places, where), at)
     return PoseSide(poses, places, "3×3 matrices", frames=frames)
-
-
-def _flat(value: Any) -> Any:
-    array = numbers(value)
-    return value if array is None else array.ravel().tolist()
 
 
 def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | None:

@@ -6,7 +6,7 @@ import re
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,9 @@ from stcal.handeye.data.pose_content import (
     read_tree,
     require_each_once,
 )
-from stcal.handeye.data.pose_pairs import HandEyePoses, Setup, inverted
-from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
+from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Setup, inverted, read_poses, read_side
+from stcal.handeye.data.pose_partners import matched
+from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, taken_at
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.join import keys_of
 from stcal.io.rotations import (
@@ -66,8 +67,13 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None
     names, sides = _row_names(table, key), []
     prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
     for prefix, frames in (*prefixes.items(), ("", None)):
-        if (prefix or not sides) and (side := _side(table, prefix, frames, names, statements)) is not None:
-            sides.append(side)
+        if (sides and not prefix) or (place := _place(table, prefix)) is None:
+            continue
+        if (turned := read_rotations(table, prefix, statements.rotation)) is None:
+            continue
+        covariance, poses = table.pose_covariances(prefix), Poses(turned.rotation, place[0])
+        read = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
+        sides.append(PoseSide(poses, places_of(table), turned.words, place[1], frames, names, **read))
     if not sides:
         return None
     known = [side.frames for side in sides if side.frames is not None]
@@ -88,17 +94,6 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     number = next((lower[name] for name in NUMBERS if name in lower), None)
     values = tuple(table.text(number)) if number is not None else ()
     return values if len(set(values)) == len(table) else ()
-
-
-def _side(table: Table, prefix: str, frames: Known | None, names: tuple[str, ...], statements: Said) -> PoseSide | None:
-    """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
-    if (place := _place(table, prefix)) is None:
-        return None
-    if (turned := read_rotations(table, prefix, statements.rotation)) is None:
-        return None
-    covariance, (at, unit) = table.pose_covariances(prefix), place
-    common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
-    return PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common)
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
@@ -382,24 +377,27 @@ class ToldPairs:
         return cls(pairs, (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines), **more)
 
 
-def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> ToldPairs | None:
-    """Returns the pose pairs of one file; None where it is one of the package's own tables.
+def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> ToldPairs:
+    """Returns the pose pairs of one file, or of a table of the package's own.
 
     Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
     """
-    content = read_content(path, statements, key, quaternions)
-    if content is None:
-        return None
+    if isinstance(source, Table) or (content := read_content(source, statements, "image", quaternions)) is None:
+        pairs = read_poses(source, quaternions)  # first: a table that is not understood states nothing
+        require_unsaid(statements, str(source))
+        return ToldPairs(pairs, ())
     if len(content.sides) == 1:
         frames = content.sides[0].frames
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
-        said = f"{path}: {content.form} with {held}"
+        said = f"{source}: {content.form} with {held}"
         raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
-    robot, camera = (settled(content, role, path, statements) for role in FRAMES)
+    robot, camera = (settled(content, role, source, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
-        said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        said = (
+            f"{source}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        )
         raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
-    return ToldPairs.of(robot, camera, robot.names or camera.called(), path.name, setup=content.setup)
+    return ToldPairs.of(robot, camera, robot.names or camera.called(), source.name, setup=content.setup)
 
 
 def read_two(
@@ -421,7 +419,7 @@ def read_two(
     contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
     if not any(contents):
         return None
-    sides = []
+    sides, setup = [], next((each.setup for each in contents if each is not None and each.setup), None)
     for (role, path, own), content in zip(files, contents, strict=True):
         if content is None:
             table = read_table(path, "table", quaternions)
@@ -430,14 +428,23 @@ def read_two(
                 raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
-    setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
     times, wanted = (stamps_of(side.names) if side.names else None for side in sides)
     if timed and (times is None or wanted is None):
         untimed = (robot if times is None else camera).where
         raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
-        stream = Stream.of(times, robot.poses, Path(robot.where).name)
-        return _by_time(robot, camera, stream, stream.after_origin(wanted), setup, where, tolerance_s)
+        stream = Stream.of(times, robot.poses, first.name)
+        seconds = stream.after_origin(wanted)
+        taken = taken_at(stream, seconds, tolerance_s)
+        if not taken.kept.any():
+            said = f"no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}"
+            raise InputError("E-POSES-UNMATCHED", f"{camera.where}: {said}")
+        lines = [taken.said]
+        if robot.covariance is not None:
+            lines.append("covariances of the robot's poses are not used: they are of other times")
+        robot, camera = replace(robot, poses=taken.base_from_flange, covariance=None), camera[taken.rows]
+        more = {"left_out": taken.left_out(sides[1].names), "timed": Timed(stream, seconds[taken.rows])}
+        return ToldPairs.of(robot, camera, camera.names, where, lines, setup=setup, **more)
     rows, how = matched(robot, camera, key)
     a, b = ([row[k] for row in rows] for k in (0, 1))
     stamped = None
@@ -453,14 +460,46 @@ def read_two(
         if i not in used
     ]
     more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
-    lines = (f"rows joined {how}",) if how else ()
+    lines = [f"rows joined {how}"] if how else []
     return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
 
 
-def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseSide | None:
-    """Returns the robot's poses of a file; None where it is one of the package's own tables."""
-    content = read_content(path, statements.of("robot"), key, quaternions)
-    return None if content is None else settled(content, "robot", path, statements)
+TIME = "time_s"
+"""Column of a stream of poses, in place of ``image``."""
+
+
+def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> PoseSide:
+    """Returns the robot's poses of a file. A table of the package's own has a column ``image``, or ``time_s``, and
+    ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``statements`` : the
+    user's statements about what a file of another program does not state itself.
+    """
+    content = read_content(path, statements.of("robot"), "image", quaternions)
+    if content is not None:
+        return settled(content, "robot", path, statements)
+    if statements.options():
+        require_own(path, quaternions)
+        require_unsaid(statements, f"robot poses {path}")
+    table = read_table(path, "robot poses", quaternions)
+    timed = "image" not in table and TIME in table
+    names = tuple(table.text(TIME if timed else "image"))
+    require_each_once(names, places_of(table), table.where, "image ")
+    poses, covariance, _ = read_side(table, *SIDES[0])
+    frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
+    understood = f"{path.name}: table; {len(names)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
+    read = {"names": names, "covariance": covariance, "where": str(path), "understood": understood, "own": True}
+    return PoseSide(poses, places_of(table), "quaternions by name", timed=timed, **read)
+
+
+def require_unsaid(statements: Said, where: str) -> None:
+    """Refuse statements on a table whose columns state the same."""
+    if statements.options():
+        raise InputError(
+            "E-OPTION-NEEDS",
+            f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
+            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm)",
+        )
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
@@ -483,29 +522,6 @@ def _no_poses(table: Table) -> InputError:
         f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
         f"a, b, c …) needed; the header is {table.header()}; rename them",
     )
-
-
-def _by_time(
-    robot: PoseSide,
-    camera: PoseSide,
-    stream: Stream,
-    seconds: np.ndarray,
-    setup: Setup | None,
-    where: str,
-    tolerance_s: float,
-) -> ToldPairs:
-    """Returns the robot's poses of a stream at the camera's times, ``seconds`` after its origin."""
-    taken = taken_at(stream, seconds, tolerance_s)
-    if not taken.kept.any():
-        first = f"{camera.names[0]}, {taken.why[0]}"
-        raise InputError("E-POSES-UNMATCHED", f"{camera.where}: no pose has one of the robot: first {first}")
-    rows, lines = np.flatnonzero(taken.kept), (taken.said,)
-    if robot.covariance is not None:
-        lines += ("covariances of the robot's poses are not used: they are of other times",)
-    at_images, seen = replace(robot, poses=taken.base_from_flange, covariance=None), camera[rows.tolist()]
-    left_out = tuple((name, why) for name, why in zip(camera.names, taken.why, strict=True) if why)
-    more = {"setup": setup, "left_out": left_out, "timed": Timed(stream, seconds[rows])}
-    return ToldPairs.of(at_images, seen, seen.names, where, lines, **more)
 
 
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
@@ -573,50 +589,3 @@ def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Know
         )
     guess = "m" if farthest <= METRES_UP_TO else "mm"
     return Known(guess, f"by their size, up to {farthest:.4g}", False), guess
-
-
-def matched(robot: PoseSide, camera: PoseSide, key: str) -> tuple[list[tuple[int, int]], str]:
-    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched;
-    empty where the names are the same."""
-    if not robot.names and not camera.names:
-        if len(robot) == len(camera):
-            return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
-        counts = f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times"
-        raise InputError("E-POSES-COUNT", f"{counts}; as many of each, or names, needed")
-    if not robot.names or not camera.names:
-        without, other = (robot, camera) if not robot.names else (camera, robot)
-        said = f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …"
-        raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column {key}")
-    rows = partners(robot.names, camera.names)
-    if rows is None:
-        said = f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one"
-        raise InputError("E-POSES-UNMATCHED", f"{said}, {camera.names[0]} … in the other; correct them")
-    return rows
-
-
-def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
-    """Returns the places of names in both lists that mean the same, and how they were matched: as they are, as times,
-    without folder and ending, or by the number at their ends, where no number occurs twice. None where none match."""
-    ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
-        (str, ""),
-        (time_of, "by their times as numbers"),
-        (stem_of, "by names without folder and ending"),
-        (trailing_number, "by the number at the end of each name, like"),
-    )
-    for way, description in ways:
-        one, other = ([way(name) for name in names] for names in (first, second))
-        known = [[key for key in keys if key is not None] for keys in (one, other)]
-        if not all(keys and len(set(keys)) == len(keys) for keys in known):
-            continue
-        place = {key: j for j, key in enumerate(other)}
-        rows = [(i, place[key]) for i, key in enumerate(one) if key is not None and key in place]
-        if rows:
-            i, j = rows[0]
-            return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
-    return None
-
-
-def trailing_number(name: str) -> int | None:
-    """Returns the number at the end of a name: 7 for ``img07.png``; None where there is none, or for a time."""
-    match = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
-    return int(match[1]) if match else None

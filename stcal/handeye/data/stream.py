@@ -141,6 +141,15 @@ class Taken:
     why: tuple[str, ...]
     said: str
 
+    @property
+    def rows(self) -> list[int]:
+        """The places of the kept times."""
+        return np.flatnonzero(self.kept).tolist()
+
+    def left_out(self, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+        """Returns the names (k) of times without a pose, and why."""
+        return tuple((name, why) for name, why in zip(names, self.why, strict=True) if why)
+
 
 def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE_S) -> Taken:
     """Returns poses at times (k,) after the stream's origin. They are interpolated where the samples are close, else
@@ -156,10 +165,8 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     for k, time in enumerate(seconds):
         reason = f"{gap_s[k]:.4g} s {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
         if covered[k]:
-            reason = (
-                f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed; the nearest sample is "
-            )
-            reason += f"{gap_s[k]:.4g} s away"
+            reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed"
+            reason += f"; the nearest sample is {gap_s[k]:.4g} s away"
         why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
     parts = [f"{same.sum()} at a sample"] if same.any() else []
     if between.any():

@@ -16,25 +16,18 @@ from stcal.geometry.robust import length_limit
 
 @runtime_checkable
 class ArmModel(Protocol):
-    """An arm with k parameters, small motions of the axes about the arm's file, and m joint vectors."""
+    """An arm with k parameters, small motions of the axes about the arm's file, and m joint vectors.
+
+    ``angles`` : (k,) bool, True for parameters in rad, False for those in mm; ``poses`` : returns base_from_flange, m;
+    ``slope`` : returns the derivative (m, 6, k) of these, left perturbation, by a small further motion of the axes
+    about their places at ``parameters``; ``arm[rows]`` : the arm with these joint vectors alone.
+    """
 
     @property
-    def angles(self) -> np.ndarray:
-        """Boolean array (k,): True for parameters in rad, False for those in mm."""
-        ...
-
-    def poses(self, parameters: np.ndarray) -> Poses:
-        """Returns base_from_flange, m poses."""
-        ...
-
-    def slope(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns the derivative (m, 6, k) of :meth:`poses`, left perturbation, by a small further motion of the axes
-        about their places at ``parameters``."""
-        ...
-
-    def __getitem__(self, rows: Any) -> "ArmModel":
-        """Returns the arm with these joint vectors alone."""
-        ...
+    def angles(self) -> np.ndarray: ...
+    def poses(self, parameters: np.ndarray) -> Poses: ...
+    def slope(self, parameters: np.ndarray) -> np.ndarray: ...
+    def __getitem__(self, rows: Any) -> "ArmModel": ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +48,6 @@ class LinearArm:
         motion = self.slope @ step
         turn = Rotation.from_rotvec(motion[:, :3]).as_matrix()
         return Poses(turn @ base_from_flange.rotation, base_from_flange.translation + motion[:, 3:])
-
-    def slope_after(self, step: np.ndarray) -> np.ndarray:
-        """Returns the derivative (m, 6, k) of :meth:`moved`, left, at a step: rotation vectors do not add."""
-        cross = skew(np.einsum("mak,k->ma", self.slope[:, :3], step))
-        to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
-        return np.concatenate([to_left @ self.slope[:, :3], self.slope[:, 3:]], axis=1)
 
     def parts(self) -> dict[str, np.ndarray]:
         """Returns the rows of the parameters by group of σ: directions of axes and places of axes, if any."""
@@ -121,7 +108,7 @@ class Corners:
         on.append((a.block("scale", Vector(np.ones((1, 1))), fixed=[] if self.with_scale else [0]), None))
         if self.basis.shape[1]:
             on.append((a.block("camera", Vector(np.zeros((1, self.basis.shape[1])))), None))
-            for name, rows in self.camera_parts():
+            for name, rows in camera_parts(self.basis, self.information):
                 root = np.linalg.cholesky(self.information[np.ix_(rows, rows)]).T
                 a.factor(_linear(root, rows), on[-1:], kind=name)
         if self.arm is not None:
@@ -173,10 +160,6 @@ class Corners:
         x, z = values["x"][0], values["z"][0]
         return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]), arm)
 
-    def camera_parts(self) -> list[tuple[str, np.ndarray]]:
-        """Returns :func:`camera_parts` of the intrinsics solved for."""
-        return camera_parts(self.basis, self.information)
-
     def _placed(self, state: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns of each measured corner its place (n, 3) in the frames of the stand, the mount and the camera."""
         x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
@@ -211,8 +194,11 @@ class Corners:
             "board": state.scale * by_stand @ z.rotation,
             "robot": by_mount @ by_hand,
         }
-        if self.arm is not None:
-            slopes["arm"] = slopes["robot"] @ self.arm.slope_after(state.arm)[self.view]
+        if self.arm is not None:  # rotation vectors of a step do not add
+            turns, shifts = self.arm.slope[:, :3], self.arm.slope[:, 3:]
+            cross = skew(turns @ state.arm)
+            to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
+            slopes["arm"] = slopes["robot"] @ np.concatenate([to_left @ turns, shifts], axis=1)[self.view]
         return slopes
 
     def only(self, keep: np.ndarray) -> "Corners":
@@ -236,7 +222,7 @@ class Corners:
 
     def factors(self) -> dict[str, float]:
         """Returns a factor of 1 for each kind of the intrinsics solved for."""
-        return dict.fromkeys((name for name, _ in self.camera_parts()), 1.0)
+        return dict.fromkeys((name for name, _ in camera_parts(self.basis, self.information)), 1.0)
 
 
 def errors(robot: Poses) -> np.ndarray:

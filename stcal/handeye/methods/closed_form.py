@@ -193,8 +193,7 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
     Raises ConvergenceError: the bound is not reached, or the matrix is not a rotation.
     """
     c, d = equations(motions, unit_mm)
-    x, *_ = np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)
-    x = smallest_largest(c, d, x)
+    x = smallest_largest(c, d, np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)[0])
     u, s, vt = np.linalg.svd(x[:9].reshape(3, 3, order="F"))
     if np.linalg.det(u @ vt) < 0 or s[2] < 0.1:
         raise ConvergenceError("E-HANDEYE-METHOD-FAILS", "hand-eye: zhao finds no rotation; motions are too alike")
@@ -227,16 +226,13 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
     def squared(y):
         return (np.einsum("kij,j->ki", c, y) - d) ** 2 / scale**2
 
-    def below(y):
-        return y[-1] - squared(y[:-1]).sum(1)
-
-    def below_slope(y):
-        return np.column_stack([-2 * (hessian @ y[:-1] - pull), np.ones(len(c))])
-
-    ahead = np.eye(13)[-1]
-    limits, options = {"type": "ineq", "fun": below, "jac": below_slope}, {"maxiter": 500, "ftol": 1e-14}
-    start, objective = np.append(x, 1.0), lambda y: y[-1]
-    x = minimize(objective, start, jac=lambda _: ahead, method="SLSQP", constraints=limits, options=options).x[:-1]
+    limits = {
+        "type": "ineq",
+        "fun": lambda y: y[-1] - squared(y[:-1]).sum(1),
+        "jac": lambda y: np.column_stack([-2 * (hessian @ y[:-1] - pull), np.ones(len(c))]),
+    }
+    start, ahead, options = np.append(x, 1.0), np.eye(13)[-1], {"maxiter": 500, "ftol": 1e-14}
+    x = minimize(ahead.dot, start, jac=lambda _: ahead, method="SLSQP", constraints=limits, options=options).x[:-1]
     errors = squared(x).sum(1)
     # The minimum of a weighted mean of the squared errors is below that of the largest: multipliers give the best mean.
     active = errors > (1 - 1e-2) * errors.max()
@@ -321,10 +317,6 @@ class EvolutionOptions:
                 + f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed",
             )
 
-    def needs_closed_form(self) -> bool:
-        """True if some bounds lie about the closed-form solution."""
-        return any(bounds is not None and bounds.centre is None for bounds in (self.bounds_rad, self.bounds_mm))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
@@ -372,7 +364,9 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
     x = rng.uniform(centre - half, centre + half, (size, 6))
     value = objective.values(x)
     for _ in range(options.generations):
-        a, b, c = three_others(rng, size)
+        order = rng.random((size, size))
+        np.fill_diagonal(order, 2)  # a candidate itself comes last
+        a, b, c = np.argsort(order, axis=1)[:, :3].T  # three others, all different
         mutant = x[a] + options.factor * (x[b] - x[c])
         trial = np.where(rng.random((size, 6)) <= options.crossover, mutant, x)
         trial_value = objective.values(trial)
@@ -380,13 +374,6 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
         x, value = np.where(better[:, None], trial, x), np.where(better, trial_value, value)
     best = x[np.argmin(value)]
     return Rigid.exp(np.concatenate([best[:3], objective.unit_mm * best[3:]]))
-
-
-def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Returns three other candidates for each of ``size`` candidates, all different, (3, size)."""
-    order = rng.random((size, size))
-    np.fill_diagonal(order, 2)  # the candidate itself comes last
-    return np.argsort(order, axis=1)[:, :3].T
 
 
 def polish(objective: Objective, x: Rigid) -> Rigid:

@@ -86,10 +86,6 @@ class LoopComponents:
         """Returns the covariances (m, 6, 6) for these variances (f,)."""
         return self.known + np.tensordot(variances, self.free, 1)
 
-    def of(self, used: np.ndarray) -> "LoopComponents":
-        """Returns the components of the poses ``used``."""
-        return LoopComponents(self.known[used], self.free[:, used], self.names)
-
     def first(self, residuals: np.ndarray) -> np.ndarray:
         """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect."""
         turn, shift = (robust_sigma(each, 3) ** 2 for each in np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T)
@@ -130,17 +126,6 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
         else:
             del free["robot_rad"]
     return LoopComponents(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
-
-
-def variance_components(
-    parts: LoopComponents, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
-) -> np.ndarray:
-    """Returns restricted maximum-likelihood variances (f,) of the free components from residuals (m, 6) and their
-    jacobian (m, 6, k) near a solution (Patterson & Thompson 1971), from a ``first`` guess; :data:`CAUTION` is
-    subtracted."""
-    least = np.maximum(parts.least(), LEAST_SHARE * first)
-    most = np.maximum(first, least) * np.exp(2 * FARTHEST)
-    return component_variances(residuals, jacobian, parts.known, parts.free, first, (least, most), CAUTION)
 
 
 FALSE_ALARM = 0.01
@@ -196,6 +181,8 @@ def adjust_poses(
     count, state, residuals = 12 + with_scale, start, loop.residuals(*start)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
     variances = first = parts.first(residuals)
+    least = np.maximum(parts.least(), LEAST_SHARE * first)
+    limits = least, np.maximum(first, least) * np.exp(2 * FARTHEST)
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
     for round_ in range(ROUNDS):
         parts = components(loop, noise, state.mount_from_camera, state.scale)
@@ -204,8 +191,9 @@ def adjust_poses(
         residuals, jacobian = loop.residuals(*state), loop.jacobian(state.mount_from_camera, state.scale, count)
         before, settled = used, True
         if parts.names:
-            old = variances
-            variances = variance_components(parts.of(used), residuals[used], jacobian[used], first)
+            # Restricted maximum likelihood (Patterson & Thompson 1971).
+            old, own = variances, (residuals[used], jacobian[used], parts.known[used], parts.free[:, used])
+            variances = component_variances(*own, first, limits, CAUTION)
             settled = bool(np.abs(np.log(variances / old)).max() < SETTLED)
         if robust and round_ < ROUNDS // 2:  # later the set stays: a set that alternates would never settle
             used = _agreeing(residuals, jacobian, parts.total(variances), used, estimated=bool(parts.names))
@@ -287,23 +275,18 @@ def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _agreeing(
     residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray, estimated: bool
 ) -> np.ndarray:
-    """Returns which poses, (m,), agree with the solution of all others."""
+    """Returns which poses, (m,), agree with the solution of all others: by squared residuals over their own variance,
+    less than the pose's for poses that took part, plus the solution's for the others."""
     m, count = len(used), jacobian.shape[2]
     redundancy = 6 * int(used.sum()) - count - 6
     if redundancy < 6:
         return used
     level = 1 - FALSE_ALARM / m
     limit = 6 * f.ppf(level, 6, redundancy) if estimated else chi2.ppf(level, 6)
-    agrees = against_others(residuals, jacobian, covariance, used) <= limit
-    return agrees if agrees.sum() >= LEAST_POSES else used
-
-
-def against_others(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Returns squared residuals (m,) over their own variance, χ² of 6 degrees of freedom: less than the pose's for
-    poses that took part, plus the solution's for the others."""
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian
     solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
     value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
     turned = np.einsum("mab,ma->mb", vector, white)
-    return np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
+    agrees = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1) <= limit
+    return agrees if agrees.sum() >= LEAST_POSES else used

@@ -11,8 +11,9 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import partners, read_pairs, read_robot, read_two
-from stcal.workflows.handeye_inputs import Files, one_source, read_robot_poses
+from stcal.handeye.data.pose_files import read_pairs, read_robot, read_two
+from stcal.handeye.data.pose_partners import partners
+from stcal.workflows.handeye_inputs import Files, one_source
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
@@ -127,7 +128,7 @@ def test_archives_of_much_and_programs_are_no_arrays(tmp_path):
     (tmp_path / "a.npz").write_bytes(archived(bytes(101_000_000)))
     assert "101 MB unpacked, at most 100 MB are read" in refused(tmp_path / "a.npz")
     (tmp_path / "b.npy").write_bytes(pickle.dumps(GOOD))
-    assert read_robot(tmp_path / "b.npy", Said()) is None  # the reader of tables says that it is no text
+    assert "not UTF-8 text" in refused(tmp_path / "b.npy")
 
 
 EULER = "x_mm,y_mm,z_mm"
@@ -285,4 +286,4 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     said = Said(rotation="ur-rotvec")
     refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
-    refuses("E-POSES-NOT-FOUND … u", read_robot_poses, path, statements=said)
+    refuses("E-POSES-NOT-FOUND … u", read_robot, path, said)

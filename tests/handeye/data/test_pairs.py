@@ -6,27 +6,9 @@ import pytest
 from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pose_pairs import inverted
 from stcal.io.table import COVARIANCE
+from tests.handeye.written import poses_file, sides_of, table
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
-
-CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
-
-
-def write(path, sides, unit="mm", edit=None, extra=None):
-    factor = {"mm": 1.0, "m": 1000.0}[unit]
-    header = [f"{name}_{c}" + (f"_{unit}" if c in "xyz" else "") for name in sides for c in CELLS]
-    rows = [
-        [repr(float(v)) for p in sides.values() for v in (*(p.translation[i] / factor), *p.quaternions()[i])]
-        for i in range(len(next(iter(sides.values()))))
-    ]
-    for (row, column), text in (edit or {}).items():
-        rows[row][header.index(column)] = text
-    for name, values in (extra or {}).items():
-        header.append(name)
-        for row, value in zip(rows, values, strict=True):
-            row.append(repr(float(value)))
-    path.write_text("\n".join(",".join(line) for line in [header, *rows]) + "\n")
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +25,7 @@ def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
         robot: flange if robot.startswith("base") else flange.inverse(),
         camera: board if camera.startswith("camera") else board.inverse(),
     }
-    pairs = read_poses(write(tmp_path / "poses.csv", sides, unit))
+    pairs = read_poses(table(tmp_path / "poses.csv", sides, unit=unit))
     assert pairs.base_from_flange.difference(flange) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
     assert pairs.camera_from_board.difference(board) == pytest.approx(np.zeros((8, 6)), abs=1e-9)
     assert pairs.names[:2] == ("line 2", "line 3")
@@ -52,30 +34,32 @@ def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        ({(2, "base_from_flange_x_mm"): "nan"}, "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
-        ({(5, "camera_from_board_qz"): "3"}, "E-QUATERNION-LENGTH … line 7"),
-        ({(0, "camera_from_board_y_mm"): "abc"}, "E-TABLE-NUMBER … 2 … camera_from_board_y_mm … 'abc'"),
+        (((2, 0), "nan"), "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
+        (((5, 13), "3"), "E-QUATERNION-LENGTH … line 7"),
+        (((0, 8), "abc"), "E-TABLE-NUMBER … 2 … camera_from_board_y_mm … 'abc'"),
     ],
 )
 def test_bad_cells_are_named_by_line(tmp_path, truth, edit, message):
-    sides = {"base_from_flange": truth.pairs.base_from_flange, "camera_from_board": truth.pairs.camera_from_board}
+    (row, column), cell = edit
+
+    def change(rows):
+        rows[row][column] = cell
+
     with fails_with(message):
-        read_poses(write(tmp_path / "poses.csv", sides, edit=edit))
+        read_poses(poses_file(tmp_path / "poses.csv", truth, change))
 
 
 def test_missing_and_doubled_sides(tmp_path, truth):
     flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
     every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
     for sides, fault in (({"base_from_flange": flange}, "no such columns … camera_from_board"), (every, "both … base")):
-        refuses(f"E-TABLE-COLUMN-MISSING … {fault}", read_poses, write(tmp_path / "a.csv", sides))
+        refuses(f"E-TABLE-COLUMN-MISSING … {fault}", read_poses, table(tmp_path / "a.csv", sides))
 
 
 def test_identical_poses_and_a_board_that_did_not_follow_are_named(tmp_path, truth):
     rows = [0, 1, 2, 3, 1, 5]
-    sides = {"base_from_flange": truth.pairs.base_from_flange[rows]}
-    sides["camera_from_board"] = truth.pairs.camera_from_board[rows]
     with fails_with("E-POSES-IDENTICAL … line 3 and line 6"):
-        read_poses(write(tmp_path / "poses.csv", sides))
+        read_poses(table(tmp_path / "poses.csv", {n: poses[rows] for n, poses in sides_of(truth.pairs).items()}))
     board = truth.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
     with fails_with("E-POSES-IDENTICAL … pose 4 and pose 5"):
         HandEyePoses(truth.pairs.base_from_flange, board)
@@ -107,7 +91,7 @@ def test_covariances_are_read_and_turned_over(tmp_path, truth):
     _, inverse, _ = inverted(board, covariance, None)
     extra = {f"board_from_camera_{name}": inverse[:, i[k], j[k]] for k, name in enumerate(COVARIANCE)}
     sides = {"base_from_flange": truth.pairs.base_from_flange, "board_from_camera": board.inverse()}
-    pairs = read_poses(write(tmp_path / "poses.csv", sides, extra=extra))
+    pairs = read_poses(table(tmp_path / "poses.csv", sides, **extra))
     assert pairs.camera_from_board_covariance == pytest.approx(covariance, rel=1e-6, abs=1e-10)
     assert pairs.base_from_flange_covariance is None
     assert pairs[2:4].camera_from_board_covariance.shape == (2, 6, 6)

@@ -30,14 +30,6 @@ def test_a_cubic_meets_the_trajectory():
     assert max(stream().rest()) < 1e-3
 
 
-def test_the_velocity_is_that_of_the_trajectory():
-    step = 1e-5
-    true = trajectory(AT + step, PHASE).difference(trajectory(AT - step, PHASE)) / (2 * step)
-    found = stream().velocity(AT)
-    assert np.abs(found - true)[:, 3:].max() < 0.01 < 50 < np.abs(true[:, 3:]).max()
-    assert np.abs(found - true)[:, :3].max() < 1e-4
-
-
 def test_noise_of_samples_is_told():
     """196 samples that miss the cubic through their neighbours: σ to 5 %; lengths of three numbers, √3 σ."""
     turn, shift = stream(noise=(1e-4, 0.05)).rest()

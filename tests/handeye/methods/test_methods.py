@@ -15,11 +15,8 @@ from stcal.handeye.methods.closed_form import (
     Bounds,
     EvolutionOptions,
     Objective,
-    equations,
     evolve,
-    polish,
     robust,
-    smallest_largest,
 )
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import disturbed, handeye, simulated
@@ -106,43 +103,6 @@ def test_evolution_follows_its_rules():
     assert objective.linear(again).cost == costs[5]
     still = evolve(objective, EvolutionOptions(seed=3, crossover=0.0), 500)
     assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
-
-
-def test_evolution_and_its_polish_look_at_the_same_objective():
-    truth = simulated(np.random.default_rng(7), 10, camera=(1e-3, 0.3))
-    motions = Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand"))
-    objective = Objective(motions, 800.0, 2.0)
-    x = Rigid.exp([0.3, -1.0, 0.5, 40.0, -20.0, 90.0])
-    a, b = motions.mount, motions.camera
-    by_hand = sum(
-        np.sum((al - x.rotation @ be) ** 2)
-        + 2.0 * np.sum((((ra - np.eye(3)) @ x.translation + ta - x.rotation @ tb) / 800) ** 2)
-        for al, be, ra, ta, tb in zip(
-            motions.alpha, motions.beta, a.rotation, a.translation, b.translation, strict=True
-        )
-    )
-    vector = np.concatenate([x.log()[:3], x.translation / 800])
-    assert objective.values(vector[None])[0] == pytest.approx(by_hand, rel=1e-12)
-    assert objective.linear(x).cost == pytest.approx(by_hand, rel=1e-12)
-    found = polish(objective, x)
-    assert np.abs(objective.linear(found).gradient).max() < 1e-6
-
-
-def test_the_convex_method_is_at_its_minimum():
-    """No step in any direction, small or large, makes the largest error smaller."""
-    truth = simulated(np.random.default_rng(8), 13, camera=(2e-3, 0.5))
-    c, d = equations(Motions.consecutive(Loop.of(truth.pairs, "eye-in-hand")), 1000.0)
-    start = np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)[0]
-    x = smallest_largest(c, d, start)
-
-    def largest(x):
-        return np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
-
-    assert largest(x) < 0.97 * largest(start)  # least squares is not the same
-    rng = np.random.default_rng(0)
-    for size in (1e-3, 1e-5):
-        steps = size * rng.normal(size=(300, 12))
-        assert min(largest(x + step) for step in steps) > largest(x) * (1 - 1e-4)
 
 
 @pytest.mark.parametrize(
