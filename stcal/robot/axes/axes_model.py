@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile
 from stcal.parallel import one_thread
 from stcal.robot.axes.fit import (
@@ -268,9 +268,8 @@ def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
 
 def _chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
     """Returns the chain through the axes; the flange is the last joint's frame."""
-    gaps = [frames[0], *(a.inverse() @ b for a, b in pairwise(frames))]
-    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-    return Chain(rotation, translation, Rigid(), nominal.prismatic, nominal.coupling)
+    gaps, ends = Poses.of([frames[0], *(a.inverse() @ b for a, b in pairwise(frames))]), (Rigid(),) * len(frames)
+    return Chain(gaps.rotation, gaps.translation, ends, nominal.prismatic, nominal.coupling)
 
 
 def _by_axes(function: Callable[[list[Rigid]], np.ndarray], frames: list[Rigid], robot: Robot) -> np.ndarray:

@@ -45,10 +45,9 @@ def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
     whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
     links = []
     for tool in tools:
-        chain = whole.branch(whole.carrier(tool))
-        end = chain.last_from_flange @ robot.tool(tool)
-        along = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1)
-        links.append(along.sum() + np.linalg.norm(end.translation))
+        path = whole.branch(tool).path()
+        end = whole.ends[path[-1]] @ robot.tool(tool)
+        links.append(np.linalg.norm([*whole.translation[list(path[1:])], end.translation], axis=1).sum())
     return float(max(max(links) + travel[np.isfinite(travel)].sum(), 1.0))
 
 
@@ -185,7 +184,7 @@ class InverseProblem:
         middle = np.clip(middle, *bounds.T)
         # A whole turn of the controller's value leaves the arm in place only if the coupling maps it to whole turns.
         whole = np.isclose(robot.coupling, np.round(robot.coupling)) & ~(sliding[:, None] & (robot.coupling != 0))
-        few = len(chain.branch(chain.carrier(tool)).path()) < 6
+        few = len(chain.branch(tool).path()) < 6
         return cls(robot, tool, unit, reach, bounds, middle, ~sliding & whole.all(axis=0), few)
 
     def refuse_redundant(self) -> None:
