@@ -84,7 +84,7 @@ class Cell:
         """Random places in the cube, without noise."""
         a = MIDDLE + rng.uniform(-side / 2, side / 2, (count, 3))
         poses = Poses(Rotation.from_rotvec(rng.uniform(-tilt, tilt, (count, 3))).as_matrix() @ DOWN, a)
-        q = InverseProblem.of(self.drawn).solve(poses, np.tile(NEAR, (count, 1)))
+        q = InverseProblem(self.drawn).solve(poses, np.tile(NEAR, (count, 1)))
         off = np.abs(forward(self.drawn, q).translation - a).max()
         if off > 1e-6:
             raise DegenerateError("E-NO-MINIMUM", f"inverse kinematics: {off:.2g} mm from a place of the cube")

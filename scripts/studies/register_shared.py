@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import DegenerateError
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.register import register
 from stcal.register.registration import affine_least_squares
 from stcal.robot.identification.identify import identify
@@ -114,9 +114,8 @@ def robot_of(path: Path) -> Robot:
             gap = Rigid()
             if name == COLUMN:
                 gap = Rigid(np.eye(3), [0.0, 0.0, -COLUMN_TIP_MM])
-    chain = Chain(
-        np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps]), Rigid(), prismatic, np.eye(7)
-    )
+    placed = Poses.of(gaps)
+    chain = Chain(placed.rotation, placed.translation, (Rigid(),) * 7, prismatic, np.eye(7))
     rows = tuple(DHRow(0.0, 0.0, 0.0, 0.0) for _ in gaps)
     joints = tuple(Joint("prismatic" if p else "revolute") for p in prismatic)
     return robot_from_chain(chain, {"": gap}, Robot("trailblazer", "modified", rows, joints))

@@ -195,14 +195,14 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
         carriers[tool], tools[tool] = last, passed
     joints, n, placed = tuple(joint.limited() for joint in moving), len(moving), Poses.of(gaps)
     sliding = np.array([joint.type == "prismatic" for joint in joints])
-    chain = Chain(placed.rotation, placed.translation, flange, sliding, np.eye(n))
-    if "" in paths:
+    ends, tree = (*(Rigid(),) * (n - 1), flange), None if "" in paths else Tree(mounts, carriers)
+    chain = Chain(placed.rotation, placed.translation, ends, sliding, np.eye(n), None, tree)
+    if tree is None:
         tools = {tool: flange.inverse() @ pose for tool, pose in tools.items()}
         robot = robot_between(chain, tools, name, convention, joints)
     else:
-        rows, tree = (DHRow(0, 0, 0, 0),) * n, Tree(mounts, carriers)
-        chain = replace(chain, tree=tree, ends=(Rigid(),) * n)
-        robot = robot_from_chain(chain, tools, Robot(name, convention, rows, joints, tools=tools, tree=tree))
+        bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=tree)
+        robot = robot_from_chain(chain, tools, bare)
     q = fixed_values(n)
     for tool, pose in tools.items():
         require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
@@ -384,11 +384,11 @@ def robot_urdf(robot: Robot) -> str:
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
             shown = {end: repr(float(value)) for end, value in ends.items()}
             ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-    if chain.tree is None:
-        fix(f"link_{len(chain)}", FLANGE, chain.last_from_flange)
+    if robot.tree is None:
+        fix(f"link_{len(chain)}", FLANGE, chain.ends[-1])
     for name, tool in robot.tools.items():
         carrier = chain.carrier(name)
-        at = (FLANGE, tool) if chain.tree is None else (f"link_{carrier + 1}", chain.end(carrier) @ tool)
+        at = (FLANGE, tool) if robot.tree is None else (f"link_{carrier + 1}", chain.end(carrier) @ tool)
         fix(at[0], link_of(name), at[1])
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'

@@ -1,6 +1,8 @@
 """The robot from the axes of all joints: Denavit–Hartenberg rows, tools, their σ, and what to refuse."""
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, pairwise
 from typing import Annotated, ClassVar, Literal
@@ -10,8 +12,8 @@ from pydantic import BeforeValidator, Field
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.rigid import Rigid
-from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile
 from stcal.parallel import one_thread
 from stcal.robot.axes.fit import (
     GROSS,
@@ -61,7 +63,7 @@ REFITTED = 200
 """Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Pair:
     """Two consecutive axes; :class:`AxesFile` describes the fields (``pairs``). None along prismatic joints."""
 
@@ -126,16 +128,7 @@ class AxesResult:
         return self.robot.tools
 
 
-class AxisPart(Part):
-    world_from_axis: Pose
-    covariance: Matrix
-    rms_mm: float
-    sigma_mm: float
-    redundancy: int
-    span: float
-    arcs: Annotated[list[str], BeforeValidator(lambda arcs: [getattr(arc, "target", arc) for arc in arcs])]
-    radii: Annotated[list[Finite], BeforeValidator(list)]
-    heights: Annotated[list[Finite], BeforeValidator(list)]
+OfAxis = Annotated[AxisFit, Named("world_from_axis covariance rms_mm sigma_mm redundancy span arcs radii heights")]
 
 
 class LeaveOneOutRows(Part):
@@ -149,7 +142,7 @@ class AxesFile(ResultFile):
 
     format: Literal["stcal axes 1"] = Field(description="the file's form and its version")
     robot: RobotText = Field(description="text of the robot file")
-    fits: list[AxisPart] = Field(
+    fits: list[OfAxis] = Field(
         description="of each joint, all joints at zero: `world_from_axis`, z along positive motion; `covariance` of "
         "rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by its own noise; `rms_mm` of a coordinate of the "
         "residuals, `sigma_mm`, `redundancy`; `span`, rad or mm; reflectors of its `arcs`, `radii` and `heights`, mm"
@@ -275,9 +268,8 @@ def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
 
 def _chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
     """Returns the chain through the axes; the flange is the last joint's frame."""
-    gaps = [frames[0], *(a.inverse() @ b for a, b in pairwise(frames))]
-    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-    return Chain(rotation, translation, Rigid(), nominal.prismatic, nominal.coupling)
+    gaps, ends = Poses.of([frames[0], *(a.inverse() @ b for a, b in pairwise(frames))]), (Rigid(),) * len(frames)
+    return Chain(gaps.rotation, gaps.translation, ends, nominal.prismatic, nominal.coupling)
 
 
 def _by_axes(function: Callable[[list[Rigid]], np.ndarray], frames: list[Rigid], robot: Robot) -> np.ndarray:
@@ -331,40 +323,36 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
         spread = jacobian[:3] @ covariance @ jacobian[:3].T  # of the angle's vector
         # of exactly parallel axes the largest σ of that
         variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
+        sigma = np.where(np.isfinite(value[3:]), _sigma_of(jacobian[3:], covariance), np.nan)
+        lengths = np.column_stack([np.abs(value[3:]), sigma])
+        lengths[2, 0] = value[5]
         pair = Pair(
-            joint=i + 1,
-            angle_rad=np.pi - acute if opposed else acute,
-            angle_sigma_rad=float(np.sqrt(max(variance, 0))),
-            parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
+            i + 1,
+            np.pi - acute if opposed else acute,
+            float(np.sqrt(max(variance, 0))),
+            bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
+            *(length if np.isfinite(length) else None for length in lengths.ravel().tolist()),
         )
-        if np.isfinite(value[3]):
-            pair = _with_lengths(pair, acute, value[3:], _sigma_of(jacobian[3:], covariance), size)
-        pairs.append(pair)
+        pairs.append(replace(pair, refused=_refused(pair, acute, size)))
     return tuple(pairs)
 
 
-def _with_lengths(pair: Pair, angle: float, value: np.ndarray, sigma: np.ndarray, size: float) -> Pair:
-    """Returns the pair with its lengths, and why Denavit and Hartenberg's must not be used, if so."""
-    distance, normal, foot = (float(v) for v in value)
-    pair = replace(pair, distance_mm=abs(distance), distance_sigma_mm=float(sigma[0]))
-    if not np.isfinite(foot):
-        return replace(pair, refused="the axes are parallel: every common normal is as good as any other")
+def _refused(pair: Pair, acute: float, size: float) -> str:
+    """Returns why the lengths of Denavit and Hartenberg must not be used, if so."""
+    if pair.distance_mm is None:
+        return ""
+    if pair.normal_sigma_mm is None or pair.foot_mm is None or pair.foot_sigma_mm is None:
+        return "the axes are parallel: every common normal is as good as any other"
+    foot_m, normal, foot_sigma_m = abs(pair.foot_mm) / 1e3, pair.normal_sigma_mm, pair.foot_sigma_mm / 1e3
     reasons = []
-    if abs(foot) > size:
-        reasons.append(f"foot {abs(foot) / 1e3:.4g} m away, the arm is {size / 1e3:.3g} m long")
-    if max(sigma[1:]) > USABLE_MM:
-        reasons.append(f"σ {sigma[1]:.3g} mm of a and {sigma[2] / 1e3:.3g} m of the foot, {USABLE_MM:g} mm needed")
+    if abs(pair.foot_mm) > size:
+        reasons.append(f"foot {foot_m:.4g} m away, the arm is {size / 1e3:.3g} m long")
+    if max(normal, pair.foot_sigma_mm) > USABLE_MM:
+        reasons.append(f"σ {normal:.3g} mm of a and {foot_sigma_m:.3g} m of the foot, {USABLE_MM:g} mm needed")
     if reasons:
-        per_urad = abs(distance) / np.sin(angle) ** 2 * 1e-6
-        reasons.append(f"axes {np.degrees(angle):.4f}° apart, 1 µrad moves the foot by {per_urad / 1e3:.3g} m")
-    return replace(
-        pair,
-        normal_mm=abs(normal),
-        normal_sigma_mm=float(sigma[1]),
-        foot_mm=foot,
-        foot_sigma_mm=float(sigma[2]),
-        refused="; ".join(reasons),
-    )
+        per_urad_m = pair.distance_mm / np.sin(acute) ** 2 * 1e-9
+        reasons.append(f"axes {np.degrees(acute):.4f}° apart, 1 µrad moves the foot by {per_urad_m:.3g} m")
+    return "; ".join(reasons)
 
 
 def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -485,15 +473,13 @@ def _remarks(
     return notes if moved is None else [*notes, moved.sentence()]
 
 
-def _leave_one_out(
-    data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
-) -> LeaveOneOut:
+def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, passed: np.ndarray) -> LeaveOneOut:
     """Returns the values of the pairs without each row."""
-    groups, counts = {}, {}  # rows that were measured together: the same joint values, each reflector once
+    groups, counts = defaultdict(list), Counter()  # rows measured together: the same joint values, each reflector once
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
-        key = q.tobytes(), target
-        counts[key] = counts.get(key, 0) + 1
-        groups.setdefault((key[0], counts[key]), []).append(row)
+        key = q.tobytes()
+        counts[key, target] += 1
+        groups[key, counts[key, target]].append(row)
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
     if len(instants) > REFITTED:
@@ -514,26 +500,21 @@ def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit]
     for found, rows in zip(values, instants, strict=True):
         first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
         again, at = fits[:first], points[first]
-        try:
+        with suppress(DegenerateError, ConvergenceError):
             for fit, value in zip(fits[first:], kinematic[first:], strict=True):
                 again = [*again, fit.without(at, rows)]
                 at = again[-1].unwound(at, value)[1]
             found[:] = _pair_values([fit.world_from_axis for fit in again], nominal)
-        except (DegenerateError, ConvergenceError):
-            continue
     return values
 
 
-def _by_influence(
-    instants: list[list[int]], fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
-) -> np.ndarray:
+def _by_influence(instants: list[list[int]], fits: list[AxisFit], nominal: Robot, passed: np.ndarray) -> np.ndarray:
     """Returns the values (r, 6 (n − 1)) without each instant's rows, to first order."""
     number = {row: i for i, rows in enumerate(instants) for row in rows}
     changes = []
-    for fit, derivatives in zip(fits, passed, strict=True):
-        change = np.zeros((len(instants), len(fit.gain)))
-        np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
-        changes.append(change + sum(old @ by.T for old, by in zip(changes, derivatives, strict=True)))
+    for fit in fits:
+        changes.append(np.zeros((len(instants), len(fit.gain))))
+        np.add.at(changes[-1], [number[row] for row in fit.rows.tolist()], fit.influence())
     frames = [fit.world_from_axis for fit in fits]
     slope = _by_axes(lambda f: _pair_values(f, nominal), frames, nominal)
-    return _pair_values(frames, nominal) + np.concatenate(changes, axis=1) @ slope.T
+    return _pair_values(frames, nominal) + np.concatenate(changes, axis=1) @ (slope @ passed).T

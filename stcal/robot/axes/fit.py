@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -209,7 +210,7 @@ class AxisFit:
     """The axis of one joint, by the distances of its arcs' points from circles or lines; p is 4 or, prismatic, 2.
 
     ``where`` : the joint, for messages; ``world_from_axis`` : z of this frame is the joint's positive direction; the
-    origin lies on the axis, at the foot of the measured points' centroid; ``arcs`` : those used; ``near`` : arcs too
+    origin lies on the axis, at the foot of the measured points' centroid; ``used`` : its arcs; ``near`` : arcs too
     close to the axis to be used; ``rows``, ``points`` : (k,), (k, 3) mm of each point of each arc, with the joints
     before this one unwound; ``member`` : (k, a) one-hot, the arc of each point; ``size`` : of the largest arc, mm;
     ``weights`` : (k,), 0 for gross errors; ``span`` : range of the joint's values, rad or mm; ``settled`` : whether the
@@ -218,7 +219,7 @@ class AxisFit:
 
     where: str
     prismatic: bool
-    arcs: tuple[Arc, ...]
+    used: tuple[Arc, ...]
     rows: np.ndarray
     points: np.ndarray
     member: np.ndarray
@@ -229,26 +230,15 @@ class AxisFit:
     span: float = np.nan
     settled: bool = False
 
-    @classmethod
-    def of(cls, points: np.ndarray, arcs: Sequence[Arc], prismatic: bool, where: str, start: Rigid) -> "AxisFit":
-        """Returns the fit at its start: points (m, 3) of all rows, of equal weights."""
-        rows = np.concatenate([arc.rows for arc in arcs])
-        return cls(
-            where=where,
-            prismatic=prismatic,
-            arcs=tuple(arcs),
-            rows=rows,
-            points=points[rows],
-            member=np.repeat(np.eye(len(arcs)), [len(arc.rows) for arc in arcs], axis=0),
-            size=max(_spread(points[arc.rows]) for arc in arcs),
-            weights=np.ones(len(rows)),
-            world_from_axis=start,
-        )
-
     @property
     def joint(self) -> int:
         """Number of the joint, from 0."""
-        return self.arcs[0].joint
+        return self.used[0].joint
+
+    @property
+    def arcs(self) -> tuple[str, ...]:
+        """Reflector of each arc."""
+        return tuple(arc.target for arc in self.used)
 
     @cached_property
     def local(self) -> np.ndarray:
@@ -272,14 +262,14 @@ class AxisFit:
         return values - self.member @ self.means(values)
 
     @property
-    def radii(self) -> np.ndarray:
+    def radii(self) -> list[float]:
         """Radii (a,) of the arcs, mm; nan for a prismatic joint."""
-        return self.means(self.values)[:, 0] * (np.nan if self.prismatic else 1.0)
+        return (self.means(self.values)[:, 0] * (np.nan if self.prismatic else 1.0)).tolist()
 
     @property
-    def heights(self) -> np.ndarray:
+    def heights(self) -> list[float]:
         """Heights (a,) of the arcs above the origin, mm; nan for a prismatic joint."""
-        return self.means(self.values)[:, 1] * (np.nan if self.prismatic else 1.0)
+        return (self.means(self.values)[:, 1] * (np.nan if self.prismatic else 1.0)).tolist()
 
     @cached_property
     def residuals(self) -> np.ndarray:
@@ -300,7 +290,7 @@ class AxisFit:
     @cached_property
     def gain(self) -> np.ndarray:
         """Derivative (p, k, 3) of the axis (rx, ry rad, tx, ty mm in its own frame) by the points."""
-        return np.einsum("pkv,kvc->pkc", self._inverse(), self._by_points())
+        return np.einsum("kpv,kvc->pkc", self._inverse(), self._by_local() @ self.world_from_axis.rotation.T)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -325,12 +315,9 @@ class AxisFit:
 
     def influence(self) -> np.ndarray:
         """Returns the change (k, p) of the axis, linear, without each of its points (Cook & Weisberg 1982)."""
-        step = np.einsum("pkc,kvc->kpv", self.gain, self._by_points())  # derivative of the axis by the residuals
-        weight = np.maximum(self.weights, TINY)
-        normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
-        lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
+        step = self._inverse()
         sums = np.maximum(self.member @ (self.weights @ self.member), TINY)
-        lever += (self.weights / sums)[:, None, None] * np.eye(2)
+        lever = (self.weights / sums)[:, None, None] * np.eye(2) - self._jacobian() @ step
         return -(step @ np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None]))[:, :, 0]
 
     def without(self, points: np.ndarray, left_out: Sequence[int]) -> "AxisFit":
@@ -346,17 +333,17 @@ class AxisFit:
         turn = Rotation.from_rotvec(-value[:, None] * z).as_matrix()
         return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
 
-    def solved(self, moved: np.ndarray, starts: bool = True) -> "AxisFit":
-        """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint;
-        ``starts`` : the axis is not known yet."""
+    def solved(self, moved: np.ndarray | None) -> "AxisFit":
+        """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint, None
+        if the axis is known nearly."""
         if self.redundancy < 1:
             raise DegenerateError(
                 "E-AXES-FEW",
-                f"{self.where}: {len(self.rows)} positions on {len(self.arcs)} arcs leave no redundancy; another "
+                f"{self.where}: {len(self.rows)} positions on {len(self.used)} arcs leave no redundancy; another "
                 "position or a second reflector needed",
             )
         fit = self
-        if starts:  # weights before the first step, which a gross error would lead astray
+        if moved is not None:  # weights before the first step, which a gross error would lead astray
             fit = self._started(moved[self.rows])
             fit = replace(fit, weights=fit._robust()[2])
         for gross in (np.inf, GROSS):
@@ -376,11 +363,10 @@ class AxisFit:
     def _started(self, moved: np.ndarray) -> "AxisFit":
         """Returns the axis from all points; if some stand out, from the subset with the least median residual. A subset
         leaves out one point, or all points at one value of the joint ``moved`` (k,)."""
-        count = len(self.rows)
-        value = np.unique(moved, return_inverse=True)[1]
-        points, values = (np.arange(n) % min(n, STARTS) for n in (count, value.max() + 1))
-        sets = [np.ones(count), *(points != out for out in np.unique(points))]
-        sets += [values[value] != out for out in np.unique(values) if value.max() > 1]
+        count, sets = len(self.rows), [np.ones(len(self.rows))]
+        for each in (np.arange(count), np.unique(moved, return_inverse=True)[1]):
+            groups = each % STARTS
+            sets += [groups != out for out in np.unique(groups) if each.max() > 1]
         least, best = np.inf, None
         for i, subset in enumerate(sets):
             fit = replace(self, weights=np.asarray(subset, float))
@@ -390,13 +376,9 @@ class AxisFit:
                 least, best = np.median(length), fit
             if i == 0 and length.max() <= min(GROSS * sigma, QUIET * self.size):
                 break
-        if best is None:
-            raise DegenerateError(
-                "E-AXES-UNDETERMINED",
-                f"{self.where}: no axis follows from any {count - 1} of its {count} positions; check them, or measure "
-                "the sweep again",
-            )
-        return best
+        return best or self._undetermined(
+            f"no axis follows from any {count - 1} of its {count} positions; check them, or measure the sweep again"
+        )
 
     def _linear_start(self) -> Rigid:
         """Returns the axis by the arcs' common scatter and the circles' common centre (Kåsa 1976)."""
@@ -424,36 +406,31 @@ class AxisFit:
         sigma = max(robust_sigma(length, 2, redundancy), self._floor)
         return length, sigma, huber_weights(length, HUBER * sigma)
 
-    def _by_points(self) -> np.ndarray:
-        """Returns the derivative (k, 2, 3) of the values by the points."""
-        local, axes = self.local, self.world_from_axis.rotation
-        if self.prismatic:
-            return np.broadcast_to(axes[:, :2].T, (len(local), 2, 3))
-        outward = local[:, :2] / np.maximum(np.hypot(local[:, 0], local[:, 1]), TINY)[:, None]
-        return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
+    def _by_local(self) -> np.ndarray:
+        """Returns the derivative (k, 2, 3) of the values by the points in the axis's frame."""
+        by_local = np.zeros((len(self.local), 2, 3))
+        by_local[:, 0, 0] = by_local[:, 1, 1 if self.prismatic else 2] = 1.0
+        if not self.prismatic:
+            across = self.local[:, :2]
+            by_local[:, 0, :2] = across / np.maximum(np.hypot(*across.T), TINY)[:, None]
+        return by_local
 
     def _jacobian(self) -> np.ndarray:
-        """Returns the derivative (2 k, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
-        u, v, w = self.local.T
-        zero = np.zeros_like(u)
-        if self.prismatic:
-            values = np.array([[zero, -w], [w, zero]])
-        else:
-            u1, v1 = np.array([u, v]) / np.maximum(np.hypot(u, v), TINY)
-            values = np.array([[v1 * w, -u1 * w, -u1, -v1], [-v, u, zero, zero]])
-        return self.demean(np.moveaxis(values, 2, 0).reshape(len(u), -1)).reshape(2 * len(u), -1)
+        """Returns the derivative (k, 2, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
+        by_axis = self._by_local() @ -_motions(self.local, np.eye(3), self.prismatic)
+        return self.demean(by_axis.reshape(len(by_axis), -1)).reshape(by_axis.shape)
 
     def _inverse(self) -> np.ndarray:
-        """Returns the matrix (p, k, 2) by which residuals become the Gauss-Newton step."""
+        """Returns the matrices (k, p, 2) by which residuals become the Gauss-Newton step."""
         jacobian = self._jacobian()
-        root, p = np.repeat(np.sqrt(self.weights), 2), jacobian.shape[1]
+        p, root = jacobian.shape[2], np.repeat(np.sqrt(self.weights), 2)
         unit = np.array([1 / self.size, 1 / self.size, 1.0, 1.0])[:p]
-        u, s, vt = np.linalg.svd(root[:, None] * jacobian * unit, full_matrices=False)
+        u, s, vt = np.linalg.svd(root[:, None] * jacobian.reshape(-1, p) * unit, full_matrices=False)
         if s[-1] <= SINGULAR * s[0]:
             self._undetermined("its arcs do not determine an axis; sweep further, or with reflectors farther apart")
-        return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, -1, 2)
+        return -np.moveaxis((unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, -1, 2), 1, 0)
 
-    def _undetermined(self, said: str, code: str = "E-AXES-UNDETERMINED") -> None:
+    def _undetermined(self, said: str, code: str = "E-AXES-UNDETERMINED") -> NoReturn:
         raise DegenerateError(code, f"{self.where}: {said}")
 
     def _descended(self) -> "AxisFit":
@@ -463,7 +440,9 @@ class AxisFit:
 
         def linearise(frame: Rigid) -> NormalEquations:
             fit = replace(self, world_from_axis=frame)
-            return NormalEquations.of(root * fit.residuals.ravel(), root[:, None] * fit._jacobian())
+            return NormalEquations.of(
+                root * fit.residuals.ravel(), root[:, None] * fit._jacobian().reshape(len(root), -1)
+            )
 
         def moved(frame: Rigid, step: np.ndarray) -> Rigid:
             """Returns the moved frame with its origin at the foot of the points' centroid."""
@@ -477,22 +456,22 @@ class AxisFit:
 
     def _require_known(self) -> None:
         """Refuses an axis whose σ is too large for its linear covariance."""
-        if not self.prismatic and (self.means(self.values)[:, 0] <= NEAR_AXIS * self.sigma_mm).all():
+        if not self.prismatic and max(self.radii) <= NEAR_AXIS * self.sigma_mm:
             self._undetermined(ON_AXIS.format(self.size))
         sigma, most_mm = self.sigma_mm * np.linalg.norm(self.gain, axis=2), WEAK_RAD * self.size * 10
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
-        if (direction > WEAK_RAD or place > most_mm) and self.size < STANDS_STILL_MM:
+        if direction <= WEAK_RAD and place <= most_mm:
+            return
+        if self.size < STANDS_STILL_MM:
             self._undetermined(
                 f"its reflectors stay within {self.size:.3g} mm of one position while its values change; check that it "
                 "moved and that each position was measured again, or put a reflector off its axis",
                 "E-AXES-STILL",
             )
-        if direction > WEAK_RAD or place > most_mm:
-            self._undetermined(
-                f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm, "
-                f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed; sweep further, or with reflectors farther "
-                "apart"
-            )
+        self._undetermined(
+            f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm, "
+            f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed; sweep further, or with reflectors farther apart"
+        )
 
     def oriented(self, moved: np.ndarray) -> "AxisFit":
         """Returns the axis with z along positive motion; refuses motion that does not match the values (m,)."""
@@ -523,6 +502,13 @@ class AxisFit:
         return replace(self, world_from_axis=axis, span=float(np.ptp(moved)))
 
 
+def _motions(xyz: np.ndarray, axes: np.ndarray, sliding: bool) -> np.ndarray:
+    """Returns the motions (m, 3, p) of points (m, 3) with a frame of ``axes`` at the origin, by its rx, ry, tx, ty."""
+    across = np.broadcast_to(axes[:, :2], (len(xyz), 3, 2))
+    turning = -skew(xyz) @ across
+    return turning if sliding else np.concatenate([turning, across], axis=2)
+
+
 ON_AXIS = (
     "all reflectors stay within {:.3g} mm of one place while it moves, so close to its axis that they say nothing "
     "about it; put a reflector off the axis"
@@ -538,58 +524,68 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     Raises DegenerateError: no redundancy, reflectors on the axis, or arcs too short to give a direction. Raises
     InputError: the motion observed about the axis is not that of the joint's values.
     """
-    size = np.array([_spread(points[arc.rows]) for arc in arcs])
+    size = np.array([np.linalg.norm(p - p.mean(axis=0), axis=1).max() for p in (points[arc.rows] for arc in arcs)])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
         raise DegenerateError("E-AXES-UNDETERMINED", f"{where}: {ON_AXIS.format(size.max())}")
+
+    def of(use: np.ndarray, start: Rigid) -> AxisFit:
+        """Returns the fit to these arcs at its start, with equal weights."""
+        used = tuple(arcs[i] for i in np.flatnonzero(use))
+        rows = np.concatenate([arc.rows for arc in used])
+        return AxisFit(
+            where=where,
+            prismatic=prismatic,
+            used=used,
+            rows=rows,
+            points=points[rows],
+            member=np.repeat(np.eye(len(used)), [len(arc.rows) for arc in used], axis=0),
+            size=float(size[use].max()),
+            weights=np.ones(len(rows)),
+            world_from_axis=start,
+        )
+
     use = size >= FIRST_SIZE * size.max()
-    fit = AxisFit.of(points, [arcs[i] for i in np.flatnonzero(use)], prismatic, where, Rigid()).solved(moved)
+    fit = of(use, Rigid()).solved(moved)
     if not prismatic and not use.all():
-        frame = fit.world_from_axis
-        local = [(points[arc.rows] - frame.translation) @ frame.rotation for arc in arcs]
-        far = np.array([np.hypot(*each.T[:2]).mean() for each in local]) > NEAR_AXIS * fit.sigma_mm
-        if (far & ~use).any():
-            use |= far
-            used = [arcs[i] for i in np.flatnonzero(use)]
-            fit = AxisFit.of(points, used, prismatic, where, frame).solved(moved, starts=False)
+        across = (points - fit.world_from_axis.translation) @ fit.world_from_axis.rotation[:, :2]
+        radius = np.array([np.hypot(*across[arc.rows].T).mean() for arc in arcs])
+        more = ~use & (radius > NEAR_AXIS * fit.sigma_mm)
+        if more.any():
+            use |= more
+            fit = of(use, fit.world_from_axis).solved(None)
     return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(~use)))
-
-
-def _spread(points: np.ndarray) -> float:
-    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
 
 def fit_axes(
     data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
-) -> tuple[list[AxisFit], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
-    """Returns the fits in order, their common covariance, the points with all joints unwound, and the derivatives of
-    each axis by the axes before it. Each axis is fitted to points with the joints before it unwound.
+) -> tuple[list[AxisFit], np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the fits in order, their common covariance, the points with all joints unwound, and the derivatives
+    (P, P) of the parameters of all axes by those of each joint's own fit, which axes after it inherit by unwinding.
 
     The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
     """
     kinematic = data.q @ robot.coupling.T
-    points, m = np.array(data.points()), len(data)
+    points, m, count = np.array(data.points()), len(data), int(np.where(robot.prismatic, 2, 4).sum())
     turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # rotation of the noise by unwinding
-    fits, response, inherited, passed = [], [], [], []
+    fits, by_noise, by_before = [], np.zeros((count, m, 3)), np.zeros((count, count))
+    inherited = np.zeros((m, 3, 0))  # derivatives of the unwound points by the axes before
     for j, sliding in enumerate(robot.prismatic):
         joint_arcs = [arc for arc in arcs if arc.joint == j]
         fit = fit_axis(points, kinematic[:, j], joint_arcs, bool(sliding), f"{data.where}: joint {j + 1}")
-        # derivative of this axis by σ-scaled noise of every row: its own, and through the axes before it
-        to_noise = np.zeros((len(fit.gain), m, 3))
-        own_noise = fit.sigma_mm * np.einsum("pkc,kcd->kpd", fit.gain, turned[fit.rows])
-        np.add.at(to_noise.swapaxes(0, 1), fit.rows, own_noise)  # a row may belong to several arcs
-        passed.append([np.einsum("pkc,kcq->pq", fit.gain, jacobian[fit.rows]) for jacobian in inherited])
-        for before, by in zip(response, passed[-1], strict=True):
-            to_noise += np.einsum("pq,qmc->pmc", by, before)
+        begin = inherited.shape[2]
+        own = slice(begin, begin + len(fit.gain))
+        noise = fit.sigma_mm * np.einsum("pkc,kcd->kpd", fit.gain, turned[fit.rows])
+        np.add.at(by_noise[own].swapaxes(0, 1), fit.rows, noise)  # a row may belong to several arcs
+        by_before[own, :begin] = np.einsum("pkc,kcq->pq", fit.gain, inherited[fit.rows])
         axis, (turn, after) = fit.world_from_axis, fit.unwound(points, kinematic[:, j])
         # The unwound points change with rx, ry, tx, ty of the axis: δ = D(U x) − U(D x).
-        shifts = [np.broadcast_to(axis.rotation[:, c], (2, m, 3)) for c in (0, 1)]
-        places = np.stack([after, points]) - axis.translation
-        moves = [np.cross(shift, places) for shift in shifts] + shifts[: len(fit.gain) - 2]
-        by_axis = np.stack([of_after - np.einsum("mij,mj->mi", turn, of_point) for of_after, of_point in moves], axis=2)
-        inherited = [*(turn @ jacobian for jacobian in inherited), by_axis]
+        of_after, of_points = (
+            _motions(xyz - axis.translation, axis.rotation, fit.prismatic) for xyz in (after, points)
+        )
+        inherited = np.concatenate([turn @ inherited, of_after - turn @ of_points], axis=2)
         fits.append(fit)
-        response.append(to_noise)
         points, turned = after, turn @ turned
-    rows = np.concatenate(response)
-    stacked = rows.reshape(-1, 3 * m) if virtual is None else virtual.by_pose(rows)
+    passed = np.linalg.inv(np.eye(count) - by_before)
+    response = np.einsum("pq,qmc->pmc", passed, by_noise)
+    stacked = response.reshape(count, -1) if virtual is None else virtual.by_pose(response)
     return fits, stacked @ stacked.T, points, passed

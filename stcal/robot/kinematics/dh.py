@@ -84,8 +84,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     )
     if chain.elasticity is None:
         return robot
-    loaded = len(chain) - 1 if tree is None else tree.carrier("", len(chain) - 1)
-    return replace(robot, elasticity=_elasticity(robot, chain, chain.elasticity, end(loaded)))
+    return replace(robot, elasticity=_elasticity(robot, chain, chain.elasticity, end(chain.carrier(""))))
 
 
 def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_loaded: Rigid) -> Elasticity:

@@ -33,8 +33,8 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
     Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
-    values = _joint_vectors(q, robot)
-    return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
+    values, flange_from_tool = _joint_vectors(q, robot), robot.tool(tool)
+    return flange_poses(_from_base(robot, tool), values, loaded(payload_kg, len(values))) @ flange_from_tool
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
@@ -44,10 +44,9 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     origin, in the axes of the base (left perturbation), by rad or mm of each joint; the deflection of links is taken as
     constant. Raises InputError: joint values of another shape or not finite; an unknown tool.
     """
-    values = _joint_vectors(q, robot)
-    chain = _from_base_to_tool(robot, tool)
+    values, flange_from_tool, chain = _joint_vectors(q, robot), robot.tool(tool), _from_base(robot, tool)
     path = list(chain.path())
-    columns = joint_motions(chain, values, flange_poses(chain, values))
+    columns = joint_motions(chain, values, flange_poses(chain, values) @ flange_from_tool)
     return np.moveaxis(columns[path], 0, 2) @ chain.coupling[path]
 
 
@@ -63,10 +62,10 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
     """Returns world_from_flange of joint vectors (m, n); raises InputError for a tree, which has no one flange."""
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     path = chain.path()
+    end = chain.ends[path[-1]]
     for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
         axes, origin = _walk(chain, path, q[part], conditions[part])
-        end = chain.last_from_flange
         rotation[part] = np.einsum("cjm,ck->mjk", axes, end.rotation)
         translation[part] = (origin + np.einsum("cjm,c->jm", axes, end.translation)).T
     return Poses(rotation, translation)
@@ -74,13 +73,11 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
 
 def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
     """Returns world_from_flange of joint vectors (m, n), for the flange that carries each row's target."""
-    if chain.tree is None:
-        return flange_poses(chain, q, conditions)
     carrier = np.array([chain.carrier(name) for name in targets])
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for each in np.unique(carrier):
         rows = carrier == each
-        found = flange_poses(chain.branch(int(each)), q[rows], conditions[rows])
+        found = flange_poses(replace(chain, flange_joint=int(each)), q[rows], conditions[rows])
         rotation[rows], translation[rows] = found.rotation, found.translation
     return Poses(rotation, translation)
 
@@ -121,7 +118,7 @@ def torques(
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        if chain.tree is not None and "" not in chain.tree.carriers:
+        if "" not in chain.tree.carriers:
             raise InputError(
                 "E-ROBOT-TREE",
                 "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
@@ -178,7 +175,7 @@ def _walk(
     q = q @ chain.coupling.T
     axes = np.repeat(np.eye(3)[:, :, None], m, axis=2)
     origin = np.zeros((3, m))
-    moved = {-1: (axes, origin)}  # by the joints that carry others than the next one
+    moved = {-1: (axes, origin)}  # by the joints, which may carry others than the next one
     for i in joints:
         if chain.after(i) != i - 1:
             axes, origin = moved[chain.after(i)]
@@ -194,7 +191,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.tree is not None:
+        if chain.tree.mounts:
             moved[i] = axes, origin
     return axes, origin
 
@@ -308,11 +305,9 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
     return replace(chain, rotation=rotation, translation=translation)
 
 
-def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
-    """Returns the chain from the base, with the tool as its flange."""
-    chain = replace(robot, world_from_base=Rigid()).chain()
-    chain = chain.branch(chain.carrier(tool))
-    return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))
+def _from_base(robot: Robot, tool: str) -> Chain:
+    """Returns the chain from the base to the flange that carries a tool."""
+    return replace(robot, world_from_base=Rigid()).chain().branch(tool)
 
 
 def _joint_vectors(q: ArrayLike, robot: Robot) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Inverse kinematics of any serial arm: many poses at once, joint limits, nearest branch."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,10 +45,9 @@ def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
     whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
     links = []
     for tool in tools:
-        chain = whole.branch(whole.carrier(tool))
-        end = chain.last_from_flange @ robot.tool(tool)
-        along = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1)
-        links.append(along.sum() + np.linalg.norm(end.translation))
+        path = whole.branch(tool).path()
+        end = whole.ends[path[-1]] @ robot.tool(tool)
+        links.append(np.linalg.norm([*whole.translation[list(path[1:])], end.translation], axis=1).sum())
     return float(max(max(links) + travel[np.isfinite(travel)].sum(), 1.0))
 
 
@@ -93,19 +92,11 @@ def inverse(
     up to 0.1 rad others are sought nearby, else all are compared. The solutions of an arm with more than six joints are
     not isolated; one near to ``near`` is returned.
 
-    Parameters
-    ----------
-    robot : an arm of n joints; where its base stands does not matter.
-    poses : m transforms base_from_tool, mm.
-    near : (m, n) or (n,) reference values of the controller, rad or mm. Without it the first pose gets the branch
-        nearest to the middle of the limits (0 where unlimited), and every other the one nearest to that of the pose
-        before.
-    tool : name of the tool.
-    payload_kg : mass at the flange; that of the robot if not given.
-
-    Returns
-    -------
-    Inverse : joint vectors (m, n), and for each whether it reaches its pose; no pose raises an error.
+    ``robot`` : an arm of n joints; where its base stands does not matter; ``poses`` : m transforms base_from_tool, mm;
+    ``near`` : (m, n) or (n,) reference values of the controller, rad or mm; without it the first pose gets the branch
+    nearest to the middle of the limits (0 where unlimited), and every other the one nearest to that of the pose before;
+    ``tool`` : name of the tool; ``payload_kg`` : mass at the flange; that of the robot if not given. No pose raises an
+    error: the result has joint vectors (m, n), and for each whether it reaches its pose.
 
     Raises InputError: ``near`` of another shape or not finite; a robot of more than six joints without ``near``; an
     unknown tool; a mass that no arm carries.
@@ -116,18 +107,17 @@ def inverse(
     assumption", Computing 74, 2005.
     """
     m, n = len(poses), len(robot.rows)
-    problem = InverseProblem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
+    problem = InverseProblem(robot if payload_kg is None else robot.loaded(payload_kg), tool)
     if near is None:
         problem.refuse_redundant()
-        return problem.searched(poses, np.arange(m), np.zeros((m, n)), np.zeros(m, bool), None)
+        return problem.searched(poses, np.zeros((m, n)), np.zeros(m, bool), None)
     near = np.asarray(near, float)
     if near.shape not in ((n,), (m, n)):
         raise InputError("E-ARRAY-SHAPE", f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
     near = np.broadcast_to(near, (m, n)) / problem.unit
     if not np.isfinite(near).all():
         raise InputError("E-ARRAY-NOT-FINITE", "reference joint values: hold values that are not finite")
-    q, ok = problem.from_near(poses, near)
-    return problem.searched(poses, np.flatnonzero(~ok), q, ok, near)
+    return problem.searched(poses, *problem.from_near(poses, near), near)
 
 
 @require_arguments
@@ -140,7 +130,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     search has many starts, the same every time. Raises InputError: more than six joints, and so infinitely many
     solutions; or an unknown tool.
     """
-    problem = InverseProblem.of(robot, tool)
+    problem = InverseProblem(robot, tool)
     problem.refuse_redundant()
     poses = Poses.of([pose])
     solutions, inside = problem.turned(problem.every_solution(poses)[0], problem.middle)
@@ -161,32 +151,22 @@ def _as_good(error_rad: np.ndarray) -> np.ndarray:
     return error_rad <= AS_GOOD * error_rad.min(initial=np.inf) + WITHIN_RAD
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class InverseProblem:
     """An arm with a tool, in unitless joint values: ``unit`` (n,) rad or mm; ``reach`` mm; ``bounds`` (n, 2);
     ``middle`` (n,), 0 if unlimited; ``turns`` (n,) whether 2π more is the same; ``few`` : fewer than six joints."""
 
-    robot: Robot
-    tool: str
-    unit: np.ndarray
-    reach: float
-    bounds: np.ndarray
-    middle: np.ndarray
-    turns: np.ndarray
-    few: bool
-
-    @classmethod
-    def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
-        reach, sliding, chain = reach_mm(robot, [tool]), robot.prismatic, robot.chain()
-        unit = np.where(sliding, reach, 1.0)
-        bounds = robot.limits() / unit[:, None]
-        finite = np.isfinite(bounds)
-        middle = np.where(finite.all(axis=1), np.where(finite, bounds, 0.0).mean(axis=1), 0.0)
-        middle = np.clip(middle, *bounds.T)
+    def __init__(self, robot: Robot, tool: str = ""):
+        self.robot, self.tool, self.reach = robot, tool, reach_mm(robot, [tool])
+        self.unit = np.where(robot.prismatic, self.reach, 1.0)
+        self.bounds = robot.limits() / self.unit[:, None]
+        finite = np.isfinite(self.bounds)
+        middle = np.where(finite.all(axis=1), np.where(finite, self.bounds, 0.0).mean(axis=1), 0.0)
+        self.middle = np.clip(middle, *self.bounds.T)
         # A whole turn of the controller's value leaves the arm in place only if the coupling maps it to whole turns.
-        whole = np.isclose(robot.coupling, np.round(robot.coupling)) & ~(sliding[:, None] & (robot.coupling != 0))
-        few = len(chain.branch(chain.carrier(tool)).path()) < 6
-        return cls(robot, tool, unit, reach, bounds, middle, ~sliding & whole.all(axis=0), few)
+        coupling, sliding = robot.coupling, robot.prismatic
+        whole = np.isclose(coupling, np.round(coupling)) & ~(sliding[:, None] & (coupling != 0))
+        self.turns = ~sliding & whole.all(axis=0)
+        self.few = len(robot.chain().branch(tool).path()) < 6
 
     def refuse_redundant(self) -> None:
         if (n := len(self.unit)) > 6:
@@ -211,7 +191,7 @@ class InverseProblem:
         q = q.copy()
         if not len(q):
             return q
-        low, high = (np.tile([-np.inf, np.inf], (len(self.unit), 1)) if bounds is None else bounds).T
+        low, high = (-np.inf, np.inf) if bounds is None else bounds.T
         balance = np.repeat([ORIENTATION_WEIGHT if self.few else 1.0, 1.0], 3)
         weight = balance / np.repeat([1.0, self.reach], 3)  # the Jacobian's translation is in shares of the reach
         rows, goal = np.arange(len(q)), poses
@@ -261,28 +241,26 @@ class InverseProblem:
             ok &= ~doubtful | (np.linalg.norm(q - near, axis=1) <= SHORT)
         return q, ok
 
-    def searched(
-        self, poses: Poses, rest: np.ndarray, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None
-    ) -> Inverse:
-        """Returns all joint vectors, the poses ``rest`` searched: nearest to ``near`` (m, n), or to the solution
-        before; for a pose not reached, the local minimum of error within the limits."""
-        beyond, last = np.zeros(len(poses), bool), self.middle
+    def searched(self, poses: Poses, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None) -> Inverse:
+        """Returns all joint vectors, after a search where q is not ``ok`` (m,): nearest to ``near`` (m, n), or to the
+        solution before; for a pose not reached, the local minimum of error within the limits."""
+        q, rest, beyond, last = q.copy(), np.flatnonzero(~ok), np.zeros(len(poses), bool), self.middle
         for start in range(0, len(rest), GROUP):
             part = rest[start : start + GROUP]
             every = self.every_solution(poses[part], None if near is None else q[part])
             for i, solutions in zip(part, every, strict=True):
-                wanted = last if near is None else near[i]
-                best, beyond[i] = self._nearest(poses[[i]], solutions, wanted)
-                ok[i] = best is not None
-                q[i] = last = wanted if best is None else best
-        q, missing = q.copy(), np.flatnonzero(~ok)
-        if len(missing):
-            q[missing] = self.solve(poses[missing], np.clip(q[missing], *self.bounds.T), self.bounds)
+                q[i] = last if near is None else near[i]
+                best, beyond[i] = self._nearest(poses[[i]], solutions, q[i])
+                if best is not None:
+                    q[i], ok[i] = best, True
+                last = q[i]
+        missing = np.flatnonzero(~ok)
+        q[missing] = self.solve(poses[missing], np.clip(q[missing], *self.bounds.T), self.bounds)
         judged = self.judge(poses, q)
         # An arm of more than six joints may get there on the second way, within the limits.
-        over = ~ok & beyond & np.array([s == UNREACHABLE for s in judged.status], bool)
-        status = tuple(LIMIT if o else s for o, s in zip(over, judged.status, strict=True))
-        return Inverse(judged.q, status, judged.error_mm, judged.error_rad)
+        over = ~ok & beyond & (np.array(judged.status, object) == UNREACHABLE)
+        status = np.where(over, LIMIT, np.array(judged.status, object))
+        return replace(judged, status=tuple(status))
 
     def every_solution(self, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
         """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), ignoring limits."""
@@ -305,12 +283,10 @@ class InverseProblem:
         turned, inside = self.turned(solutions, near)
         off = self.errors(pose[np.zeros(len(turned), int)], turned)
         good = self._is_reached(off)
-        if not good.any():
-            return None, False
         good[good] = _as_good(np.linalg.norm(off[good, :3], axis=1))
         eligible = turned[good & inside]
         if not len(eligible):
-            return None, True
+            return None, bool(good.any())
         return eligible[np.linalg.norm(eligible - near, axis=1).argmin()], False
 
     def _is_reached(self, off: np.ndarray) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,8 +34,37 @@ LONGEST_TOOL_MM = 10_000.0
 ORIENTED_BY = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
 
 
+class JointTable(Brief):
+    """Base of tables with a row for each joint vector; ``where`` : the file, ``notes`` on all of it."""
+
+    __slots__ = ()
+    where: str
+    lines: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __getitem__(self, index) -> Self:
+        """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
+        if getattr(self, "distances", None) is not None:
+            raise InputError(
+                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be left out"
+            )
+        rows = np.arange(len(self))[index]
+
+        def of(values: Any) -> Any:
+            if isinstance(values, dict):
+                return {column: of(own) for column, own in values.items()}
+            if isinstance(values, np.ndarray | Poses | Conditions):
+                return values[rows]
+            return None if values is None else tuple(values[i] for i in rows)
+
+        names = (each.name for each in fields(cast(Any, self)) if each.name not in ("where", "notes"))
+        return replace(cast(Any, self), **{name: of(getattr(self, name)) for name in names})
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Measurements(Brief):
+class Measurements(JointTable):
     """Measurements of an instrument at m joint vectors: poses, positions, or distances between positions.
 
     Parameters
@@ -98,17 +127,10 @@ class Measurements(Brief):
     ) -> "Measurements":
         """Returns measurements in memory.
 
-        Parameters
-        ----------
-        q : (m, n) values of the controller, rad or mm
-        positions : (m, 3) of the target in the instrument's frame, mm
-        rotations : (m, 3, 3) instrument_from_target, where poses were measured
-        poses : instrument_from_target, in place of positions and rotations
-        covariance : (m, 6, 6) of the poses, rad and mm, left perturbation
-        targets : (m,) names of the targets seen; the robot's only one if not given
-        where : source of the data, for messages
-
-        Raises InputError: neither positions nor poses, or arrays of other shapes.
+        ``q``, ``positions``, ``rotations``, ``covariance`` : as the fields; ``poses`` : instrument_from_target, in
+        place of positions and rotations; ``targets`` : (m,) names of the targets seen, the robot's only one if not
+        given; ``where`` : source of the data, for messages. Raises InputError: neither positions nor poses, or arrays
+        of other shapes.
         """
         if poses is not None:
             positions, rotations = poses.translation, poses.rotation
@@ -122,27 +144,6 @@ class Measurements(Brief):
         places, turns, spread = (None if each is None else np.asarray(each, float) for each in given)
         return cls(where, range(1, m + 1), values, tuple(targets) or ("",) * m, places, turns, spread)
 
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index) -> "Measurements":
-        """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
-        if self.distances is not None:
-            raise InputError(
-                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be left out"
-            )
-        rows = np.arange(len(self))[index]
-        optional = {name: getattr(self, name) for name in ("positions", "rotations", "covariance", "common")}
-        return replace(
-            self,
-            lines=[self.lines[i] for i in rows],
-            q=self.q[rows],
-            targets=tuple(self.targets[i] for i in rows),
-            stations=tuple(self.stations[i] for i in rows),
-            conditions=self.conditions[rows],
-            **{name: None if values is None else values[rows] for name, values in optional.items()},
-        )
-
     def by_station(self) -> dict[str, np.ndarray]:
         """Returns a mask (m,) of the rows of each station, by name, the one with most rows first."""
         names = np.array(self.stations)
@@ -155,9 +156,7 @@ class Measurements(Brief):
             raise InputError(
                 "E-MEASURED-NO-COVARIANCE", f"{self.where}: poses without covariance; columns of it needed"
             )
-        if self.common is None:
-            return self.covariance
-        return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
+        return self.covariance if self.common is None else self.covariance - self.common @ self.common.swapaxes(1, 2)
 
     def points(self) -> np.ndarray:
         """Returns the measured positions (m, 3), mm."""
@@ -210,20 +209,22 @@ def read_measurements(
     convention is open, masses that no arm carries; the message names the line.
     """
     table = read_table(path, WHAT, quaternions)
-    joints = len(robot.rows)
-    own = (PAYLOAD, *(f"{APPROACH}{i}" for i in range(1, joints + 1)))
     q, targets = joint_values(table, robot), targets_of(table)
-    base: dict[str, Any] = {"conditions": read_conditions(table, payload_kg, joints)}
+    conditions = read_conditions(table, payload_kg, q.shape[1])
+    own, base = [PAYLOAD, *approach_columns(q.shape[1])], (table.where, table.lines, q, targets)
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
-        if poses is not None:
-            covariance = table.pose_covariances()
-            common = table.common_errors(covariance)
-            base |= {"rotations": poses.rotation, "covariance": covariance, "common": common}
-        if "station" in table:
-            base["stations"] = tuple(table.text("station"))
-        notes = said + unread(table, (*columns, *own))
-        data = Measurements(table.where, table.lines, q, targets, table.points(), notes=notes, **base)
+        covariance = None if poses is None else table.pose_covariances()
+        data = Measurements(
+            *base,
+            table.points(),
+            None if poses is None else poses.rotation,
+            covariance,
+            None if poses is None else table.common_errors(covariance),
+            stations=tuple(table.text("station")) if "station" in table else (),
+            notes=said + unread(table, (*columns, *own)),
+            conditions=conditions,
+        )
         for rows in data.by_station().values():
             _in_reach(data[rows], robot)
         return _usable(data, table)
@@ -238,7 +239,13 @@ def read_measurements(
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
         )
-    from_row = _from_rows(table)
+    rows = table.numbers("from_row") if "from_row" in table else np.ones(len(table))
+    table.refuse(
+        (rows != rows.astype(int)) | (rows < 1) | (rows > len(rows)),
+        "E-MEASURED-FROM-ROW",
+        lambda i: f"from_row is {rows[i]:g}, 1 … {len(rows)} needed",
+    )
+    from_row = rows.astype(int) - 1
     table.refuse(
         (from_row == np.arange(len(table))) & (distances > 1e-3),
         "E-MEASURED-DISTANCES",
@@ -247,8 +254,8 @@ def read_measurements(
             "row, which is missing, or at the row that column from_row names"
         ),
     )
-    base |= {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
-    return Measurements(table.where, table.lines, q, targets, **base)
+    notes = unread(table, own)
+    return Measurements(*base, distances=distances, from_row=from_row, notes=notes, conditions=conditions)
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
@@ -319,22 +326,9 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _from_rows(table: Table) -> np.ndarray:
-    """Returns the row at which each distance starts: column ``from_row``, counted from 1, or the first row."""
-    if "from_row" not in table:
-        return np.zeros(len(table), int)
-    rows = table.numbers("from_row")
-    table.refuse(
-        (rows != rows.astype(int)) | (rows < 1) | (rows > len(rows)),
-        "E-MEASURED-FROM-ROW",
-        lambda i: f"from_row is {rows[i]:g}, 1 … {len(rows)} needed",
-    )
-    return rows.astype(int) - 1
-
-
 def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
     """Reads payload, by column ``payload_kg`` or the argument, and columns ``approach1`` …; raises InputError."""
-    mass = None if payload_kg is None else loaded(payload_kg, len(table)).payload_kg
+    mass, approach = loaded(payload_kg, len(table)).payload_kg, None
     if PAYLOAD in table:
         if payload_kg is not None:
             raise InputError(
@@ -344,19 +338,22 @@ def read_conditions(table: Table, payload_kg: float | None = None, joints: int =
         mass = table.numbers(PAYLOAD)
         possible = (mass >= 0) & (mass <= MOST_KG)
         table.refuse(~possible, "E-PAYLOAD-VALUE", lambda i: f"{PAYLOAD} is {mass[i]:g}; 0 … {MOST_KG:g} needed")
-    columns, approach = [f"{APPROACH}{i}" for i in range(1, joints + 1)], None
-    if any(name in table for name in columns):
-        approach = np.zeros((len(table), joints))
-        for i, name in enumerate(columns):
-            if name in table:
-                approach[:, i] = values = table.numbers(name)
-                came = f"1 (joint {i + 1} came from below), -1 (from above) or 0 (not known)"
-                table.refuse(
-                    ~np.isin(values, DIRECTIONS),
-                    "E-APPROACH-VALUE",
-                    lambda k, name=name, values=values, came=came: f"{name} is {values[k]:g}; {came} needed",
-                )
+    for i, name in enumerate(approach_columns(joints)):
+        if name in table:
+            approach = np.zeros((len(table), joints)) if approach is None else approach
+            approach[:, i] = values = table.numbers(name)
+            came = f"1 (joint {i + 1} came from below), -1 (from above) or 0 (not known)"
+            table.refuse(
+                ~np.isin(values, DIRECTIONS),
+                "E-APPROACH-VALUE",
+                lambda k, name=name, values=values, came=came: f"{name} is {values[k]:g}; {came} needed",
+            )
     return Conditions(mass, approach)
+
+
+def approach_columns(joints: int) -> list[str]:
+    """Returns the columns of approach directions."""
+    return [f"{APPROACH}{i}" for i in range(1, joints + 1)]
 
 
 _UNITS = "|".join((*ANGLES, *LENGTHS))
@@ -399,7 +396,7 @@ NAMES = ("pose", "image", "name", "scene", PAYLOAD)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Targets(Brief):
+class Targets(JointTable):
     """Target poses, one for each row of a file; given by joint values if the file has no poses.
 
     ``where`` : the file, for messages; ``lines`` : (m,) its lines; ``tools`` : (m,) names; ``poses`` : base_from_tool,
@@ -437,21 +434,6 @@ class Targets(Brief):
         if len(names) != m or (values is not None and len(values) != m):
             raise InputError("E-NAMES-COUNT", f"{where}: {m} poses, other numbers of joint values or tools; {m} needed")
         return cls(where, range(1, m + 1), names, poses, values)
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def __getitem__(self, rows: np.ndarray) -> "Targets":
-        """Returns the targets of these indices."""
-        return replace(
-            self,
-            lines=[self.lines[i] for i in rows],
-            tools=tuple(self.tools[i] for i in rows),
-            poses=None if self.poses is None else self.poses[rows],
-            q=None if self.q is None else self.q[rows],
-            names={column: tuple(own[i] for i in rows) for column, own in self.names.items()},
-            conditions=self.conditions[rows],
-        )
 
     def joints(self) -> np.ndarray:
         """Returns the commanded joint values (m, n), rad or mm. Raises an error if there are none."""

@@ -125,15 +125,13 @@ def load_robot(path: str | Path) -> Robot:
         )
     data = load_toml(path, _RobotFile, WHAT, REMEDY)
     where = f"{WHAT} {path}"
-    rows, joints = [], []
+    rows, joints, n = [], [], len(data.joint)
     for i, j in enumerate(data.joint, 1):
         alpha, theta, beta = np.radians([j.alpha_deg, j.theta_deg, j.beta_deg]).tolist()
         rows.append(DHRow(j.a_mm, alpha, j.d_mm, theta, beta))
         joints.append(_joint(j, f"{where}: joint {i}"))
     require_millimetres(longest_link(rows), data.unusual_size, where)
-    n = len(rows)
-    coupling = np.eye(n).tolist() if data.coupling is None else data.coupling
-    if len(coupling) != n or any(len(row) != n for row in coupling):
+    if data.coupling is not None and {n, *map(len, data.coupling)} != {len(data.coupling)}:
         raise InputError("E-ROBOT-COUPLING", f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
     tools = {"": data.tool.rigid(f"{where}: tool")}
     for t in data.target:
@@ -142,60 +140,50 @@ def load_robot(path: str | Path) -> Robot:
         tools[t.name] = t.rigid(f"{where}: target {t.name}")
     base = data.base.rigid(f"{where}: base")
     elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
-    tree = _tree(data, where)
-    arm = tuple(rows), tuple(joints), np.array(coupling)
-    return Robot(data.name, data.convention, *arm, base, tools, elasticity, tree, data.unusual_size)
+    arm = tuple(rows), tuple(joints), np.eye(n) if data.coupling is None else np.array(data.coupling)
+    return Robot(data.name, data.convention, *arm, base, tools, elasticity, _tree(data, where), data.unusual_size)
 
 
 def _tree(data: _RobotFile, where: str) -> Tree | None:
     """Returns the tree that keys ``after``, ``mount`` and ``joint`` describe; None without such keys."""
-    n = len(data.joint)
-    mounts = {}
+    mounts, carriers, n = {}, {}, len(data.joint)
+
+    def refuse(wrong: bool, said: str) -> None:
+        if wrong:
+            raise InputError("E-ROBOT-BRANCH", f"{where}: {said}")
+
     for i, joint in enumerate(data.joint):
-        if joint.after is None and joint.mount is not None:
-            raise InputError(
-                "E-ROBOT-BRANCH",
-                f"{where}: joint {i + 1}: mount without after; the number of the joint that carries it needed",
-            )
+        place, alone = f"joint {i + 1}", joint.after is None and joint.mount is not None
+        refuse(alone, f"{place}: mount without after; the number of the joint that carries it needed")
         if joint.after is not None:
-            if not 0 <= joint.after <= i:
-                raise InputError(
-                    "E-ROBOT-BRANCH", f"{where}: joint {i + 1}: after is {joint.after}, 0 (the base) … {i} needed"
-                )
-            mounts[i] = joint.after - 1, (joint.mount or PoseEntry()).rigid(f"{where}: joint {i + 1}: mount")
-    if 0 in mounts:
-        raise InputError(
-            "E-ROBOT-BRANCH",
-            f"{where}: joint 1: the first joint has no after, which is for joints that begin another branch; leave it "
-            "out, and give base",
-        )
-    carriers = {}
+            refuse(not 0 <= joint.after <= i, f"{place}: after is {joint.after}, 0 (the base) … {i} needed")
+            mounts[i] = joint.after - 1, (joint.mount or PoseEntry()).rigid(f"{where}: {place}: mount")
+    first = "the first joint has no after, which is for joints that begin another branch; leave it out, and give base"
+    refuse(0 in mounts, f"joint 1: {first}")
     for name, each in [("", data.tool), *((t.name, t) for t in data.target)]:
         if each.joint is not None:
-            if not 1 <= each.joint <= n:
-                what = f"target {name}" if name else "tool"
-                raise InputError("E-ROBOT-BRANCH", f"{where}: {what}: joint is {each.joint}, 1 … {n} needed")
+            what = f"target {name}" if name else "tool"
+            refuse(not 1 <= each.joint <= n, f"{what}: joint is {each.joint}, 1 … {n} needed")
             carriers[name] = each.joint - 1
     return Tree(mounts, carriers) if mounts or carriers else None
 
 
 def _joint(j: _JointFile, where: str) -> Joint:
     mine, other = ("deg", "mm") if j.type == "revolute" else ("mm", "deg")
-    for end in ("min", "max"):
+    limits = []
+    for end, unlimited in {"min": -np.inf, "max": np.inf}.items():
         if getattr(j, f"{end}_{other}") is not None:
             raise InputError("E-ROBOT-LIMITS", f"{where}: {end}_{other} at a {j.type} joint; {end}_{mine} needed")
-    lower, upper = getattr(j, f"min_{mine}"), getattr(j, f"max_{mine}")
-    if lower is not None and upper is not None and lower >= upper:
+        value = getattr(j, f"{end}_{mine}")
+        limits.append(unlimited if value is None else value)
+    lower, upper = limits
+    if lower >= upper:
         raise InputError(
             "E-ROBOT-LIMITS", f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them"
         )
     unit = np.pi / 180 if mine == "deg" else 1.0
-    return Joint(
-        j.type,
-        -np.inf if lower is None else float(lower * unit),
-        np.inf if upper is None else float(upper * unit),
-        {key.partition("_")[0]: reason for key, reason in j.fixed.items()},
-    )
+    fixed = {key.partition("_")[0]: reason for key, reason in j.fixed.items()}
+    return Joint(j.type, float(lower * unit), float(upper * unit), fixed)
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
@@ -203,59 +191,61 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
 
     Every number reads back as the same double, but for the last bit of angles.
     """
-    lines = [f"# {comment}" for comment in comments]
-    lines += [
+    lines = [
+        *(f"# {comment}" for comment in comments),
         f"name = {toml_string(robot.name)}",
         f'convention = "{robot.convention}"  # {_FORM[robot.convention]}; angles in degrees, lengths in mm',
         *stated_unusual(longest_link(robot.rows)),
     ]
+
+    def add(key: str, value: ArrayLike, note: str = "") -> None:
+        """Adds a number, or an array of them, that reads back the same."""
+        lines.append(f"{key} = {np.asarray(value, float).tolist()!r}{note and f'  # {note}'}")
+
+    def pose(a_from_b: Rigid) -> list[str]:
+        values = [*a_from_b.translation.tolist(), *Poses.of([a_from_b]).quaternions()[0].tolist()]
+        return [f"{key} = {value!r}" for key, value in zip(POSE, values, strict=True)]
+
     if (robot.coupling != np.eye(len(robot.rows))).any():
-        lines += ["# kinematic joint values from the controller's", f"coupling = {_number(robot.coupling)}"]
-    mounts, carriers = ({}, {}) if robot.tree is None else (robot.tree.mounts, robot.tree.carriers)
+        lines.append("# kinematic joint values from the controller's")
+        add("coupling", robot.coupling)
+    tree = robot.tree or Tree({}, {})
     for i, (row, joint) in enumerate(zip(robot.rows, robot.joints, strict=True)):
         lines += ["", "[[joint]]", f'type = "{joint.type}"']
         for name, key in _KEYS.items():
             value = getattr(row, name)
             if value or name != "beta":
-                lines.append(f"{key} = {_number(np.degrees(value) if key.endswith('deg') else value)}")
+                add(key, np.degrees(value) if key.endswith("deg") else value)
         unit, of_unit = ("deg", np.degrees) if joint.type == "revolute" else ("mm", float)
-        lines += [
-            f"{end}_{unit} = {_number(round(of_unit(value), 9))}"
-            for end, value in (("min", joint.lower), ("max", joint.upper))
-            if np.isfinite(value)
-        ]
+        for end, value in (("min", joint.lower), ("max", joint.upper)):
+            if np.isfinite(value):
+                add(f"{end}_{unit}", round(of_unit(value), 9))
         if joint.fixed:
             reasons = (f"{_KEYS[name]} = {toml_string(reason)}" for name, reason in joint.fixed.items())
             lines.append(f"fixed = {{ {', '.join(reasons)} }}")
-        if i in mounts:
-            after, pose = mounts[i]
-            lines += [f"after = {after + 1}", f"mount = {{ {', '.join(_pose_lines(pose))} }}"]
-    lines += ["", "[base]  # of the robot, in the frame of the instrument", *_pose_lines(robot.world_from_base)]
+        if i in tree.mounts:
+            after, mount = tree.mounts[i]
+            lines += [f"after = {after + 1}", f"mount = {{ {', '.join(pose(mount))} }}"]
+    lines += ["", "[base]  # of the robot, in the frame of the instrument", *pose(robot.world_from_base)]
     lines += ["", "[tool]  # in the frame of the flange"]
     for name, tool in {"": robot.tools.get("", Rigid()), **robot.tools}.items():
-        if name:
-            lines += ["", "[[target]]", f"name = {toml_string(name)}"]
-        lines += [*_pose_lines(tool), *([f"joint = {carriers[name] + 1}"] if name in carriers else [])]
+        lines += ["", "[[target]]", f"name = {toml_string(name)}"] if name else []
+        lines += [*pose(tool), *([f"joint = {tree.carriers[name] + 1}"] if name in tree.carriers else [])]
     if (elasticity := robot.elasticity) is not None:
-        axis, across = elasticity.compliance.T
-        lines += [
-            "",
-            "[elasticity]  # one entry for each joint; compliance about its axis and across it",
-            f"gravity = {_number(elasticity.gravity)}  # in the base",
-            f"axis_rad_per_Nm = {_number(axis)}",
-            f"across_rad_per_Nm = {_number(across)}",
-            f"moment_Nm = {_number(elasticity.moment)}",
-            "# of sin q, cos q, sin 2q, cos 2q",
-            f"periodic_rad = {_number(elasticity.periodic)}",
-        ]
-        half, pivot = _number(elasticity.hysteresis), _number(elasticity.pivot)
+        lines += ["", "[elasticity]  # one entry for each joint; compliance about its axis and across it"]
+        add("gravity", elasticity.gravity, "in the base")
+        add("axis_rad_per_Nm", elasticity.compliance[:, 0])
+        add("across_rad_per_Nm", elasticity.compliance[:, 1])
+        add("moment_Nm", elasticity.moment)
+        lines.append("# of sin q, cos q, sin 2q, cos 2q")
+        add("periodic_rad", elasticity.periodic)
         if elasticity.hysteresis.any():
-            lines.append(f"hysteresis_rad = {half}  # half of it: farther if it came from below")
+            add("hysteresis_rad", elasticity.hysteresis, "half of it: farther if it came from below")
         if elasticity.pivot.any():
-            lines.append(f"pivot_mm = {pivot}  # in the joints' frames: where the links turn when they give way")
+            add("pivot_mm", elasticity.pivot, "in the joints' frames: where the links turn when they give way")
         if elasticity.payload_kg or elasticity.payload_centre.any():
-            lines.append(f"payload_kg = {_number(elasticity.payload_kg)}")
-            lines.append(f"payload_centre_mm = {_number(elasticity.payload_centre)}  # in the frame of the flange")
+            add("payload_kg", elasticity.payload_kg)
+            add("payload_centre_mm", elasticity.payload_centre, "in the frame of the flange")
     return "\n".join(lines) + "\n"
 
 
@@ -289,13 +279,3 @@ def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = 
         return values(found, found.chain())
 
     require_written(path, again, values(robot, chain or robot.chain()), WRITTEN_MM, "mm")
-
-
-def _pose_lines(pose: Rigid) -> list[str]:
-    values = (*pose.translation, *Poses.of([pose]).quaternions()[0])
-    return [f"{key} = {_number(value)}" for key, value in zip(POSE, values, strict=True)]
-
-
-def _number(value: ArrayLike) -> str:
-    """Returns a number, or an array of them, that reads back the same."""
-    return repr(np.asarray(value, float).tolist())

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
 
 PAYLOAD = "payload_kg"
@@ -247,10 +247,6 @@ class Tree:
         """The joint that carries ``joint``; −1 for the base."""
         return self.mounts[joint][0] if joint in self.mounts else joint - 1
 
-    def carrier(self, tool: str, last: int) -> int:
-        """The joint that carries a tool, if ``last`` is the last one."""
-        return self.carriers.get(tool, last)
-
     def path(self, joint: int) -> tuple[int, ...]:
         """Joints from the base to ``joint``."""
         found = []
@@ -386,26 +382,30 @@ class Robot(Brief):
 
     def chain(self) -> "Chain":
         """Returns the fixed transforms in order, with the frames of joints at the pivots of the elasticity."""
-        gaps, ends = [], []
-        pivots = np.zeros((len(self.rows), 3)) if self.elasticity is None else self.elasticity.pivot
+        gaps, ends, elasticity = [], [], self.elasticity
+        pivots = np.zeros((len(self.rows), 3)) if elasticity is None else elasticity.pivot
         for i, row in enumerate(self.rows):
-            modified = self.convention == "modified"
             after, mount = self.carrier(i)
-            before = self.world_from_base if after < 0 else ends[after]
-            pivot = Rigid(np.eye(3), pivots[i])
-            gaps.append((before @ mount @ across(row) if modified else before @ mount) @ pivot)
-            ends.append(pivot.inverse() @ (along(row) if modified else along(row) @ across(row)))
-        rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-        elasticity = self.elasticity
-        if elasticity is not None:
-            first = self.world_from_base.inverse() @ gaps[0]
-            last = len(ends) - 1
-            end = last if self.tree is None else self.tree.carrier("", last)
-            centre = ends[end] @ elasticity.payload_centre
-            gravity = first.rotation.T @ elasticity.gravity
-            elasticity = replace(elasticity, gravity=gravity, payload_centre=centre, pivot=np.zeros_like(pivots))
-        branches = self.tree, () if self.tree is None else tuple(ends)
-        return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, *branches)
+            begin = (self.world_from_base if after < 0 else ends[after]) @ mount
+            pivot = Rigid(translation=pivots[i])
+            if self.convention == "modified":
+                gaps.append(begin @ across(row) @ pivot)
+                ends.append(pivot.inverse() @ along(row))
+            else:
+                gaps.append(begin @ pivot)
+                ends.append(pivot.inverse() @ (along(row) @ across(row)))
+        placed = Poses.of(gaps)
+        chain = Chain(placed.rotation, placed.translation, tuple(ends), self.prismatic, self.coupling, None, self.tree)
+        if elasticity is None:
+            return chain
+        first = self.world_from_base.inverse() @ gaps[0]
+        moved = replace(
+            elasticity,
+            gravity=first.rotation.T @ elasticity.gravity,
+            payload_centre=ends[chain.carrier("")] @ elasticity.payload_centre,
+            pivot=np.zeros_like(pivots),
+        )
+        return replace(chain, elasticity=moved)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
         """Returns the joint, from 0, that carries another (−1: the base), and where the other's row begins."""
@@ -428,19 +428,18 @@ class Chain:
     """The fixed transforms of an arm, which are all that calibration changes; joints turn about or move along z.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
-    first: in the world); ``last_from_flange`` : in the frame of the joint that carries the flange; ``prismatic`` :
-    (n,); ``coupling`` : (n, N), of all N values of the controller; ``elasticity`` : of the links; ``tree`` : if joints
-    form one, with the ``ends`` (n,) of its rows in their joints' frames; ``flange_joint`` : whose end is the flange.
+    first: in the world); ``ends`` : (n,) of the rows in their joints' frames, the last one is a serial arm's flange;
+    ``prismatic`` : (n,); ``coupling`` : (n, N), of all N values of the controller; ``elasticity`` : of the links;
+    ``tree`` : one joint after the other if None; ``flange_joint`` : whose end is the flange, the last of a serial arm.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
-    last_from_flange: Rigid
+    ends: tuple[Rigid, ...]
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
-    tree: Tree | None = None
-    ends: tuple[Rigid, ...] = ()
+    tree: Tree = None  # pyright: ignore[reportAssignmentType]  # made below: its last joint carries all tools
     flange_joint: int | None = None
 
     def __post_init__(self):
@@ -449,6 +448,9 @@ class Chain:
         freeze(self, "translation", (n, 3), "chain")
         freeze(self, "prismatic", (n,), "chain", bool)
         freeze(self, "coupling", (n, None), "coupling")
+        if self.tree is None:
+            object.__setattr__(self, "tree", Tree({}, {"": n - 1}))
+            object.__setattr__(self, "flange_joint", n - 1)
 
     def __len__(self) -> int:
         return len(self.prismatic)
@@ -459,21 +461,18 @@ class Chain:
 
     def after(self, i: int) -> int:
         """The joint that carries joint ``i``; −1 for the world."""
-        return i - 1 if self.tree is None else self.tree.after(i)
+        return self.tree.after(i)
 
     def end(self, i: int) -> Rigid:
         """End of the row of joint ``i`` in its frame; of a serial arm the flange."""
-        return self.last_from_flange if self.tree is None else self.ends[i]
+        return self.ends[i]
 
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
-        last = len(self) - 1
-        return last if self.tree is None else self.tree.carrier(target, last)
+        return self.tree.carriers.get(target, len(self) - 1)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
-        if self.tree is None:
-            return np.ones((len(self), len(targets)), bool)
         found = {name: np.isin(np.arange(len(self)), self.tree.path(self.carrier(name))) for name in set(targets)}
         return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
 
@@ -497,16 +496,12 @@ class Chain:
                 total[i] += total[self.after(i)]
         return total
 
-    def branch(self, carrier: int) -> "Chain":
-        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, and bend it."""
-        if self.tree is None:
-            return self
-        return replace(self, last_from_flange=self.ends[carrier], flange_joint=carrier)
+    def branch(self, tool: str) -> "Chain":
+        """Returns the chain whose flange is the one that carries the tool; other branches stay, and bend it."""
+        return replace(self, flange_joint=self.carrier(tool))
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
-        if self.tree is None:
-            return tuple(range(len(self)))
         if self.flange_joint is None:
             raise InputError(
                 "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
