@@ -23,6 +23,7 @@ Order = Literal["wxyz", "xyzw"]
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
+NEAR_DEPTH = 1e-9  # depth that stands for a smaller one
 
 
 def skew(v: ArrayLike) -> np.ndarray:
@@ -42,6 +43,7 @@ def by_pose(by_point: np.ndarray, turned: np.ndarray) -> np.ndarray:
 def perspective(xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the ideal coordinates (..., 2) of points (..., 3) before a camera, and their derivatives (..., 2, 3)."""
     depth = xyz_camera[..., 2:]
+    depth = np.where(np.abs(depth) > NEAR_DEPTH, depth, NEAR_DEPTH)
     by_point = np.zeros((*depth.shape[:-1], 2, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth[..., 0]
     by_point[..., 2] = -xyz_camera[..., :2] / depth**2
