@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.register.consensus import MODELS, Problem
-from tests.outcome import fails_with
 from tests.support.point_pairs import make_scene
 
 NOISE = ("equal", "weights", "matrices")
@@ -86,14 +85,3 @@ def test_frames_may_be_moved(seed, name):
     np.testing.assert_allclose(
         Problem(model, moved @ s.xyz_a, s.xyz_b, weights).fit() @ (moved @ s.xyz_a), found @ s.xyz_a, atol=1e-7
     )
-
-
-def test_affine_transforms_compose_and_invert():
-    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
-    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
-    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
-    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
-    with fails_with("E-AFFINE-SINGULAR"):
-        Affine(np.ones((3, 3)), np.zeros(3)).inverse()
