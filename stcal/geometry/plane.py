@@ -292,19 +292,23 @@ class Weighed:
     moved2: np.ndarray  # (h,) squared lengths of the steps, in σ
 
 
-def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: Poses) -> Weighed:
-    """Return the step of h poses that weights the points by the full covariance (h, 2n, 2n) of their residuals (h, n,
-    2); ``by_pose`` : (h, n, 2, 6) negative derivatives by left perturbations."""
+def generalised_equations(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray) -> NormalEquations:
+    """Return the normal equations of h poses; arguments as of :func:`weigh`."""
     h = len(residual)
     r, a = residual.reshape(h, -1, 1), by_pose.reshape(h, -1, 6)
     solved = np.linalg.solve(covariance, np.concatenate([a, r], axis=2))
-    back = np.swapaxes(a, 1, 2) @ solved
-    normal, right = back[..., :6], back[..., 6:]
-    step = np.linalg.solve(normal, right)[..., 0]
-    square = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
-    gain = (step * right[..., 0]).sum(1)
-    remaining = residual - (a @ step[..., None]).reshape(residual.shape)
-    return Weighed(poses.moved(step), remaining, normal, square - gain, gain)
+    weighted, cost = np.swapaxes(a, 1, 2) @ solved, np.swapaxes(r, 1, 2) @ solved[..., 6:]
+    return NormalEquations(cost[:, 0, 0], weighted[..., :6], -weighted[..., 6])
+
+
+def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: Poses) -> Weighed:
+    """Return the step of h poses that weights the points by the full covariance (h, 2n, 2n) of their residuals (h, n,
+    2); ``by_pose`` : (h, n, 2, 6) negative derivatives by left perturbations."""
+    equations = generalised_equations(residual, by_pose, covariance)
+    step = -np.linalg.solve(equations.normal, equations.gradient[..., None])
+    gain = -(step[..., 0] * equations.gradient).sum(1)
+    remaining = residual - (by_pose.reshape(len(step), -1, 6) @ step).reshape(residual.shape)
+    return Weighed(poses.moved(step[..., 0]), remaining, equations.normal, equations.cost - gain, gain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,7 @@ Order = Literal["wxyz", "xyzw"]
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
+NEAR_DEPTH = 1e-9  # depth that stands for a smaller one
 
 
 def skew(v: ArrayLike) -> np.ndarray:
@@ -42,6 +43,7 @@ def by_pose(by_point: np.ndarray, turned: np.ndarray) -> np.ndarray:
 def perspective(xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the ideal coordinates (..., 2) of points (..., 3) before a camera, and their derivatives (..., 2, 3)."""
     depth = xyz_camera[..., 2:]
+    depth = np.where(np.abs(depth) > NEAR_DEPTH, depth, NEAR_DEPTH)
     by_point = np.zeros((*depth.shape[:-1], 2, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth[..., 0]
     by_point[..., 2] = -xyz_camera[..., :2] / depth**2
@@ -88,6 +90,16 @@ class _Frames:
         m = np.zeros((*self.translation.shape[:-1], 4, 4))
         m[..., :3, :3], m[..., :3, 3], m[..., 3, 3] = self.rotation, self.translation, 1.0
         return m
+
+    def inverse(self) -> Self:
+        """Return b_from_a."""
+        back = np.swapaxes(self.rotation, -1, -2)
+        return self._of(np.ascontiguousarray(back), -(back @ self.translation[..., None])[..., 0])
+
+    def _product(self, other: "_Frames") -> tuple[np.ndarray, np.ndarray]:
+        """Return rotation and translation of a_from_c for b_from_c; one transform goes with each of a stack."""
+        translation = (self.rotation @ other.translation[..., None])[..., 0]
+        return self.rotation @ other.rotation, translation + self.translation
 
     def moved(self, step: np.ndarray) -> Self:
         """Return the transform after a left perturbation (..., 6), rad and mm: exp(w) R, t + dt."""
@@ -168,20 +180,20 @@ class Rigid(ByValue, _Frames):
         squares = np.concatenate([np.diag(by_turn @ covariance[:3, :3] @ by_turn.T), np.diag(covariance)[3:]])
         return np.sqrt(np.maximum(squares, 0))
 
-    def inverse(self) -> "Rigid":
-        """Return b_from_a."""
-        return Rigid._of(self.rotation.T, -self.rotation.T @ self.translation)
-
     @overload
     def __matmul__(self, other: "Rigid") -> "Rigid": ...
     @overload
+    def __matmul__(self, other: "Poses") -> "Poses": ...
+    @overload
+    def __matmul__(self, other: "Similarity") -> "Similarity": ...
+    @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
-        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
-        if isinstance(other, Rigid):
-            return Rigid._of(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
-        if isinstance(other, Similarity | Poses):
-            return NotImplemented
+        """Return a_from_c for transforms b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
+        if isinstance(other, _Frames):
+            return other._of(*self._product(other))
+        if isinstance(other, Similarity):
+            return Similarity(1.0, self) @ other
         return np.asarray(other, float) @ self.rotation.T + self.translation
 
     def angle_rad(self) -> float:
@@ -218,18 +230,11 @@ class Similarity(ByValue):
     def __matmul__(self, other):
         """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b."""
         if isinstance(other, Similarity):
-            return Similarity(
-                self.scale * other.scale,
-                Rigid(self.rigid.rotation @ other.rigid.rotation, self @ other.rigid.translation),
-            )
+            rotation = self.rigid.rotation @ other.rigid.rotation
+            return Similarity(self.scale * other.scale, Rigid(rotation, self @ other.rigid.translation))
         if isinstance(other, Rigid):
             return self @ Similarity(1.0, other)
         return self.scale * (np.asarray(other, float) @ self.rigid.rotation.T) + self.rigid.translation
-
-    def __rmatmul__(self, other: Rigid) -> "Similarity":
-        if isinstance(other, Rigid):
-            return Similarity(1.0, other) @ self
-        return NotImplemented
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -315,29 +320,16 @@ class Poses(Brief, _Frames):
     def __iter__(self) -> Iterator[Rigid]:
         return (self[i] for i in range(len(self)))
 
-    def inverse(self) -> "Poses":
-        """Return b_from_a."""
-        back = np.swapaxes(self.rotation, 1, 2)
-        return Poses._of(back.copy(), -np.einsum("mij,mj->mi", back, self.translation))
-
     @overload
     def __matmul__(self, other: "Rigid | Poses") -> "Poses": ...
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
         """Return a_from_c for a :class:`Rigid` or m :class:`Poses` b_from_c; points (m, 3) for one or m points."""
-        if isinstance(other, Rigid | Poses):
-            sums = "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi"
-            translation = np.einsum(sums, self.rotation, other.translation)
-            return Poses._of(self.rotation @ other.rotation, translation + self.translation)
+        if isinstance(other, _Frames):
+            return self._of(*self._product(other))
         points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
         return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
-
-    def __rmatmul__(self, other: Rigid) -> "Poses":
-        if isinstance(other, Rigid):
-            translation = self.translation @ other.rotation.T + other.translation
-            return Poses._of(other.rotation @ self.rotation, translation)
-        return NotImplemented
 
 
 @dataclass(frozen=True, slots=True, eq=False)

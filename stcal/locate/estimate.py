@@ -22,19 +22,18 @@ from stcal.geometry.plane import (
     Descend,
     Weighed,
     covariance_of_both,
+    generalised_equations,
     poses_of_plane,
     two_minima,
     weigh,
     weights_of,
 )
-from stcal.geometry.rigid import ImageFit, Poses, Rigid, by_pose
+from stcal.geometry.rigid import ImageFit, Poses, Rigid, by_pose, perspective
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.layout import TargetLayout
 
 SETTLED = 1e-5
 """Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
-NEAR_DEPTH = 1e-9
-"""Depth that stands for a smaller one, mm."""
 WEIGHED = 1e-6
 """Least decrease of χ²: a step of less than σ/1000 is the last."""
 
@@ -82,19 +81,9 @@ def project(problem: PlanarProblem, poses: Poses) -> ProjectedCorners:
     """Returns the residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
     xyz = turned + poses.translation[:, None]
-    uv, by_point, by_pose = normalised(turned, xyz)
-    return ProjectedCorners(
-        problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], (xyz[..., 2] > 0).all(1)
-    )
-
-
-def normalised(turned: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the image (..., 2) of points ``xyz`` in the camera's frame, and its derivatives by them, (..., 2, 3), and
-    by a pose, (..., 2, 6), that turned them to ``turned`` before its translation."""
-    depth = np.where(np.abs(xyz[..., 2]) > NEAR_DEPTH, xyz[..., 2], NEAR_DEPTH)[..., None]
-    uv = xyz[..., :2] / depth
-    by_point = np.concatenate([np.broadcast_to(np.eye(2), (*uv.shape, 2)), -uv[..., None]], axis=-1) / depth[..., None]
-    return uv, by_point, by_pose(by_point, turned)
+    uv, by_point = perspective(xyz)
+    by_corner = by_point @ poses.rotation[:, None, :, :2]
+    return ProjectedCorners(problem.seen - uv, by_pose(by_point, turned), by_corner, (xyz[..., 2] > 0).all(1))
 
 
 def descent_near(problem: PlanarProblem, pose: Poses) -> Descend:
@@ -129,11 +118,8 @@ def weighed(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed
 
     def linearise(poses: Poses) -> NormalEquations:
         view = project(problem, poses)
-        r, a = view.residual.reshape(1, -1, 1), view.by_pose.reshape(1, -1, 6)
-        solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
-        weighted = np.swapaxes(a, 1, 2) @ solved
-        cost = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
-        return NormalEquations(np.where(view.before, cost, np.inf), weighted[..., :6], -weighted[..., 6])
+        equations = generalised_equations(view.residual, view.by_pose, full)
+        return replace(equations, cost=np.where(view.before, equations.cost, np.inf))
 
     # A second solution that is far worse need not converge: it only shows that the first one is better.
     minimum = minimise(

@@ -1,6 +1,6 @@
 """Calibration of a target of tags: poses of the board in all images, and corners of the tags in the board's plane."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ from scipy.optimize import root_scalar
 
 from stcal.adjust.blocks import Huber, Vector, sigma_factor
 from stcal.adjust.engine import Adjustment, Solution
-from stcal.boards.board_designs import UNIT_SQUARE, BoardView
+from stcal.boards.board_designs import BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
@@ -19,9 +19,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
-from stcal.geometry.rigid import Poses, Rigid, align_rigid
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, by_pose, perspective
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.locate.estimate import normalised
 from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
 
@@ -31,6 +30,8 @@ is gross, such as a misread tag or a hidden corner: weight 0."""
 VARIANCE_ROUNDS, NEAR_PX = 6, 0.005
 LEAST_FACTOR = 1e-3
 """Least factor on the stated σ of the board's points. Exact data would give 0, and rounding would be weighed."""
+STEP_MM = 1e-3
+"""Step of numerical derivatives of the frame {obj}, which turns by 1e-4 rad at most."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
 APART = null_space(TOGETHER.T)
@@ -87,46 +88,34 @@ class AdjustedLayout:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
     """Board points (c = 1) or tags (c = 4 corners) of all images: ``image`` (r,), ``seen`` (r, c, 2), ``noise``
-    (r, 2c, 2c) and ``focal_px`` (r,)."""
+    (r, 2c, 2c), ``focal_px`` (r,). ``places`` : returns the points (r, c, 3) on the board for the values of a block;
+    ``slopes`` : the derivatives (r, 2c, k) by these values, from those (r, c, 2, 3) by the points."""
 
     image: np.ndarray
     seen: np.ndarray
     noise: np.ndarray
     focal_px: np.ndarray
+    places: Callable[[Vector], np.ndarray]
+    slopes: Callable[[np.ndarray], np.ndarray]
 
     @classmethod
-    def of(cls, images: Sequence[ImageCorners], seen: list[np.ndarray], noise: list[np.ndarray]) -> "_Rows":
+    def of(cls, images: Sequence[ImageCorners], seen: Sequence[np.ndarray], noise: Sequence, *places) -> "_Rows":
         image = np.repeat(np.arange(len(images)), [len(each) for each in noise])
         focal = np.array([each.focal_px for each in images])[image]
-        return cls(image, np.concatenate(seen).reshape(len(image), -1, 2), np.concatenate(noise), focal)
+        return cls(image, np.concatenate(seen).reshape(len(image), -1, 2), np.concatenate(noise), focal, *places)
 
-    def off(self, poses: Poses, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board, and the derivatives
-        by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
+    def off(self, poses: Poses, values: Vector) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Returns projected minus seen corners, (r, 2c), and the derivatives by the poses and by the values."""
         rotation = poses.rotation[self.image]
-        turned = xyz @ np.swapaxes(rotation, 1, 2)
-        uv, by_point, by_pose = normalised(turned, turned + poses.translation[self.image][:, None])
-        flat = len(xyz), -1
-        return (uv - self.seen).reshape(flat), by_pose.reshape(*flat, 6), by_point @ rotation[:, None]
+        turned = self.places(values) @ np.swapaxes(rotation, 1, 2)
+        uv, by_point = perspective(turned + poses.translation[self.image][:, None])
+        flat = len(uv), -1
+        slopes = by_pose(by_point, turned).reshape(*flat, 6), self.slopes(by_point @ rotation[:, None])
+        return (uv - self.seen).reshape(flat), slopes
 
-    def factor(self, a: Adjustment, kind: str, covariance: np.ndarray, blocks: Sequence, places, derivatives) -> None:
-        """Adds the observations to the adjustment, with Huber's loss. ``places`` : returns the points (r, c, 3) for the
-        values of the second block; ``derivatives`` : by them, from those by the places."""
-        limit = length_limit(covariance.shape[-1], HUBER_TAIL)
-
-        def by_both(poses: Poses, second: Vector) -> tuple[np.ndarray, np.ndarray]:
-            _, by_pose, by_place = self.off(poses, places(second))
-            return by_pose, derivatives(by_place)
-
-        a.factor(
-            lambda poses, second: self.off(poses, places(second))[0],
-            blocks,
-            derivatives=by_both,
-            root=np.linalg.inv(np.linalg.cholesky(covariance)),
-            kind=kind,
-            cluster=self.image,
-            loss=Huber(limit, GROSS * limit),
-        )
+    def px(self, solution: Solution, block: str) -> np.ndarray:
+        """Returns the residuals (r, 2c), px, at the values of a block."""
+        return self.focal_px[:, None] * self.off(solution.values["pose"], solution.values[block])[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,63 +131,65 @@ class _Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """All observations: board points, drawn at ``xyz`` (r, 1, 3), and tags, of which ``tag`` (r,) are the numbers.
-
-    ``modes`` : (r, 3, m) smooth deviations of the board's ``print`` at its points.
-    """
+    """All observations: board points and tags, of which ``tag`` (r,) are the numbers; the board's ``print``."""
 
     board: _Rows
-    xyz: np.ndarray
     tags: _Rows
     tag: np.ndarray
-    modes: np.ndarray
     print: PrintModes
 
     @classmethod
     def of(cls, images: Sequence[ImageCorners]) -> "_Layout":
-        board = _Rows.of(images, [i.board_seen for i in images], [i.board_noise for i in images])
-        tags = _Rows.of(images, [i.seen for i in images], [i.noise for i in images])
-        xyz = np.concatenate([image.board_xyz for image in images])
-        places, place = np.unique(xyz.round(6), axis=0, return_inverse=True)
-        prints = PrintModes.of(places[:, :2])
-        modes = prints.modes.reshape(len(places), 3, -1)[place.ravel()]
-        return cls(board, xyz[:, None], tags, np.concatenate([image.rows for image in images]), modes, prints)
+        tag, xyz = (np.concatenate([getattr(image, name) for image in images]) for name in ("rows", "board_xyz"))
+        drawn, place = np.unique(xyz.round(6), axis=0, return_inverse=True)
+        prints = PrintModes.of(drawn[:, :2])
+        modes = prints.modes.reshape(len(drawn), 3, -1)[place.ravel()]  # (r, 3, m) at the board's points
+        board = _Rows.of(
+            images,
+            [image.board_seen for image in images],
+            [image.board_noise for image in images],
+            lambda along: (xyz + modes @ along.array[0])[:, None],
+            lambda by_place: by_place[:, 0] @ modes,
+        )
+        tags = _Rows.of(
+            images,
+            [image.seen for image in images],
+            [image.noise for image in images],
+            lambda corners: np.pad(corners.array[tag].reshape(-1, 4, 2), ((0, 0), (0, 0), (0, 1))),
+            lambda by_place: block_diagonal(by_place[..., :2]),
+        )
+        return cls(board, tags, tag, prints)
 
     def problem(self, start: Mapping[str, Any], noise: _Noise) -> Adjustment:
         """Returns the adjustment from poses, corners (n, 8) and modes of the print (1, m), with σ of ``noise``."""
-        a, board, tags = Adjustment(), self.board, self.tags
-        pose, places = a.block("pose", start["pose"], eliminate=True), a.block("corners", start["corners"])
-        prints = a.block("print", start["print"])
+        a, tags = Adjustment(), self.tags
+        pose = a.block("pose", start["pose"], eliminate=True)
+        corners, prints = (a.block(name, start[name]) for name in ("corners", "print"))
         covariance = tags.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
         in_px = covariance / tags.focal_px[:, None, None] ** 2
-        of_board, of_tags = [(pose, board.image), (prints, None)], [(pose, tags.image), (places, self.tag)]
-        of_print = noise.board**2 * board.noise
-        board.factor(a, "board", of_print, of_board, self.printed, lambda by_place: by_place[:, 0] @ self.modes)
-        tags.factor(a, "tags", in_px, of_tags, self.placed, lambda by_place: block_diagonal(by_place[..., :2]))
+        for kind, rows, own, noise_of_rows in (
+            ("board", self.board, (prints, None), noise.board**2 * self.board.noise),
+            ("tags", tags, (corners, self.tag), in_px),
+        ):
+            limit = length_limit(noise_of_rows.shape[-1], HUBER_TAIL)
+            a.factor(
+                lambda *values, rows=rows: rows.off(*values)[0],
+                [(pose, rows.image), own],
+                derivatives=lambda *values, rows=rows: rows.off(*values)[1],
+                root=np.linalg.inv(np.linalg.cholesky(noise_of_rows)),
+                kind=kind,
+                cluster=rows.image,
+                loss=Huber(limit, GROSS * limit),
+            )
         spread = noise.amplitude * self.print.spread_mm
         a.prior(prints, np.zeros((1, len(spread))), np.diag(spread**-2.0))
         return a
-
-    def printed(self, prints: Vector) -> np.ndarray:
-        """Returns the places (r, 1, 3) of the board's points."""
-        return self.xyz + (self.modes @ prints.array[0])[:, None]
-
-    def placed(self, corners: Vector) -> np.ndarray:
-        """Returns the places (r, 4, 3) of the tags of each row."""
-        return np.pad(corners.array[self.tag].reshape(-1, 4, 2), ((0, 0), (0, 0), (0, 1)))
-
-    def px(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the residuals of board (r, 2) and tags (r, 8), px."""
-        pose, prints, corners = (solution.values[name] for name in ("pose", "print", "corners"))
-        pairs = (self.board, self.printed(prints)), (self.tags, self.placed(corners))
-        board, tags = (rows.focal_px[:, None] * rows.off(pose, places)[0] for rows, places in pairs)
-        return board, tags
 
     def noise(self, solution: Solution, noise: _Noise) -> _Noise:
         """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
         board, tags = solution.rows
         redundancy = [max(solution.redundancy(kind), 1.0) for kind in ("board", "tags")]
-        square, px = float((board.residual**2).sum()), self.px(solution)[1]
+        square, px = float((board.residual**2).sum()), self.tags.px(solution, "corners")
         corner = _added(self.tags.noise, px, tags.weight, APART, 6 / 8 * redundancy[1])
         whole_tag = _added(self.tags.noise, px, tags.weight, TOGETHER / 2, 2 / 8 * redundancy[1])
         # Twice the mean of four corners: its variance holds that of the tag's shift four times, of a corner once.
@@ -217,7 +208,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     prints = Vector(np.zeros((1, len(layout.print.spread_mm))))
     values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
     first = layout.problem(values, _Noise(1.0, 0.0, 0.0, 1.0)).at(values)
-    apart = np.linalg.norm(layout.px(first)[1].reshape(-1, 2), axis=1)
+    apart = np.linalg.norm(layout.tags.px(first, "corners").reshape(-1, 2), axis=1)
     noise = _Noise(max(robust_sigma(first.rows[0].length, 2), LEAST_FACTOR), robust_sigma(apart, 2), 0.0, 1.0)
     settled = False
     for round_ in range(VARIANCE_ROUNDS):
@@ -229,7 +220,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
         settled = round_ > 0 and abs(noise.board / previous.board - 1) < 0.01 and change < NEAR_PX
         if settled:
             break
-    board, tags = layout.px(solution)
+    tags_px = layout.tags.px(solution, "corners")
     stretch, shear = layout.print.stretch(layout.print.modes @ values["print"].array[0])
     return AdjustedLayout(
         corners_mm=values["corners"].array.reshape(-1, 4, 2),
@@ -238,9 +229,9 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
         board_factor=noise.board,
         sigma_px=noise.corner_px,
         tag_sigma_px=noise.tag_px,
-        board_rms_px=rms(board.ravel()),
-        tag_rms_px=rms(tags.ravel()),
-        image_rms_px=np.array([rms(tags[layout.tags.image == i]) for i in range(len(images))]),
+        board_rms_px=rms(layout.board.px(solution, "print")),
+        tag_rms_px=rms(tags_px),
+        image_rms_px=np.array([rms(tags_px[layout.tags.image == i]) for i in range(len(images))]),
         downweighted=float((solution.rows[1].weight < 1).mean()),
         settled=settled,
         stretch=stretch,
@@ -417,7 +408,7 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
     """Returns the calibration in {obj}. The frame is defined by the corners of one tag, and depends on their errors."""
     origin = int(np.flatnonzero(tag_rows == plan.origin)[0])
     turn, shift = obj_from_plane(adjusted.corners_mm[origin])
-    by_corner = _by_board_corners(adjusted.corners_mm, origin, turn)
+    by_corner = _by_board_corners(adjusted.corners_mm, origin)
     covariance = by_corner @ adjusted.covariance_mm2 @ by_corner.T
     layout = TargetLayout(
         plan.name,
@@ -449,23 +440,11 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
     )
 
 
-def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.ndarray:
-    """Returns the derivative (8n, 8n), first order, of corners in {obj} by those on the board; {obj} turns by the mean
-    small rotation of the origin tag's corners."""
-    n = corners.size // 2
-    rows = slice(4 * origin, 4 * origin + 4)
-    flat = corners.reshape(-1, 2)
-    middle = flat[rows].mean(0)
-    nominal = 2 * UNIT_SQUARE @ turn  # corners of the square in the axes of the board
-    offset = flat[rows] - middle
-    quarter_turn = nominal @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # quarter turn from x to y
-    by_angle = quarter_turn / np.sum(nominal * offset)
-    jacobian = np.zeros((n, 2, n, 2))
-    jacobian[np.arange(n), :, np.arange(n)] = np.eye(2)
-    jacobian[:, :, rows] -= np.eye(2)[None, :, None, :] / 4
-    swing = (flat - middle) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    jacobian[:, :, rows] -= swing[:, :, None, None] * by_angle[None, None]
-    return np.einsum("ij,njmk->nimk", turn, jacobian).reshape(2 * n, 2 * n)
+def _by_board_corners(corners: np.ndarray, origin: int) -> np.ndarray:
+    """Returns the derivative (8n, 8n) of corners in {obj} by those on the board, from central differences."""
+    flat, steps = corners.ravel(), STEP_MM * np.eye(corners.size)
+    ends = ([in_obj((flat + sign * step).reshape(-1, 4, 2), origin).ravel() for step in steps] for sign in (1, -1))
+    return np.subtract(*map(np.array, ends)).T / (2 * STEP_MM)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

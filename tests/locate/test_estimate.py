@@ -1,4 +1,4 @@
-"""Poses from simulated corners: their covariance, their branches, and tags that are wrong."""
+"""Poses from simulated corners: covariance, branches, tags that are wrong; and the published steps, each for itself."""
 
 from dataclasses import replace
 
@@ -6,12 +6,23 @@ import numpy as np
 import pytest
 
 from stcal.boards.tags import Tags
+from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import SeenTags, covering_both, locate, merge
-from stcal.locate.verdict import VerdictOptions, judge
-from tests.outcome import fails_with
+from stcal.locate.scenes import exposure_times
+from stcal.locate.verdict import (
+    PatentOptions,
+    VerdictOptions,
+    gate,
+    judge,
+    largest_area,
+    locate_as_patent,
+    most_tags,
+    triangulated_area,
+)
+from tests.outcome import refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
 SIX = (0, 1, 2, 3, 4, 5)
@@ -128,8 +139,7 @@ def test_two_tags_that_contradict_are_rejected():
 
 def test_no_tag_is_refused():
     empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0))
-    with fails_with("E-LOCATE-NO-TAG"):
-        locate(empty, LAYOUT, CAMERA)
+    refuses("E-LOCATE-NO-TAG", locate, empty, LAYOUT, CAMERA)
 
 
 def test_shared_errors_do_not_average_out():
@@ -144,3 +154,81 @@ def test_shared_errors_do_not_average_out():
             sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=1, axis2=2).mean() / 8)
     assert sigma[0.0, 9] / sigma[0.0, 1] == pytest.approx(1 / 3, rel=0.1)
     assert sigma[1.0, 9] / sigma[1.0, 1] == pytest.approx(1, rel=0.1)
+
+
+EXACT = example_layout(1e-6)
+TRUTH = Rigid.exp([0.4, -0.1, 0.2, 10, 5, 600.0])
+
+
+def tag_at(x: float, y: float, side: float = 10.0) -> np.ndarray:
+    return np.array([[x, y], [x + side, y], [x + side, y + side], [x, y + side]])
+
+
+def test_exposure_times_are_a_geometric_series():
+    assert np.allclose(exposure_times(1.0, 16.0, 5), [1, 2, 4, 8, 16])
+    refuses("E-EXPOSURES-VALUE", exposure_times, 0.0, 1.0, 3)
+    refuses("E-EXPOSURES-VALUE", exposure_times, 1.0, 2.0, 1)
+
+
+def test_selection_by_number_and_area():
+    small = np.stack([tag_at(0, 0), tag_at(20, 0)])
+    large = np.stack([tag_at(0, 0), tag_at(90, 0)])
+    single = tag_at(0, 0)[None]
+    corners = [small, single, large, large + 1]
+    assert most_tags(corners) == [0, 2, 3]
+    assert largest_area(corners, [0, 2, 3], 0.8) == [2, 3]
+    assert largest_area(corners, [0, 2, 3], 0.2) == [0, 2, 3]
+    share = triangulated_area(small.reshape(-1, 2)) / triangulated_area(large.reshape(-1, 2))
+    assert largest_area(corners, [0, 2, 3], share) == [2, 3]  # more than S_dis, as written
+
+
+def test_the_exposure_with_the_smallest_error_is_kept():
+    rng = np.random.default_rng(0)
+    coarse = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.5, 0.0))[0]
+    fine = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.01, 0.0))[0]
+    few = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.0, 0.0), ((0, 1),))[0]
+    found = locate_as_patent([coarse, fine, few], EXACT, CAMERA)
+    assert found.exposure == 1
+    assert found.candidates == (0, 1)
+    assert [(each.tags, each.candidate, each.poses is None) for each in found.exposures] == [
+        (len(EXACT.tags), True, False),
+        (len(EXACT.tags), True, False),
+        (2, False, True),
+    ]
+    assert found.exposures[1].errors_px == found.errors_px
+    assert found.exposures[0].errors_px[0] > found.errors_px[0]
+    assert found.exposures[1].det_j == found.det_j
+    assert found.exposures[2].area_px2 is None
+    assert (found.camera_from_obj @ TRUTH.inverse()).angle_rad() < np.radians(0.2)
+    assert found.verdict.decision == "accept"
+
+
+@pytest.mark.parametrize(
+    ("det_j", "error", "ratio", "same", "reasons"),
+    [
+        (1e-6, 0.3, 5.0, False, []),
+        (1e-9, 0.3, 5.0, False, ["det J"]),
+        (1e-6, 1.3, 5.0, False, ["error 1.3"]),
+        (1e-6, 0.3, 1.5, False, ["error ratio 1.5"]),
+        (1e-6, 0.3, 1.0, True, []),
+        (1e-9, 2.0, 1.0, False, ["det J", "error 2", "error ratio"]),
+    ],
+)
+def test_the_gate(det_j, error, ratio, same, reasons):
+    verdict = gate(det_j, error, ratio, same, PatentOptions())
+    assert verdict.decision == ("reject" if reasons else "accept")
+    assert len(verdict.reasons) == len(reasons)
+    assert all(text.startswith(start) for text, start in zip(verdict.reasons, reasons, strict=True))
+
+
+def test_a_pose_that_fits_exactly_has_a_ratio_and_none_is_named():
+    def refuse(xy, seen):
+        raise DegenerateError("E-TEST", "no")
+
+    flat = np.pad(EXACT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
+    corners = CAMERA.project(TRUTH @ flat).reshape(-1, 4, 2)
+    exact = Tags(EXACT.tags, corners, np.tile(np.eye(2), (len(corners), 4, 1, 1)))
+    assert locate_as_patent([exact], EXACT, CAMERA).verdict.decision == "accept"
+    refuses("E-LOCATE-NO-POSE … in any exposure", locate_as_patent, [exact], EXACT, CAMERA, solve=refuse)
+    empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
+    refuses("E-LOCATE-NO-TAG", locate_as_patent, [empty], EXACT, CAMERA)

@@ -1,4 +1,4 @@
-"""The three models: fits against a general optimiser, covariances against numeric derivatives."""
+"""The three models, σ and covariances of their fits, and errors of points that had no part in them."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,14 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.register.consensus import MODELS, Problem
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Affine, Rigid, Similarity, align_rigid
+from stcal.register import register
+from stcal.register.consensus import MODELS, Problem, problem_of
+from stcal.register.registered import held_out
+from tests.levels import sampled
 from tests.outcome import fails_with
-from tests.support.point_pairs import make_scene
+from tests.support.point_pairs import SIGMA_MM, make_scene, parameter_error, scene
 
 NOISE = ("equal", "weights", "matrices")
 
@@ -88,12 +92,120 @@ def test_frames_may_be_moved(seed, name):
     )
 
 
-def test_affine_transforms_compose_and_invert():
-    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
-    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
-    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
-    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
-    with fails_with("E-AFFINE-SINGULAR"):
-        Affine(np.ones((3, 3)), np.zeros(3)).inverse()
+RIGID = MODELS["rigid"]
+
+
+def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float:
+    """Mean of eᵀC⁻¹e/p over its expectation."""
+    sizes = []
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, n])
+        s = make_scene(rng, n, share)
+        b, stated = s.xyz_b, None
+        if given:
+            axes = Rotation.random(n, random_state=trial).as_matrix()
+            root = axes * (np.array([0.02, 0.2, 0.2]) * rng.uniform(0.5, 2, (n, 1)))[:, None, :]
+            noise = np.einsum("nij,nj->ni", root, rng.normal(size=(n, 3)))
+            b = np.where(s.clean[:, None], s.b_from_a @ s.xyz_a + noise, b)
+            stated = root @ np.swapaxes(root, 1, 2)
+        found = register(s.xyz_a, b, covariances=stated, folds=0, **options)
+        error = parameter_error(found.b_from_a, s.b_from_a)
+        ν = found.redundancy
+        of_sigma = (ν - 2) / ν if np.isfinite(ν) else 1  # E[σ²/s²] = ν/(ν − 2)
+        sizes.append(error @ np.linalg.solve(found.covariance, error) / len(error) * of_sigma)
+    return float(np.mean(sizes))
+
+
+# χ²₆/6 has a standard deviation of 0.58; the mean of 60 trials one of 0.075, and 0.28 is nearly 4 of these.
+@pytest.mark.parametrize(
+    ("share", "options"),
+    sampled(
+        [
+            (0.3, {}),
+            (0, {}),
+            (0.3, {"given": True}),
+            (0, {"threshold_mm": 3 * SIGMA_MM}),
+            (0, {"method": "least-squares"}),
+        ]
+    ),
+)
+def test_the_covariance_is_calibrated(share, options):
+    assert calibration(60, 40, share, **options) == pytest.approx(1, abs=0.28)
+
+
+def test_given_sigma_stands_unless_contradicted():
+    s = make_scene(np.random.default_rng(3), 50)
+    true = register(s.xyz_a, s.xyz_b, covariances=np.full(50, SIGMA_MM**2), folds=0)
+    assert not true.scaled
+    assert true.redundancy == np.inf
+    assert true.sigma_factor == pytest.approx(1, abs=0.25)  # 144 degrees of freedom: ± 6 %
+    low = register(s.xyz_a, s.xyz_b, covariances=np.full(50, (SIGMA_MM / 5) ** 2), folds=0)
+    assert low.scaled
+    assert low.redundancy == 144
+    assert low.sigma_factor == pytest.approx(5 * true.sigma_factor)
+    assert any("residuals exceed the σ given" in note for note in low.notes)
+    # scaled, it is what the residuals alone give
+    plain = register(s.xyz_a, s.xyz_b, folds=0)
+    np.testing.assert_allclose(low.covariance, plain.covariance, rtol=1e-9)
+    # but for what is cut off at 5 σ
+    np.testing.assert_allclose(true.covariance * true.sigma_factor**2, plain.covariance, rtol=1e-3)
+
+
+def test_weights_have_no_unit():
+    s = make_scene(np.random.default_rng(5), 30)
+    weights = np.random.default_rng(6).uniform(0.5, 2, 30)
+    one, two = (register(s.xyz_a, s.xyz_b, weights=w, folds=0) for w in (weights, 1000 * weights))
+    np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-9)
+    assert one.sigma_mm == pytest.approx(two.sigma_mm)
+    assert one.sigma_factor is None
+
+
+@pytest.mark.parametrize(
+    ("weights", "covariances", "message"),
+    [
+        (np.ones(4), np.ones(4), "E-REGISTER-WEIGHTS"),
+        (np.ones(3), None, "E-ARRAY-SHAPE … weights … (3,) … 4"),
+        (None, np.ones((4, 3)), "E-ARRAY-SHAPE … covariances … (4, 3)"),
+        ([1, 1, 0, 1], None, "E-REGISTER-WEIGHTS … weights … 3 … 0"),
+        (None, [1, np.nan, 1, 1], "E-REGISTER-WEIGHTS … covariances … row 2 has nan"),
+        (None, np.tile(np.diag([1, 1, -1.0]), (4, 1, 1)), "E-REGISTER-WEIGHTS … covariances … 1 … 1"),
+    ],
+)
+def test_noise_that_cannot_be(weights, covariances, message):
+    with fails_with(message):
+        problem_of(RIGID, np.zeros((4, 3)), np.zeros((4, 3)), weights, covariances)
+
+
+def test_leave_one_out_is_what_it_says():
+    s = scene(0, 7)
+    problem = problem_of(RIGID, s.xyz_a, s.xyz_b)
+    found = held_out(problem, lambda rows: problem[rows].fit(), s.clean, 7, 0)
+    for i, error in zip(found.rows, found.error_mm, strict=True):
+        rest = np.arange(7) != i
+        expected = np.linalg.norm(s.xyz_b[i] - align_rigid(s.xyz_b[rest], s.xyz_a[rest]) @ s.xyz_a[i])
+        assert error == pytest.approx(expected)
+    assert found.rows.tolist() == list(range(7))
+    figures = (found.of_all.mean_mm, found.of_all.rms_mm, found.of_all.max_mm)
+    assert figures == pytest.approx((found.error_mm.mean(), np.sqrt((found.error_mm**2).mean()), max(found.error_mm)))
+
+
+def test_no_folds_and_too_few_points():
+    s = scene(2, 12)
+    assert register(s.xyz_a, s.xyz_b, folds=0).held_out is None
+    assert register(s.xyz_a[:4], s.xyz_b[:4], folds=4).held_out is None
+    assert register(s.xyz_a, s.xyz_b, folds=50).held_out.folds == 12
+
+
+def test_a_fold_that_cannot_be_fitted_is_left_out():
+    s = scene(3, 12)
+    problem = problem_of(RIGID, s.xyz_a, s.xyz_b)
+
+    def sometimes(rows):
+        if 0 not in rows:
+            raise DegenerateError("E-TEST", "without the first")
+        return problem[rows].fit()
+
+    found = held_out(problem, sometimes, s.clean, 4, 0)
+    assert found.folds == 3
+    assert len(found.rows) == 9
+    assert 0 not in found.rows

@@ -14,6 +14,7 @@ SIGMA_MM = 0.15
 HALF_MM = 100.0
 CENTRE_MM = (800.0, 200.0, 700.0)
 OFF_MM = (2.0, 50.0)
+B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

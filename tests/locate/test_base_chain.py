@@ -1,14 +1,16 @@
-"""From the camera to the robot's base."""
+"""From the camera to the robot's base; robot poses and hand-eye that cannot be meant as they stand, and such as can."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Rigid, UncertainRigid
+from stcal.geometry.rigid import Poses, Rigid, UncertainRigid
+from stcal.io.rotations import INVERTED
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.base_chain import goal_chain
+from stcal.locate.base_chain import GoalChain, goal_chain, on_chain
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
@@ -100,7 +102,25 @@ def test_scenes_are_found_by_another_column(files):
         read_chain(hand_eye, poses)
 
 
-def test_what_is_wrong_is_named(files, tmp_path):
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{", "not JSON"),
+        ("[]", "an object"),
+        ("{}", "neither; flange_from_camera or base_from_camera"),
+        ({"flange_from_camera": [[1, 2], [3, 4]]}, "flange_from_camera.*4×4 needed"),
+        ({"flange_from_camera": MOUNT.matrix().tolist(), "covariance": NEGATIVE}, "covariance: .* of y, 0 or more"),
+        ({"flange_from_camera": "x"}, "flange_from_camera.*'x'"),
+        ({"format": "stcal handeye 2", "base_from_camera": MOUNT.matrix().tolist()}, "'stcal handeye 1'"),
+    ],
+)
+def test_what_is_wrong_in_a_hand_eye_file_is_named(files, content, reason):
+    files[0].write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=reason):
+        read_chain(*files)
+
+
+def test_what_does_not_lead_to_the_base_is_named(files):
     hand_eye, poses, offset = files
     with pytest.raises(InputError, match="on the flange; robot poses"):
         read_chain(hand_eye, None)
@@ -109,21 +129,6 @@ def test_what_is_wrong_is_named(files, tmp_path):
     poses.write_text(poses.read_text() + poses.read_text().splitlines()[1] + "\n")
     with pytest.raises(InputError, match="line 3: scene a again"):
         read_chain(hand_eye, poses)
-    for content, reason in [
-        ("{", "not JSON"),
-        ("[]", "an object"),
-        ("{}", "neither; flange_from_camera or base_from_camera"),
-        (json.dumps({"flange_from_camera": [[1, 2], [3, 4]]}), "flange_from_camera.*4×4 needed"),
-        (
-            json.dumps({"flange_from_camera": MOUNT.matrix().tolist(), "covariance": NEGATIVE}),
-            "covariance: variance -2.5e\\+05 of y, 0 or more needed",
-        ),
-        (json.dumps({"flange_from_camera": "x"}), "flange_from_camera.*'x'"),
-        (json.dumps({"format": "stcal handeye 2", "base_from_camera": MOUNT.matrix().tolist()}), "'stcal handeye 1'"),
-    ]:
-        hand_eye.write_text(content)
-        with pytest.raises(InputError, match=reason):
-            read_chain(hand_eye, poses)
     offset.write_text("{}")
     hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
     with pytest.raises(InputError, match="no 'obj_from_goal'"):
@@ -136,3 +141,86 @@ def test_the_order_of_the_robots_quaternions_is_an_option(files):
     poses.write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["a", x, y, z, qx, qy, qz, qw]) + "\n")
     found = read_chain(hand_eye, poses, quaternions="xyzw").flange["a"].rigid
     assert np.allclose(found.matrix(), FLANGE.matrix(), atol=1e-12)
+
+
+CAMERA_ON_FLANGE = Rigid.exp([0.1, -0.2, 1.5, 60, -30, 110])
+
+
+def looks(seed: int, count: int, turn_rad: float = 0.5, moves: float = 0.0) -> tuple[Poses, Poses]:
+    """base_from_flange and camera_from_obj, with noise of 0.3 mm and 0.5 mrad; ``moves`` : σ of the target, mm."""
+    rng = np.random.default_rng([seed, count])
+    about = Rigid.exp([*rng.normal(0, 1, 3), *rng.uniform(-900, 900, 3)])
+    turns = rng.normal(0, turn_rad, (count, 3))
+    flange = [about @ Rigid.exp([*turn, *rng.normal(0, 80, 3)]) for turn in turns]
+    obj = flange[0] @ CAMERA_ON_FLANGE @ Rigid.exp([0.2, 0.1, 0.4, 10, 20, 600])
+    seen = []
+    for each in flange:
+        away = Rigid.exp([*rng.normal(0, moves * 5e-3, 3), *rng.normal(0, moves, 3)])
+        noise = Rigid.exp([*rng.normal(0, 5e-4, 3), *rng.normal(0, 0.3, 3)])
+        seen.append((each @ CAMERA_ON_FLANGE).inverse() @ away @ obj @ noise)
+    return Poses.of(flange), Poses.of(seen)
+
+
+def judged(flange: Poses, seen: Poses, mount: Rigid = CAMERA_ON_FLANGE) -> tuple[str, ...]:
+    poses = {str(i): UncertainRigid.exact(each) for i, each in enumerate(flange)}
+    chain = GoalChain(UncertainRigid.exact(mount), True, poses, Rigid())
+    return on_chain(chain, {str(i): UncertainRigid.exact(each) for i, each in enumerate(seen)})
+
+
+def rolled(poses: Poses) -> Poses:
+    """x, y, z, w read as w, x, y, z."""
+    return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)
+
+
+def times(each, factor: float):
+    return replace(each, translation=factor * each.translation)
+
+
+MISTAKES = {
+    "xyzw": (
+        lambda f, m: (rolled(f), m),
+        "the robot's quaternions were x, y, z, w in the order .*; give --quaternions xyzw",
+    ),
+    "conjugated": (lambda f, m: (INVERTED.poses(f), m), "the robot's quaternions were conjugated"),
+    "inverse": (lambda f, m: (f.inverse(), m), "the robot's poses were flange_from_base"),
+    "hand-eye inverse": (lambda f, m: (f, m.inverse()), "the hand-eye were camera_from_flange"),
+    "metres": (lambda f, m: (times(f, 1e-3), m), "the robot's lengths were metres; name the columns _m"),
+    "inches": (lambda f, m: (times(f, 1 / 25.4), m), "the robot's lengths were inches; name the columns _in"),
+    "hand-eye in metres": (
+        lambda f, m: (f, times(m, 1e-3)),
+        "the hand-eye's lengths were metres; multiply them by 1000",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("count", [2, 3, 12])
+def test_a_target_that_stands_still_shows_the_mistake(name, count):
+    wrong, says = MISTAKES[name]
+    for seed in range(4):
+        flange, seen = looks(seed, count)
+        flange, mount = wrong(flange, CAMERA_ON_FLANGE)
+        with pytest.raises(InputError, match=rf"varies by .* \(RMS of {count} scenes\), but by .* if {says}"):
+            judged(flange, seen, mount)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2, 3, 12])
+@pytest.mark.parametrize("turn_rad", [0.0, 0.02, 0.5])
+@pytest.mark.parametrize("moves", [0.0, 3.0, 200.0])
+def test_good_poses_pass(count, turn_rad, moves):
+    """Flanges that turn and that do not, targets that stand and that move."""
+    for seed in range(12):
+        assert judged(*looks(seed, count, turn_rad, moves)) == ()
+
+
+def test_lengths_in_metres_are_said():
+    flange, seen = looks(1, 1)
+    (note,) = judged(times(flange, 1e-3), seen, CAMERA_ON_FLANGE)
+    assert note.startswith("robot poses: the flange is within ")
+    assert "if lengths are metres, name the columns _m" in note
+    (note,) = judged(flange, seen, times(CAMERA_ON_FLANGE, 1e-3))
+    assert note.startswith("hand-eye file: the camera is 0.13 mm from the origin of the flange, more than 2 mm")
+    fixed = GoalChain(UncertainRigid.exact(times(CAMERA_ON_FLANGE, 0.02)), False, {}, Rigid())
+    assert "of the base, more than 20 mm expected" in on_chain(fixed, {})[0]
+    assert judged(Poses.of([Rigid()]), seen) == judged(flange, seen, Rigid()) == ()
