@@ -95,11 +95,6 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
     """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10). ``kind``:
     ``three-point`` as in the paper; ``plane``: Z from the plane of all circles; ``towards``: direction to the side from
     which the face is seen."""
-    if missing := missing_frame_circles(face, xyz):
-        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-        raise DegenerateError(
-            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
-        )
     return face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)[0]
 
 
@@ -110,6 +105,11 @@ def face_frames(
     design, laid over all of its points by least squares."""
     if face.sigma_mm is not None:
         return _fitted(face, circles, xyz)
+    if missing := missing_frame_circles(face, circles):
+        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        )
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_planes(xyz, towards)

@@ -27,7 +27,7 @@ from stcal.geometry.plane import circle_image_offset, fit_plane
 from stcal.geometry.rigid import Poses, Rigid, Similarity, align_rigid, align_similarity, by_pose
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, Label, dot_cells
-from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, M, Outlier, WorldModel
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, M, Outlier, WorldModel, rows_of
 
 MIN_DOTS = 4
 EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share
@@ -179,12 +179,8 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
 
 def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[FaceDesign, np.ndarray]]:
     """Returns the faces of known shape with three points or more among ``labels``, and the indices of these."""
-    faces = {face.id: face for face in faces_of_known_shape(board)}
-    members: dict[str, list[int]] = {}
-    for i, label in enumerate(labels):
-        if isinstance(label, CircleLabel) and label.face in faces:
-            members.setdefault(label.face, []).append(i)
-    return [(faces[face], np.array(rows)) for face, rows in members.items() if len(rows) >= MIN_CORNERS]
+    faces, members = {face.id: face for face in faces_of_known_shape(board)}, rows_of(label.plane for label in labels)
+    return [(faces[face], rows) for face, rows in members.items() if face in faces and len(rows) >= MIN_CORNERS]
 
 
 EXACTLY = 1e-15

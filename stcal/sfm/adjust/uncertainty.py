@@ -48,14 +48,13 @@ class Derivatives:
     circles_designed: np.ndarray  # (c, 3, d)
     designed_sigma_mm: float  # of these positions
 
+    def _covariance(self, covariance_mm2: np.ndarray, by_circles: np.ndarray, designed: np.ndarray) -> np.ndarray:
+        return by_circles @ covariance_mm2 @ by_circles.T + self.designed_sigma_mm**2 * designed @ designed.T
+
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """Returns 6×6 by face from the covariance (3c, 3c) of the circles, in any datum."""
-        variance = self.designed_sigma_mm**2
-        return {
-            face_id: jacobian @ covariance_mm2 @ jacobian.T
-            + variance * self.face_designed[face_id] @ self.face_designed[face_id].T
-            for face_id, jacobian in self.faces.items()
-        }
+        parts = {face: (by_circles, self.face_designed[face]) for face, by_circles in self.faces.items()}
+        return {face: self._covariance(covariance_mm2, *own) for face, own in parts.items()}
 
     def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
         """Returns σ of the distance between the origins of every two faces."""
@@ -63,22 +62,20 @@ class Derivatives:
         for a, b in combinations(self.target_from_face, 2):
             offset = self.target_from_face[b].translation - self.target_from_face[a].translation
             along = offset / np.linalg.norm(offset)
-            gradient = along @ (self.faces[b][3:] - self.faces[a][3:])
-            designed = self.designed_sigma_mm * along @ (self.face_designed[b][3:] - self.face_designed[a][3:])
-            sigma[a, b] = float(np.sqrt(max(gradient @ covariance_mm2 @ gradient, 0.0) + designed @ designed))
+            apart = (along @ (own[b][3:] - own[a][3:]) for own in (self.faces, self.face_designed))
+            sigma[a, b] = float(np.sqrt(max(self._covariance(covariance_mm2, *apart), 0.0)))
         return sigma
 
     def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """Returns (c, 3, 3) mm², target frame, from the covariance (3c, 3c) of the circles."""
-        mapped = np.einsum("cip,pq,cjq->cij", self.circles, covariance_mm2, self.circles, optimize=True)
-        designed = self.designed_sigma_mm * self.circles_designed
-        return mapped + designed @ np.swapaxes(designed, 1, 2)
+        c = np.arange(len(self.circles))
+        return self.all_circles_covariance(covariance_mm2).reshape(len(c), 3, len(c), 3)[c, :, c]
 
     def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """Returns (3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
-        flat = self.circles.reshape(-1, self.circles.shape[-1])
-        designed = self.designed_sigma_mm * self.circles_designed.reshape(len(flat), -1)
-        return flat @ covariance_mm2 @ flat.T + designed @ designed.T
+        rows = 3 * len(self.circles)
+        parts = self.circles.reshape(rows, -1), self.circles_designed.reshape(rows, -1)
+        return self._covariance(covariance_mm2, *parts)
 
 
 def calibrated_target(

@@ -34,7 +34,7 @@ from stcal.sfm.camera.intrinsics import (
     projection_sigma,
     start_camera,
 )
-from stcal.sfm.data.group_model import ImageObservations, by_group
+from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
@@ -219,9 +219,8 @@ def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
 def prediction_errors(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
     camera, factor = result.camera, result.factors.centres
-    ((group, members),) = by_group([view]).items()
-    model = model_of_views(group, view.labels, members, board, camera)
-    known = [own for own in result.models if own.group == group]
+    model = model_of_views([view], board, camera)
+    known = [own for own in result.models if own.group == view.group]
     places = {label: xyz for own in known for label, xyz in zip(own.labels, own.xyz_model, strict=True)}
     points = Vector(np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)]))
     model = replace(model, xyz_model=points.array)

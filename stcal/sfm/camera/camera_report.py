@@ -1,16 +1,16 @@
 """Result file and report of a calibrated camera."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, parameter_names
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
-from stcal.io.json import ByName, Matrix, NamedReason, ResultFile
+from stcal.io.json import ByName, Matrix, Named, NamedReason, ResultFile
 from stcal.report.camera_figures import field_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
@@ -29,48 +29,13 @@ from stcal.sfm.camera.intrinsics import GRID, Intrinsics, model_parameters
 ByCorner = Annotated[str, "corner"]
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    value: float
-    sigma: float
-    freedom: float
-
-
-@dataclass(frozen=True, slots=True)
-class Print:
-    stretch: float
-    shear: float
-
-
-@dataclass(frozen=True, slots=True)
-class Corner:
-    reach: float
-    sigma_px: float
-
-
-@dataclass(frozen=True, slots=True)
-class BoardViewRow:
-    image: str
-    dots: int
-    tilt_deg: float
-    rms_px: float
-
-
-@dataclass(frozen=True, slots=True)
-class OutlierDot:
-    image: str
-    label: str
-    residual_px: float
-    weight: float
-
-
 class CalibrationFile(ResultFile):
     """Result file of ``calibrate-camera``. Pixels count from the centre of the top-left pixel."""
 
     format: Literal["stcal camera 1"] = Field(description="the file's form and its version")
     model: str = Field(description="COLMAP model")
     size_px: tuple[int, int] = Field(description="width and height")
-    parameters: dict[ByName, Parameter] = Field(
+    parameters: dict[ByName, Annotated[Any, Named("value sigma freedom")]] = Field(
         description="`value`, `sigma`, and the degrees of freedom `freedom` that the photographs have for it, in the "
         "model's order; px and OpenCV pixel origin, distortion coefficients without unit"
     )
@@ -87,7 +52,7 @@ class CalibrationFile(ResultFile):
         description="by how much photographs differ more than their pixels explain, as a ratio of σ; σ are those of "
         "independent photographs, never below those of independent pixels"
     )
-    prints: dict[ByName, Print] = Field(
+    prints: dict[ByName, Annotated[Any, Named("stretch shear")]] = Field(
         description="by folder: how much longer the board is printed along its rows than across, relative (`stretch`), "
         "and its `shear`; both are adjusted"
     )
@@ -97,7 +62,7 @@ class CalibrationFile(ResultFile):
         description="σ per axis of where a known direction is seen, up to a rotation of the camera: median over the "
         "image"
     )
-    corners: dict[ByCorner, Corner] = Field(
+    corners: dict[ByCorner, Annotated[Any, Named("reach sigma_px")]] = Field(
         description="of the image: `reach` of the dots towards it, 1 at the corner, and `sigma_px` there"
     )
     held_out_rms_px: float | None = Field(
@@ -107,10 +72,10 @@ class CalibrationFile(ResultFile):
         description="with `--model auto`: `model`, `parameters` it has, `rms_px` of held-out views, `worse` than the "
         "best by so much in the mean square (σ²) and its standard error `worse_sigma`; `why` it could not be tried",
     )
-    images: list[BoardViewRow] = Field(
+    images: list[Annotated[Any, Named("image dots tilt_deg rms_px")]] = Field(
         description="`image`, `dots`, `tilt_deg` of the board against the image plane, `rms_px`"
     )
-    outliers: list[OutlierDot] = Field(
+    outliers: list[Annotated[Any, Named("image label residual_px weight")]] = Field(
         description="dots that weigh less than half: `image`, `label`, `residual_px`, `weight`"
     )
     left_out: list[NamedReason] = Field(description="`name`, `reason`")
@@ -120,23 +85,23 @@ class CalibrationFile(ResultFile):
 def calibration_file(calibration: CameraCalibration) -> CalibrationFile:
     result, projection, held_out = calibration.intrinsics, calibration.projection, calibration.held_out
     camera, sigma = result.camera, result.sigma()
-    columns = np.array([model_parameters(camera, result.colmap_model), sigma, result.freedom]).T.tolist()
-    reached = np.array([projection.reach, projection.corner_sigma_px]).T.tolist()
+    found = {"value": model_parameters(camera, result.colmap_model), "sigma": sigma, "freedom": result.freedom}
+    reached = {"reach": projection.reach, "sigma_px": projection.corner_sigma_px}
     return CalibrationFile(
         format="stcal camera 1",
         model=result.colmap_model,
         size_px=(camera.width, camera.height),
-        parameters={n: Parameter(*v) for n, v in zip(parameter_names(result.colmap_model), columns, strict=True)},
+        parameters=_rows(parameter_names(result.colmap_model), found),
         correlation=result.covariance / np.outer(sigma, sigma),
         residual_rms_px=residual_rms_px(result),
         centre_sigma_factor=result.factors.centres,
         dot_sigma_factor=result.factors.dots,
         photographs_differ=result.differ,
-        prints={folder: Print(*map(float, own)) for folder, own in result.prints().items()},
+        prints={folder: {"stretch": float(a), "shear": float(b)} for folder, (a, b) in result.prints().items()},
         redundancy=result.redundancy,
         rounds=calibration.rounds,
         projection_sigma_px=float(np.median(projection.sigma_px)),
-        corners={corner: Corner(*values) for corner, values in zip(CORNERS, reached, strict=True)},
+        corners=_rows(CORNERS, reached),
         held_out_rms_px=held_out and held_out.rms_px(),
         models=calibration.candidates,
         images=list(_views(result)),
@@ -146,34 +111,38 @@ def calibration_file(calibration: CameraCalibration) -> CalibrationFile:
     )
 
 
-def _views(result: Intrinsics) -> Iterator[BoardViewRow]:
+def _rows(names: Sequence[str], columns: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
+    return {name: {key: float(own[i]) for key, own in columns.items()} for i, name in enumerate(names)}
+
+
+def _views(result: Intrinsics) -> Iterator[dict[str, Any]]:
     for model in result.models:
         residual = model.residuals_px(result.camera)
         for image, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             tilt_deg = float(np.degrees(np.arccos(abs(pose.rotation[2, 2]))))
-            yield BoardViewRow(image, len(rows), tilt_deg, float(np.sqrt((residual[rows] ** 2).mean())))
+            yield {"image": image, "dots": len(rows), "tilt_deg": tilt_deg, "rms_px": rms(residual[rows])}
 
 
-def _outliers(result: Intrinsics) -> Iterator[OutlierDot]:
+def _outliers(result: Intrinsics) -> Iterator[dict[str, Any]]:
     for model, weights in zip(result.models, result.weights(), strict=True):
         length = np.linalg.norm(model.residuals_px(result.camera), axis=1)
         for i in np.flatnonzero(weights < OUTLIER_WEIGHT):
             image, label = model.images[model.image_index[i]], model.labels[model.point_index[i]]
-            yield OutlierDot(image, label, float(length[i]), float(weights[i]))
+            yield {"image": image, "label": label, "residual_px": float(length[i]), "weight": float(weights[i])}
 
 
 def calibration_report(result: CameraCalibration, summary: CalibrationFile, where: str) -> Document:
     lens, held = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model), summary.held_out_rms_px
     digits = {name: 4 if name[0] in "fc" else 7 for name in summary.parameters}
-    rows = [[n, number(own.value, digits[n]), number(own.sigma, digits[n])] for n, own in summary.parameters.items()]
+    rows = [[n, *(number(own[k], digits[n]) for k in ("value", "sigma"))] for n, own in summary.parameters.items()]
     models = [
         ["*" if own.model == summary.model else "", own.model, str(own.parameters)]
         + [number(v, 4) for v in (own.rms_px, own.worse, own.worse_sigma)]
         + [own.why]
         for own in summary.models
     ]
-    images = [[own.image, own.dots, number(own.tilt_deg, 1), number(own.rms_px, 4)] for own in summary.images]
-    outliers = [[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers]
+    images = [[v["image"], v["dots"], number(v["tilt_deg"], 1), number(v["rms_px"], 4)] for v in summary.images]
+    outliers = [[o["image"], o["label"], number(o["residual_px"], 3), number(o["weight"], 2)] for o in summary.outliers]
     left_out = [[own.name, own.reason] for own in summary.left_out]
     differ = f"{summary.photographs_differ:.1f} times more than their pixels explain; σ are larger by that"
     parameters: list[Block] = [
@@ -190,7 +159,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         parameters.append(f"views held out, {parts} after their poses were fitted")
     for folder, own in summary.prints.items():
         board = "the board" if folder == "." else f"the board of {folder}"
-        parameters += stretch_in_words(board, own.stretch, own.shear)
+        parameters += stretch_in_words(board, **own)
     parameters.append(plot(lambda: field_figure(*moved_px(lens)), "What the lens moves"))
     uncertainty = [
         "How well it is known where the camera sees a known direction, up to a rotation of the camera, which poses "

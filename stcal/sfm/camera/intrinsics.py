@@ -22,7 +22,7 @@ from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import image_cost, normalised, robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px, placed, reproject
-from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, assemble, by_group
 from stcal.sfm.detect.detect_files import DetectedImage
 from stcal.sfm.detect.labelling import labelled_image
 
@@ -383,12 +383,9 @@ def adjust_intrinsics(
 ) -> Intrinsics:
     """Adjusts the intrinsics from ``start`` by at least three views, with dots of the board only."""
     basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
-    models = []
-    for folder, members in by_group(views).items():
-        labels = tuple(sorted({label for view in members for label in view.labels}))
-        models.append(model_of_views(folder, labels, members, board, start))
+    models = tuple(model_of_views(members, board, start) for members in by_group(views).values())
     fit = Fit(
-        models=tuple(models),
+        models=models,
         camera=start,
         start=start,
         basis=basis,
@@ -470,24 +467,11 @@ def _adjusted(fit: Fit, board: BoardDesign, colmap_model: str) -> Intrinsics:
     return _intrinsics(last, colmap_model, factors, settled)
 
 
-def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
+def model_of_views(views: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> MetricModel:
     """Returns the model of a folder's views of its board, with the dots at their design places."""
-    place = {label: i for i, label in enumerate(labels)}
-    rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
-    image_index, point_index, keypoint = np.array(rows).T
-    return MetricModel(
-        group=folder,
-        images=tuple(v.name for v in views),
-        camera_from_model=tuple(start_pose(v, board, camera) for v in views),
-        labels=labels,
-        xyz_model=board.places_mm(labels),
-        image_index=image_index,
-        point_index=point_index,
-        keypoint=keypoint,
-        measured_px=np.concatenate([v.centre_px for v in views]),
-        shift_px=np.zeros((len(rows), 2)),
-        covariance_px2=np.concatenate([v.covariance_px2 for v in views]),
-    )
+    labels = sorted({label for view in views for label in view.labels})
+    places = dict(zip(labels, board.places_mm(labels), strict=True))
+    return assemble(MetricModel, views[0].group, views, (start_pose(v, board, camera) for v in views), places)
 
 
 def _weighted(fit: Fit, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> Fit:

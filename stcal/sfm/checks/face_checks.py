@@ -1,6 +1,6 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -15,7 +15,6 @@ from stcal.design import faces_of_known_shape
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
-from stcal.parallel import run_in_order
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.refine import Network
@@ -35,17 +34,13 @@ def _loop_remedy(evidence: Evidence) -> str:
     return "add a group that closes a loop of faces" if evidence.board.rows or len(evidence.linked) > 1 else ""
 
 
-def _adjust(evidence: Evidence, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
-    """Adjusts parts of the models as the run did, from its result and with its intrinsics; returns the error of a part
-    that has no result."""
-    jobs = [(models, evidence.board, evidence.options.flatness_mm, evidence.joint) for models in parts]
-    return run_in_order(_adjusted, jobs, 1)
-
-
-def _adjusted(models: Sequence[MetricModel], board, flatness_mm, whole: JointResult) -> JointResult | StcalError:
+def _adjusted(evidence: Evidence, whole: JointResult, models: Iterable[MetricModel]) -> JointResult | StcalError:
+    """Adjusts a part of the models as the run did, from its result and with its intrinsics; returns the error if there
+    is no result."""
     models = [model for model in models if model.images]  # a part of a group may hold no two images of a point
     try:
-        return result_of(adjust_part(models, board, flatness_mm, whole)) if models else _unfixed(models)
+        part = adjust_part(models, evidence.board, evidence.options.flatness_mm, whole) if models else None
+        return result_of(part) if part else _unfixed(models)
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:
@@ -90,7 +85,7 @@ def halves_check(evidence: Evidence, joint: JointResult) -> Check:
     if len(fewest.images) < 2 * MIN_HALF:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
         return impossible("halves", reason, "add images")
-    halves = _adjust(evidence, [[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
+    halves = [_adjusted(evidence, joint, (m.without(m.image_index % 2 != k) for m in models)) for k in (0, 1)]
     try:
         first, second = (_posed(evidence, half, faces) for half in halves)
     except StcalError as error:
@@ -128,8 +123,8 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
     ]
     trials: list[Trial] = []
     curing = []
-    parts = _adjust(evidence, [[m for m in joint.models if m.group != group] for group in removable])
-    for group, part in zip(removable, parts, strict=True):
+    for group in removable:
+        part = _adjusted(evidence, joint, (m for m in joint.models if m.group != group))
         if isinstance(part, StcalError):
             continue
         extra, freedom, free = _added(part, [n for n in evidence.linked if n.model.group != group])
@@ -198,8 +193,7 @@ def loops_check(evidence: Evidence, joint: JointResult) -> Check:
         if not set(first.groups) & set(second.groups)
     ]
     groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
-    alone = _adjust(evidence, [[m for m in models if m.group == group] for group in groups])
-    single = dict(zip(groups, alone, strict=True))
+    single = {group: _adjusted(evidence, joint, (m for m in models if m.group == group)) for group in groups}
 
     @cache  # several ways share a step
     def step_of(group: str, a: str, b: str) -> tuple[Rigid, np.ndarray]:

@@ -3,7 +3,7 @@ labelled points; and notes, on faces that are not where the design draws them, o
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
@@ -21,6 +21,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
+K = TypeVar("K")
 ROW_SHAPES = {
     "centre_px": (2,),
     "centre": (2,),
@@ -99,12 +100,18 @@ class ImageObservations(Measured):
         return replace(self, labels=tuple(self.labels[i] for i in keep), **arrays)
 
 
+def rows_of(keys: Iterable[K]) -> dict[K, np.ndarray]:
+    """Returns the indices of each key, in order of appearance."""
+    rows: dict[K, list[int]] = {}
+    for i, key in enumerate(keys):
+        rows.setdefault(key, []).append(i)
+    return {key: np.array(own) for key, own in rows.items()}
+
+
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
     """Returns the observations by group, in order."""
-    groups: dict[str, list[ImageObservations]] = {}
-    for image in observations:
-        groups.setdefault(image.group, []).append(image)
-    return groups
+    groups = rows_of(image.group for image in observations)
+    return {group: [observations[i] for i in rows] for group, rows in groups.items()}
 
 
 def detections_csv(observations: list[ImageObservations]) -> str:
@@ -252,10 +259,7 @@ class GroupModel(Measured):
 
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Returns the indices of the points by face; the points of the board have the key ``board``."""
-        members: dict[str, list[int]] = {}
-        for i, label in enumerate(self.labels):
-            members.setdefault(label.plane, []).append(i)
-        return {key: np.array(indices) for key, indices in members.items()}
+        return rows_of(label.plane for label in self.labels)
 
     def normals(self) -> np.ndarray:
         """Returns the normal of each point's face or board, (p, 3); zero where the model has too few points of it."""
@@ -317,6 +321,36 @@ class MetricModel(GroupModel):
     def in_world(self, world_from_model: Similarity) -> "WorldModel":
         """Returns the model in a world without unit, as the mapper would have made it; for simulations."""
         return self._placed(WorldModel, world_from_model)
+
+
+def assemble(
+    kind: type[M],
+    group: str,
+    images: Sequence[ImageObservations],
+    poses: Iterable[Rigid],
+    xyz: Mapping[Label, np.ndarray],
+) -> M:
+    """Returns the model of placed images and labelled points, with all observations of these points in these images."""
+    labels = sorted(xyz)
+    index = {label: i for i, label in enumerate(labels)}
+    rows = [
+        (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
+    ]
+    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
+    row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
+    return kind(
+        group=group,
+        images=tuple(image.name for image in images),
+        camera_from_model=tuple(poses),
+        labels=tuple(labels),
+        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
+        image_index=image_index,
+        point_index=point_index,
+        keypoint=keypoint,
+        measured_px=np.concatenate([image.centre_px for image in images])[row],
+        shift_px=np.zeros((len(rows), 2)),
+        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
+    )
 
 
 NOT_AS_DRAWN = "not-as-drawn"

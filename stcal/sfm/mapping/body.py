@@ -21,7 +21,7 @@ from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
-from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel, assemble
 from stcal.sfm.mapping.incremental import (
     MAX_REPROJECTION_PX,
     MIN_RAY_ANGLE_RAD,
@@ -31,8 +31,6 @@ from stcal.sfm.mapping.incremental import (
     rays_of,
     widest_angle_rad,
 )
-from stcal.sfm.mapping.models import assemble
-from stcal.sfm.mapping.pairs import PairScore, ray_angle_rad
 
 BY_FACES = "faces of known shape, placed together"
 SHOW_MORE = "show two faces of it at once, or one by more corners"
@@ -360,14 +358,12 @@ def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
     return Poses.of(poses)
 
 
-def adjust_body(
-    start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, rounds: int = ROBUST_ROUNDS
-) -> Body:
+def adjust_body(start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
     """Returns the body of least robust cost over all poses, and over the camera's parameters of ``basis`` (16, q),
     which have the weight matrix ``prior`` (q, q) about those of ``given``."""
     body = start
     used = corners.select(body.used(corners))
-    for _ in range(rounds):
+    for _ in range(ROBUST_ROUNDS):
         length = body.lengths(used)
         huber = HUBER * max(robust_sigma(length[np.isfinite(length)], 2), 1e-3) if len(length) else np.inf
         body = _minimum(body, used, basis, prior, given, huber)
@@ -604,17 +600,3 @@ def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camer
     is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
     missing = left_out(group, model, SHOW_MORE)
     return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)
-
-
-def pair_of_model(model: WorldModel) -> PairScore:
-    """Returns the pair of images with most points in common: a report names one for each group."""
-    sees = np.zeros((len(model.images), len(model.labels)), bool)
-    sees[model.image_index, model.point_index] = True
-    shared = np.triu(sees.astype(int) @ sees.T.astype(int), 1)
-    i, j = np.unravel_index(int(shared.argmax()), shared.shape)
-    pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
-    both = model.xyz_model[sees[i] & sees[j]]
-    angle = ray_angle_rad(*(both - model.camera_from_model[k].inverse().translation for k in (i, j)))
-    length = float(np.linalg.norm(pose.translation)) or 1.0
-    pair, forward = (model.images[i], model.images[j], int(shared[i, j])), abs(float(pose.translation[2])) / length
-    return PairScore(*pair, angle, 1.0, forward, Rigid(pose.rotation, pose.translation / length), "chosen")

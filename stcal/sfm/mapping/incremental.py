@@ -13,9 +13,9 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel, assemble
 from stcal.sfm.mapping.database import CAMERA_ID, pycolmap, unwritable
-from stcal.sfm.mapping.models import assemble, points_by_votes, rigid_from_colmap
+from stcal.sfm.mapping.models import points_by_votes, rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 
 MIN_SHARE = 0.25  # smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)

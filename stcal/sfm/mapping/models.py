@@ -18,7 +18,7 @@ from stcal.io.cameras.camera_model import camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.io.static_transforms import image_lines
 from stcal.labels import DotLabel, Label
-from stcal.sfm.data.group_model import GroupModel, ImageObservations, M, MetricModel, WorldModel
+from stcal.sfm.data.group_model import GroupModel, ImageObservations, MetricModel, WorldModel, assemble
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, pycolmap, to_colmap_px
 
 LOG_NOTHING = 4  # level of COLMAP's log that prints nothing. Errors are raised as exceptions.
@@ -327,32 +327,6 @@ def points_by_votes(
                 votes_of_label.setdefault(label, Counter())[point.point3D_id] += 1
     chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in votes_of_label.items()}
     return chosen, sum(len(votes) > 1 for votes in votes_of_label.values())
-
-
-def assemble(
-    kind: type[M], group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
-) -> M:
-    """Returns the model of placed images and labelled points, with all observations of these points in these images."""
-    labels = sorted(xyz)
-    index = {label: i for i, label in enumerate(labels)}
-    rows = [
-        (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
-    ]
-    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
-    row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
-    return kind(
-        group=group,
-        images=tuple(image.name for image in images),
-        camera_from_model=tuple(poses),
-        labels=tuple(labels),
-        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
-        image_index=image_index,
-        point_index=point_index,
-        keypoint=keypoint,
-        measured_px=np.concatenate([image.centre_px for image in images])[row],
-        shift_px=np.zeros((len(rows), 2)),
-        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
-    )
 
 
 def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tuple[WorldModel | None, int]:

@@ -18,7 +18,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Rigid, best_rotations
 from stcal.labels import DotLabel
-from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.data.group_model import ImageObservations, WorldModel, rows_of
 from stcal.sfm.data.patterns import planar_pose
 from stcal.sfm.mapping.database import match_labels
 
@@ -157,6 +157,20 @@ def ray_angle_rad(to_a: np.ndarray, to_b: np.ndarray) -> float:
     return float(np.median(np.arccos(np.clip(cosine, -1, 1)))) if len(cosine) else 0.0
 
 
+def pair_of_model(model: WorldModel) -> PairScore:
+    """Returns the pair of images with most points in common: a report names one for each group."""
+    sees = np.zeros((len(model.images), len(model.labels)), bool)
+    sees[model.image_index, model.point_index] = True
+    shared = np.triu(sees.astype(int) @ sees.T.astype(int), 1)
+    i, j = np.unravel_index(int(shared.argmax()), shared.shape)
+    pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
+    both = model.xyz_model[sees[i] & sees[j]]
+    angle = ray_angle_rad(*(both - model.camera_from_model[k].inverse().translation for k in (i, j)))
+    length = float(np.linalg.norm(pose.translation)) or 1.0
+    pair, forward = (model.images[i], model.images[j], int(shared[i, j])), abs(float(pose.translation[2])) / length
+    return PairScore(*pair, angle, 1.0, forward, Rigid(pose.rotation, pose.translation / length), "chosen")
+
+
 def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigid | None:
     """Returns b_from_a with unit translation by five-point RANSAC (Nistér 2004) on normalised points."""
     essential, inliers = cv2.findEssentialMat(
@@ -214,10 +228,7 @@ def image_graph(
     kind = kind or ("sparse" if len(observations) > SPARSE_FROM else "all")
     sees = incidence(observations)
     shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)
-    groups: dict[str, list[int]] = {}
-    for i, image in enumerate(observations):
-        groups.setdefault(image.group, []).append(i)
-    members = {name: np.array(indices) for name, indices in groups.items()}
+    members = rows_of(image.group for image in observations)
     if kind == "all":
         return ImageGraph(kind, np.argwhere(np.triu(shared, 1) >= MIN_SHARED), members)
     skeleton, pairs = {}, set()

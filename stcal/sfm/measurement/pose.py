@@ -31,7 +31,7 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.adjust.equations import coordinates
 from stcal.sfm.adjust.faces_file import TargetCircles
-from stcal.sfm.data.group_model import ImageObservations, Outlier
+from stcal.sfm.data.group_model import ImageObservations, Outlier, rows_of
 from stcal.sfm.data.patterns import CircleImages, project_circles
 
 SETTLED = 1e-4
@@ -114,11 +114,8 @@ MIN_BREADTH = 0.05  # ratio to the length of the visible circles: a row leaves t
 
 def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[Poses, Rigid]:
     """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
-    faces: dict[str, list[int]] = {}
-    for i, label in enumerate(problem.labels):
-        if label.face in target.target_from_plane:
-            faces.setdefault(label.face, []).append(i)
-    by_size = sorted(faces, key=lambda face: -len(faces[face]))
+    faces = rows_of(label.face for label in problem.labels)
+    by_size = sorted((face for face in faces if face in target.target_from_plane), key=lambda face: -len(faces[face]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
         raise DegenerateError(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,31 +11,15 @@ from pydantic import Field
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
-from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
+from stcal.io.json import Finite, Matrix6, Named, NamedReason, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, csv_text, pose_cells, require_pose_table_written
 from stcal.report.document import Answer, Document, Printed, Section, legend, page_only, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
 from stcal.report.text import number
+from stcal.sfm.data.group_model import Outlier
 from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import TargetPose, fit_verdict
-
-
-class OtherPose(Part):
-    camera_from_target: Pose
-    covariance: Matrix6
-
-
-class CircleRow(Part):
-    label: str
-    residual_px: Pair
-    weight: float
-
-
-class OutlierRow(Part):
-    label: str
-    residual_px: float
-    limit_px: float
 
 
 class ImagePose(Part):
@@ -48,7 +32,7 @@ class ImagePose(Part):
         description="what it is the sum of: `image`, `target`, `intrinsics`, `curvature`: by which the likelihood is "
         "wider, or narrower, than its linearisation says (zero unless a face is frontal, far and noisy)"
     )
-    alternative: OtherPose | None = Field(
+    alternative: Annotated[TargetPose, Named("camera_from_target covariance")] | None = Field(
         description="`camera_from_target` and `covariance` of the other pose that fits, null where there is none"
     )
     delta_chi2: Finite = Field(
@@ -61,10 +45,10 @@ class ImagePose(Part):
     dof: int = Field(description="their degrees of freedom")
     p_value: float = Field(description="of as much by chance")
     fit: Literal["passed", "suspicious", "failed"] = Field(description="suspicious: p < 0.001, failed: p < 0.00001")
-    circles: list[CircleRow] = Field(
+    circles: list[Annotated[Any, Named("label residual_px weight")]] = Field(
         description="`label`, `residual_px` measured minus projected ellipse centre, Huber's `weight`"
     )
-    outliers: list[OutlierRow] = Field(
+    outliers: list[Annotated[Outlier, Named("label residual_px limit_px")]] = Field(
         description="`label`, `residual_px`, `limit_px` of circles that contradict the others and are left out"
     )
     notes: list[str] = Field(description="what detection saw and left out")
@@ -170,7 +154,7 @@ def poses_file(result: MeasureResult) -> PosesFile:
     images = []
     for image in result.images:
         pose = image.pose
-        circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
+        circles = zip(pose.labels, pose.residuals_px.tolist(), pose.weights.tolist(), strict=True)
         named = {
             "image": image.name,
             "notes": image.notes,
@@ -181,7 +165,7 @@ def poses_file(result: MeasureResult) -> PosesFile:
             "dof": pose.redundancy,
             "p_value": pose.p_value(),
             "fit": fit_verdict(pose),
-            "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
+            "circles": [{"label": label, "residual_px": px, "weight": weight} for label, px, weight in circles],
         }
         alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
         images.append(ImagePose.model_validate(named | alike))

@@ -25,8 +25,7 @@ from stcal.sfm.adjust.faces_file import FacePoses
 from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
-from stcal.sfm.data.group_model import ImageObservations, MetricModel, by_group
-from stcal.sfm.mapping.models import assemble
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, assemble, by_group
 from stcal.synthetic.scene import Scene, image_circles
 
 

@@ -32,10 +32,9 @@ from stcal.parallel import one_thread
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.refine import with_edge_sigma
-from stcal.sfm.data.group_model import ImageObservations, MetricModel
+from stcal.sfm.data.group_model import ImageObservations, MetricModel, assemble
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.mapping.body import unknown_lens
-from stcal.sfm.mapping.models import assemble
 from stcal.sfm.planning.forecast import (
     FORECAST,
     MICRO,

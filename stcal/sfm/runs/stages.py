@@ -46,14 +46,13 @@ from stcal.sfm.mapping.body import (
     LENS,
     MIN_CORNERS,
     map_body,
-    pair_of_model,
     place_and_find_camera,
     place_with_camera,
     unknown_lens,
 )
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import Mapping, left_out, map_group
-from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, rank_pairs
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, pair_of_model, rank_pairs
 from stcal.sfm.report.check import Check
 from stcal.sfm.runs.run_options import RunOptions, is_vague, require_dots
 from stcal.sfm.runs.transaction import RunFolder
