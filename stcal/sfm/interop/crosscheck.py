@@ -31,7 +31,7 @@ from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, writ
 from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
-from stcal.sfm.report.judgement import judged
+from stcal.sfm.report.judgement import with_judgement
 from stcal.sfm.runs.comparisons import (
     CameraDifference,
     Crosscheck,
@@ -308,7 +308,7 @@ def crosscheck(
                 "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
             )
         check = _compared(saved, colmap, tolerances, timeout_s, progress)
-        write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
+        write_report(stage, with_judgement(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
     return check
 
 

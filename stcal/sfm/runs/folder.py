@@ -62,7 +62,7 @@ from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import QUESTIONS, Judgement, judged, without_sigma_of
+from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
 from stcal.sfm.report.run_page import (
     CONTROL,
     FIRST_IMAGES,
@@ -80,10 +80,8 @@ from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complet
 LONGEST_NAME, HASH_DIGITS = 200, 12
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
 during writing."""
-WEAK_FOCAL = 0.01
-"""Relative σ of a focal length beyond which the views lack what determines it."""
-FIRST = 20
-"""Number of images that are named."""
+WEAK_FOCAL = 0.01  # relative σ of a focal length beyond which the views lack what determines it
+FIRST = 20  # number of images that are named
 
 
 @contextlib.contextmanager
@@ -159,7 +157,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     save_target(out / TARGET, result.target_design)
     if result.board_design.rows:
         save_board(out / BOARD, result.board_design)
-    report = judged(report_of(result).content())
+    report = with_judgement(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
     faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces

@@ -68,9 +68,6 @@ from stcal.sfm.runs.transaction import (
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from stcal.sfm.runs.report_file import ReportCamera
-
-ReportPart = TypeVar("ReportPart", bound=Part)
 Value = TypeVar("Value")
 Rows = Literal["faces", "circles", "images", "observations"]
 """Tables of :meth:`RunResult.to_dataframe`."""
@@ -209,18 +206,6 @@ class SavedRun(Brief):
     def failed_checks(self) -> list[dict]:
         """Returns the checks that failed, as ``report.json`` has them."""
         return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
-
-    def report_as(self, part: type[ReportPart]) -> ReportPart:
-        """Returns the part of ``report.json`` that a command needs."""
-        with as_written(self.folder / "report.json"):
-            return checked(self.report, part)
-
-    def adjusted_camera(self, own: "ReportCamera") -> Camera:
-        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
-        if not self.options.refine_camera:
-            return self.camera
-        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
-        return Camera.of(camera, self.camera.colmap_model)
 
 
 def no_faces(folder: Path) -> InputError:
