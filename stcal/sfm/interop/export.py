@@ -26,7 +26,7 @@ from stcal.labels import CircleLabel
 from stcal.report.text import number
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.runs.report_file import ReportCamera, Space
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run, target_in
 from stcal.sfm.runs.transaction import as_written
 
 FACES_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
@@ -45,7 +45,7 @@ class Content:
 
     root: str  # name of the target frame
     run: SavedRun
-    target: CalibratedTarget  # that of the run
+    target: CalibratedTarget  # of faces.json
     camera: Camera  # as the run refined it
     photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
 
@@ -125,7 +125,7 @@ def content_of(run: SavedRun, root: str) -> Content:
     """Returns the content of a run; ``root``: name of the target frame."""
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
-    target, camera = run.target, run.camera
+    camera = run.camera
     with as_written(run.folder / "report.json"):
         report = checked(run.report, _Report)
     if run.options.refine_camera:
@@ -133,7 +133,7 @@ def content_of(run: SavedRun, root: str) -> Content:
         refined = Camera(camera.width, camera.height, own.focal_px, own.centre_px, own.distortion)
         camera = Camera.of(refined, camera.colmap_model)
     views = {(each.image, each.group): Rigid(each.axes.T, each.position_mm) for each in report.scene.cameras}
-    content = Content(root, run, target, camera, views)
+    content = Content(root, run, target_in(run.faces), camera, views)
     names = [root, *(each.child for each in content.statics())]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

@@ -67,7 +67,6 @@ from stcal.sfm.report.run_page import (
     CONTROL,
     FIRST_IMAGES,
     PUBLISHED,
-    Residuals,
     faces_table,
     report_html,
     shown_overlays,
@@ -245,18 +244,14 @@ def _report_page(run: Path, report: dict) -> tuple[str, int]:
     shown = shown_overlays(report)
     overlays = {name: path.read_bytes() for name in shown if (path := overlay_path(run, name)).is_file()}
     gone = len(shown) - len(overlays)
-    return report_html(report, overlays, _residuals(run, list(overlays)), gone), gone
-
-
-def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
-    """Returns centres and residuals of these images from ``labels.csv``."""
-    rows: dict[str, list[list[float]]] = {name: [] for name in names}
+    residuals: dict[str, list[list[float]]] = {name: [] for name in overlays}
     with as_written(run / "labels.csv"):
         for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
-            if row["image"] in rows and row["residual_x_px"]:
+            if row["image"] in residuals and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
-                rows[row["image"]].append(values)
-    return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
+                residuals[row["image"]].append(values)
+    arrays = {name: np.array(values).reshape(-1, 4) for name, values in residuals.items()}
+    return report_html(report, overlays, arrays, gone), gone
 
 
 def require_report(saved: SavedRun) -> None:

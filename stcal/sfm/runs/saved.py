@@ -174,18 +174,7 @@ class SavedRun(Brief):
     @property
     def target(self) -> CalibratedTarget:
         """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
-        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
-        return CalibratedTarget(
-            faces.reference_face,
-            faces.poses(),
-            by_circle(faces.circles),
-            {},
-            dict(faces.target_from_face_covariance),
-            by_circle(faces.circle_covariance_mm2),
-            {},
-            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
-            None if joint is None else joint.matrix(),
-        )
+        return target_in(self.faces)
 
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Returns the observations by group, in order."""
@@ -220,6 +209,22 @@ def no_faces(folder: Path) -> InputError:
 def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
     """Returns values of ``faces.json`` by the labels of the circles."""
     return dict(zip(circle_labels(values), values.values(), strict=True))
+
+
+def target_in(faces: FacesFile) -> CalibratedTarget:
+    """Returns the target in the content of ``faces.json``, which has no poses of groups."""
+    joint = faces.circles_joint_covariance_mm2
+    return CalibratedTarget(
+        faces.reference_face,
+        faces.poses(),
+        by_circle(faces.circles),
+        {},
+        dict(faces.target_from_face_covariance),
+        by_circle(faces.circle_covariance_mm2),
+        {},
+        None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
+        None if joint is None else joint.matrix(),
+    )
 
 
 AnyRun = SavedRun | str | Path

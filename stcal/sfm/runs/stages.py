@@ -432,7 +432,6 @@ def solve_groups(
     step = counted(progress, "map", len(inputs))
     for _ in range(len(inputs) - len(pending)):
         step(None)
-    shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
         jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
