@@ -51,9 +51,7 @@ from stcal.sfm.runs.stages import (
 )
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
-IN_MEMORY = "images in memory"
-"""What a run's folder states as the folder of its images where there is none."""
-FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
+IN_MEMORY = "images in memory"  # what a run's folder states as the folder of its images where there is none
 ASSUMED = (
     "no --camera, and no board of dots that tells one: a lens without distortion is assumed, and centres are good "
     "for a look, not for measuring"
@@ -123,13 +121,12 @@ def run(
     if out is None:
         with scratch_folder("run") as scratch:
             return replace(run(images, camera, scratch, target, board, options, progress, checks, every), out=None)
-    images = frames_of_video(images, out, every)
-    with begun(images, camera, out, target, board, options, progress) as task:
+    with begun(frames_of_video(images, out, every), camera, out, target, board, options, progress) as task:
         seen = detect_and_label(task)
         with overlays_beside(seen, task) as left_out:
             task = scaled_by_drawing(task, seen, board is not None)
             groups = map_groups(task, groups_of(task, seen))
-            groups, calibration = scale_chain_adjust(task, seen, groups)
+            groups, calibration = scale_chain_adjust(task, groups)
             result = result_of(task, seen, groups, calibration)
             left_out.update(result.unadjusted())
         result = checked(compared(task, result), checks, task.progress)
@@ -173,7 +170,7 @@ def begun(
         yield Task(files, folder, design, scale, options, progress or (lambda *_: None), model, place.absolute())
 
 
-def scale_chain_adjust(task: Task, seen: DetectedImages, groups: Groups) -> tuple[Groups, Calibration]:
+def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]:
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
     calibration = calibration_by(task, groups)
@@ -192,8 +189,8 @@ def scale_chain_adjust(task: Task, seen: DetectedImages, groups: Groups) -> tupl
     except ConvergenceError:  # a lens that folds its image
         warnings.warn(PLAIN, InputNote, stacklevel=2)
         plain = model_of(plain_lens(lens), PHOTOGRAPHS)
-        groups = replace(groups, camera=start_of(plain, seen, task.options))
-        return scale_chain_adjust(replace(task, camera=plain), seen, map_groups(task, groups))
+        groups = replace(groups, camera=start_of(plain, lens, task.options))
+        return scale_chain_adjust(replace(task, camera=plain), map_groups(task, groups))
     return groups, calibration
 
 
@@ -201,7 +198,7 @@ def calibration_by(task: Task, groups: Groups) -> Calibration:
     """Returns the calibration by the solutions of the groups; of the board alone, its scale."""
     models = [solution.model for solution in groups.solutions]
     camera, board, options = groups.camera, groups.board, groups.options.adjustment(task.target)
-    with groups.explained():
+    with groups.naming_cause():
         if not groups.board_alone:
             return calibrate(models, camera, task.target, board, options, camera_prior(camera), task.progress)
         task.progress("faces", 0, 1)
@@ -371,7 +368,7 @@ def detect_images(
             with suppress(DetectionError, DegenerateError):
                 if task.board.rows:
                     model = camera_by_dots(task, None)
-                    note = FOUND_BY_DOTS.format(model.focal[0])
+                    note = f"no --camera: found by the dots of the board, f {model.focal[0]:.0f} px"
             notes += [note] if task.target.with_faces(printed=False).faces else []
         seen = detect_with(task, model)
         if unseen := unseen_faces(task, seen):

@@ -2,15 +2,17 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import stcal
-from stcal.boards.board_file import load_board
-from stcal.boards.target_file import load_target
+from stcal.boards.board_file import load_board, save_board
+from stcal.boards.target_file import load_target, save_target
 from stcal.cli.main import LIBRARIES, main, main_sfm
 from stcal.io.cameras.read import read_camera
+from stcal.synthetic.designs import second_design
 from tests.outcome import ended
 
 
@@ -34,6 +36,11 @@ def test_init_writes_the_reference_design_and_overwrites_nothing(command, tmp_pa
     code, _, err = command("init", tmp_path / "mine")
     assert code == 2
     assert "exists" in err
+    text = (tmp_path / "mine" / "board.toml").read_text()  # what is written as a remark may be used
+    for key in ("[corner]", "row", "column", "radius_mm"):
+        text = text.replace(f"# {key}", key)
+    (tmp_path / "mine" / "board.toml").write_text(text)
+    assert load_board(tmp_path / "mine" / "board.toml").corner is not None
 
 
 @pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "Part: ")])
@@ -47,60 +54,25 @@ def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(command
     assert err.count("\n") == (word != "Yes")
 
 
-def circles_toml(circles: str) -> str:
-    """Of id, x, y and radius of each."""
-    rows = (each.split() for each in circles.split(", "))
-    return ",\n".join(f'{{ id = "{i}", x_mm = {x}, y_mm = {y}, radius_mm = {r} }}' for i, x, y, r in rows)
-
-
-ROOF = "1 10 10 6, 2 85 12 6, 3 14 80 6, 4 60 84 6, 5 45 38 6, 6 30 62 3.5, 7 68 58 3.5, 8 30 18 3.5"
-FLANK = "1 20 18 6, 2 70 10 6, 3 12 60 6, 4 82 80 6, 5 40 82 3.5, 6 52 40 3.5, 7 84 36 3.5, 8 30 40 3.5"
-WEDGE = f"""
-name = "wedge"
-polarity = "bright"
-[[face]]
-id = "roof"
-origin = "1"
-x = "2"
-y = "3"
-rough_pose = {{ origin_mm = [0, 0, 0], x = [1, 0, 0], normal = [0, 0, 1] }}
-circles = [{circles_toml(ROOF)}]
-[[face]]
-id = "flank"
-origin = "1"
-x = "2"
-y = "3"
-rough_pose = {{ origin_mm = [116, 0, -12], x = [0.64, 0, -0.77], normal = [0.77, 0, 0.64] }}
-circles = [{circles_toml(FLANK)}]
-"""
-"""Of two faces at 50°, as a user writes them."""
-
-
 @pytest.fixture
-def wedge(command, tmp_path):
-    """init, and its two files edited."""
-    folder = tmp_path / "design"
-    assert command("init", folder)[0] == 0
-    (folder / "target.toml").write_text(WEDGE)
-    board = (folder / "board.toml").read_text()
-    board = (
-        board.replace("rows = 7", "rows = 6").replace("columns = 9", "columns = 8").replace("# [corner]", "[corner]")
-    )
-    board = board.replace("# row", "row").replace("# column", "column").replace("# radius_mm", "radius_mm")
-    (folder / "board.toml").write_text(board)
-    return "--target", folder / "target.toml", "--board", folder / "board.toml"
+def designs(tmp_path):
+    """Of two faces of a cube, and of a board beside it."""
+    target, board, _ = second_design()
+    save_target(tmp_path / "target.toml", replace(target, faces=target.faces[:2]))
+    save_board(tmp_path / "board.toml", board)
+    return "--target", tmp_path / "target.toml", "--board", tmp_path / "board.toml"
 
 
-def test_a_design_of_ones_own_is_planned_before_any_photograph(command, wedge):
-    code, out, _ = command("plan", *wedge, "--images", 3, "--width", 1200)
+def test_a_design_of_ones_own_is_planned_before_any_photograph(command, designs):
+    code, out, _ = command("plan", *designs, "--images", 3, "--width", 1200)
     assert code == 0
-    assert "flank" in out
+    assert all(face.id in out for face in second_design()[0].faces[:2])
 
 
-def test_simulate_with_the_camera_of_a_file(command, wedge, tmp_path):
+def test_simulate_with_the_camera_of_a_file(command, designs, tmp_path):
     camera = tmp_path / "cameras.txt"
     camera.write_text("1 SIMPLE_RADIAL 400 300 430 203 148 -0.05\n")
-    call = "simulate", tmp_path / "data", *wedge, "--camera", camera, "--images", 2, "--workers", 1
+    call = "simulate", tmp_path / "data", *designs, "--camera", camera, "--images", 2, "--workers", 1
     code, text, _ = command(*call)
     assert code == 0
     assert "2 images in 1 groups" in text
@@ -133,13 +105,13 @@ def test_simulate_with_lens_and_rim(command, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_simulate_says_which_faces_have_no_place(command, wedge, tmp_path):
-    lines = wedge[1].read_text().splitlines()
-    lines.remove(next(line for line in lines if line.startswith("rough_pose = { origin_mm = [116")))
-    wedge[1].write_text("\n".join(lines))
-    code, _, err = command("simulate", tmp_path / "data", *wedge)
+def test_simulate_says_which_faces_have_no_place(command, designs, tmp_path):
+    target = load_target(designs[1])
+    first, second = target.faces
+    save_target(designs[1], replace(target, faces=(first, replace(second, rough_target_from_face=None))))
+    code, _, err = command("simulate", tmp_path / "data", *designs)
     assert code == 2
-    assert "does not say where face flank is; add approximate rough_pose = { origin_mm, x, normal }" in err
+    assert f"does not say where face {second.id} is; add approximate rough_pose = {{ origin_mm, x, normal }}" in err
 
 
 @pytest.mark.full

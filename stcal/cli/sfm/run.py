@@ -284,14 +284,14 @@ def crosscheck(
 ) -> None:
     """Map the same database with the native COLMAP, compare faces, circles and cameras, and add this to the report."""
     from stcal.sfm.interop.crosscheck import comparison_text
-    from stcal.sfm.interop.crosscheck import crosscheck as checked
+    from stcal.sfm.interop.crosscheck import crosscheck as cross_checked
     from stcal.sfm.runs.comparisons import Tolerances
 
     tolerances = Tolerances(
         tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma
     )
     with StageProgress() as progress:
-        check = checked(run, colmap, tolerances, timeout, progress, into_report=True)
+        check = cross_checked(run, colmap, tolerances, timeout, progress, into_report=True)
     say(comparison_text(check))
     say(f"report: {run / 'report.html'}")
     if check.differences:

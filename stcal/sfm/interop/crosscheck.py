@@ -31,7 +31,7 @@ from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, writ
 from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
-from stcal.sfm.report.judgement import judged
+from stcal.sfm.report.judgement import with_judgement
 from stcal.sfm.runs.comparisons import (
     CameraDifference,
     Crosscheck,
@@ -70,19 +70,17 @@ def find_colmap(path: str | Path | None = None) -> NativeColmap:
     executable = shutil.which("colmap" if path is None else str(path))
     if executable is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
-        raise InputError(
-            "E-COLMAP-PROGRAM", f"native COLMAP: no program {where}; {INSTALL}, or give its path with --colmap"
-        )
+        raise _unfit(f"no program {where}; {INSTALL}, or give its path with --colmap")
     program = Path(executable)
-    text = _answer(program, "help")
-    version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", text)
+    version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", _answer(program, "help"))
     if version is None:
-        raise InputError(
-            "E-COLMAP-PROGRAM",
-            f"native COLMAP: {program} does not say a COLMAP version; {INSTALL}, or give another --colmap",
-        )
+        raise _unfit(f"{program} does not say a COLMAP version; {INSTALL}, or give another --colmap")
     options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
     return NativeColmap(program, version[1], frozenset(options))
+
+
+def _unfit(fault: str) -> InputError:
+    return InputError("E-COLMAP-PROGRAM", f"native COLMAP: {fault}")
 
 
 def map_natively(
@@ -115,10 +113,7 @@ def _answer(program: Path, *words: str) -> str:
     code, output = _run([str(program), *words], ASK_SECONDS)
     if code != 0:
         ending = f"does not end in {ASK_SECONDS:g} s" if code is None else _end(code, output)
-        raise InputError(
-            "E-COLMAP-PROGRAM",
-            f"native COLMAP: `{program} {' '.join(words)}` {ending}; {INSTALL}, or give another --colmap",
-        )
+        raise _unfit(f"`{program} {' '.join(words)}` {ending}; {INSTALL}, or give another --colmap")
     return output
 
 
@@ -140,9 +135,7 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
                 start_new_session=True,
             )
         except OSError as error:
-            raise InputError(
-                "E-COLMAP-PROGRAM", f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}"
-            ) from error
+            raise _unfit(f"{command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
         try:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout_s)
@@ -308,7 +301,7 @@ def crosscheck(
                 "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
             )
         check = _compared(saved, colmap, tolerances, timeout_s, progress)
-        write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
+        write_report(stage, with_judgement(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
     return check
 
 

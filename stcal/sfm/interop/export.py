@@ -11,7 +11,6 @@ from textwrap import indent
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import stcal
 from stcal.errors import InputError
@@ -19,14 +18,16 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
-from stcal.io.json import Part
+from stcal.io.json import Part, checked
 from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, metres, ros1_launch, ros2_launch, xyzw
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
-from stcal.labels import CircleLabel, parse_label
+from stcal.labels import CircleLabel
 from stcal.report.text import number
+from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.runs.report_file import ReportCamera, Space
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run, target_in
+from stcal.sfm.runs.transaction import as_written
 
 FACES_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 """Okabe and Ito's palette, which colour-blind people can tell apart, used in a cycle in the order of the faces."""
@@ -39,36 +40,22 @@ class _Report(Part):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Circle:
-    """A circle of the target, target frame."""
-
-    label: CircleLabel
-    xyz_mm: np.ndarray  # (3,)
-    radius_mm: float
-    covariance_mm2: np.ndarray | None  # (3, 3)
-
-    @property
-    def sigma_mm(self) -> np.ndarray | None:
-        """σ of x, y, z, mm, or None without a covariance."""
-        return None if self.covariance_mm2 is None else np.sqrt(np.diag(self.covariance_mm2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Content:
     """Content of an export."""
 
     root: str  # name of the target frame
     run: SavedRun
+    target: CalibratedTarget  # of faces.json
     camera: Camera  # as the run refined it
-    faces: dict[str, Rigid]  # target_from_face
-    covariances: dict[str, np.ndarray]  # of the faces, 6×6, empty if the run states none
-    circles: tuple[Circle, ...]
     photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
-    rgb: dict[str, tuple[int, int, int]]  # by face
 
-    def of_face(self, face: str) -> list[Circle]:
+    def circles_of(self, face: str) -> list[CircleLabel]:
         """Returns the circles of a face, in the order of the design."""
-        return [circle for circle in self.circles if circle.label.face == face]
+        return [label for label in self.target.circles if label.face == face]
+
+    def xyz_face(self, label: CircleLabel) -> np.ndarray:
+        """Returns the centre (3,) of a circle in the frame of its face, mm."""
+        return self.target.target_from_face[label.face].inverse() @ self.target.circles[label]
 
     def face_frame(self, face: str) -> str:
         """Returns the name of the frame of a face."""
@@ -81,32 +68,37 @@ class Content:
     def statics(self) -> list[Static]:
         """Returns the frames of faces relative to the target, and of circles relative to their faces."""
         frames = []
-        for face, pose in self.faces.items():
+        for face, pose in self.target.target_from_face.items():
             frames.append(Static(self.root, self.face_frame(face), pose))
-            for circle in self.of_face(face):
-                face_from_circle = Rigid(np.eye(3), pose.inverse() @ circle.xyz_mm)
-                frames.append(Static(self.face_frame(face), self.circle_frame(circle.label), face_from_circle))
+            for label in self.circles_of(face):
+                face_from_circle = Rigid(np.eye(3), self.xyz_face(label))
+                frames.append(Static(self.face_frame(face), self.circle_frame(label), face_from_circle))
         return frames
 
     def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns σ of a face's rotation, rad, and position, mm, about and along the target's axes, or None."""
-        if face not in self.covariances:
+        if face not in self.target.face_covariance:
             return None
-        sigma = np.sqrt(np.maximum(np.diag(self.covariances[face]), 0))  # the reference face has 0 up to rounding
+        sigma = np.sqrt(np.maximum(np.diag(self.target.face_covariance[face]), 0))  # the reference's is 0 but rounded
         return sigma[:3], sigma[3:]
+
+    def circle_sigma(self, label: CircleLabel) -> np.ndarray | None:
+        """Returns σ of x, y, z of a circle, mm, or None without a covariance."""
+        covariance = self.target.circle_covariance.get(label)
+        return None if covariance is None else np.sqrt(np.diag(covariance))
 
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
         lines = [
-            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(self.faces)} faces, "
-            f"{len(self.circles)} circles, {len(self.photographs)} photographs",
+            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(faces.target_from_face)} faces, "
+            f"{len(faces.circles)} circles, {len(self.photographs)} photographs",
             f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
             f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
         ]
-        if not self.covariances:
+        if not self.target.face_covariance:
             return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
-        for face in self.faces:
+        for face in faces.target_from_face:
             turn, shift = self.face_sigma(face) or (np.zeros(3), np.zeros(3))
             um = " ".join(number(1e3 * v, 2) for v in shift)
             mdeg = " ".join(number(1e3 * v, 3) for v in np.degrees(turn))
@@ -133,29 +125,15 @@ def content_of(run: SavedRun, root: str) -> Content:
     """Returns the content of a run; ``root``: name of the target frame."""
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
-    report = run.report_as(_Report)
-    faces, scene = run.faces, report.scene
-    circles = tuple(
-        Circle(
-            parse_label(label),  # type: ignore[arg-type]
-            np.array(xyz, float),
-            faces.radius_mm[label],
-            np.array(faces.circle_covariance_mm2[label]) if label in faces.circle_covariance_mm2 else None,
-        )
-        for label, xyz in faces.circles.items()
-    )
-    content = Content(
-        root=root,
-        run=run,
-        camera=run.adjusted_camera(report.camera),
-        faces=faces.poses(),
-        covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
-        circles=circles,
-        photographs={
-            (each.image, each.group): Rigid(np.array(each.axes).T, each.position_mm) for each in scene.cameras
-        },
-        rgb=colours(run),
-    )
+    camera = run.camera
+    with as_written(run.folder / "report.json"):
+        report = checked(run.report, _Report)
+    if run.options.refine_camera:
+        own = report.camera
+        refined = Camera(camera.width, camera.height, own.focal_px, own.centre_px, own.distortion)
+        camera = Camera.of(refined, camera.colmap_model)
+    views = {(each.image, each.group): Rigid(each.axes.T, each.position_mm) for each in report.scene.cameras}
+    content = Content(root, run, target_in(run.faces), camera, views)
     names = [root, *(each.child for each in content.statics())]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -180,16 +158,17 @@ COLUMNS = (
 def table(content: Content) -> str:
     """Returns CSV with a row per face and circle, target frame. Circles have the axes and normals of their faces."""
     rows: list[Sequence] = [COLUMNS]
-    for face, pose in content.faces.items():
-        x, y, z, w = Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True).tolist()
+    for face, pose in content.target.target_from_face.items():
+        x, y, z, w = xyzw(pose)
         turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
         turn, shift = content.face_sigma(face) or (np.zeros(0), np.zeros(0))
         cells = [f"{v:.4g}" for v in (*(1e3 * shift), *(1e3 * np.degrees(turn)))]
         rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *(cells or [""] * 6)])
-        for circle in content.of_face(face):
-            cells = [""] * 3 if circle.sigma_mm is None else [f"{1e3 * v:.4g}" for v in circle.sigma_mm]
-            place = [*circle.xyz_mm.tolist(), *turned, circle.radius_mm]
-            rows.append(["circle", face, circle.label.circle, *place, *cells, "", "", ""])
+        for label in content.circles_of(face):
+            sigma = content.circle_sigma(label)
+            cells = [""] * 3 if sigma is None else [f"{1e3 * v:.4g}" for v in sigma]
+            place = [*content.target.circles[label].tolist(), *turned, content.run.faces.radius_mm[label]]
+            rows.append(["circle", face, label.circle, *place, *cells, "", "", ""])
     return csv_text(rows)
 
 
@@ -202,18 +181,19 @@ def opencv(content: Content) -> str:
         f"said: {_list(content.said())}",
         "faces:",
     ]
-    for face, pose in content.faces.items():
-        circles = content.of_face(face)
-        centres = np.array([circle.xyz_mm for circle in circles]).reshape(-1, 3)
-        covariances = [circle.covariance_mm2 for circle in circles if circle.covariance_mm2 is not None]
+    target, radius = content.target, content.run.faces.radius_mm
+    for face, pose in target.target_from_face.items():
+        labels = content.circles_of(face)
+        covariances = [target.circle_covariance[label] for label in labels if label in target.circle_covariance]
         matrices = {"target_from_face": pose.matrix()}
-        if face in content.covariances:
-            matrices["target_from_face_covariance"] = content.covariances[face]
-        if circles:
-            matrices |= {"centres": centres, "radii": np.array([[circle.radius_mm] for circle in circles])}
+        if face in target.face_covariance:
+            matrices["target_from_face_covariance"] = target.face_covariance[face]
+        if labels:
+            matrices["centres"] = np.array([target.circles[label] for label in labels])
+            matrices["radii"] = np.array([[radius[label]] for label in labels])
         if covariances:
             matrices["centres_covariance"] = np.array(covariances).reshape(-1, 9)
-        lines += ["   -", f"      id: {_quoted(face)}", f"      circles: {_list([c.label.circle for c in circles])}"]
+        lines += ["   -", f"      id: {_quoted(face)}", f"      circles: {_list([label.circle for label in labels])}"]
         matrix_lines = [line for name, values in matrices.items() for line in opencv_matrix(name, values)]
         lines.append(indent("\n".join(matrix_lines), "      "))
     return "\n".join(lines) + "\n"
@@ -262,25 +242,24 @@ def tf2(content: Content) -> str:
 
 
 def _body(content: Content, named: Callable[[str], str]) -> list[str]:
-    links = []
-    for face, pose in content.faces.items():
+    links, rgb = [], colours(content.run)
+    for face in content.target.target_from_face:
         links.append(f"<link name={quoteattr(named(content.face_frame(face)))}>")
-        red, green, blue = (f"{v / 255:.4g}" for v in content.rgb[face])
-        for circle in content.of_face(face):
-            x, y, z = (float(v) * MM_M for v in pose.inverse() @ circle.xyz_mm)
+        red, green, blue = (f"{v / 255:.4g}" for v in rgb[face])
+        for label in content.circles_of(face):
+            x, y, z = (float(v) * MM_M for v in content.xyz_face(label))
+            radius_m = content.run.faces.radius_mm[label] * MM_M
             links += [
                 "  <visual>",
                 f'    <origin xyz="{x!r} {y!r} {z - PLATE_M / 2!r}" rpy="0 0 0"/>',
-                f'    <geometry><cylinder radius="{circle.radius_mm * MM_M!r}" length="{PLATE_M!r}"/></geometry>',
+                f'    <geometry><cylinder radius="{radius_m!r}" length="{PLATE_M!r}"/></geometry>',
                 f"    <material name={quoteattr(named(f'{content.face_frame(face)}_colour'))}>"
                 f'<color rgba="{red} {green} {blue} 1"/></material>',
                 "  </visual>",
             ]
         links.append("</link>")
-        links += [f"<link name={quoteattr(named(content.circle_frame(c.label)))}/>" for c in content.of_face(face)]
-    joints = [
-        fixed_joint(Static(named(static.parent), named(static.child), static.pose)) for static in content.statics()
-    ]
+        links += [f"<link name={quoteattr(named(content.circle_frame(e)))}/>" for e in content.circles_of(face)]
+    joints = (fixed_joint(Static(named(e.parent), named(e.child), e.pose)) for e in content.statics())
     return [*links, *(joint.rstrip("\n") for joint in joints)]
 
 
@@ -301,38 +280,44 @@ VERTICES, INDICES = 34962, 34963
 LINES, TRIANGLES = 1, 4
 NEAR_M = 0.01
 POINTS = 96  # of the ball that shows σ
-Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-"""Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
+Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion x y z w that turns the target's Z to glTF's Y, which points up
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 """Rotation from OpenCV's to glTF's camera axes. glTF's cameras look along −Z, with Y up."""
 UNLIT = "KHR_materials_unlit"
 
 
 @dataclass(slots=True, eq=False)
-class _Buffer:
-    """Numerical data of a file, to which arrays are added."""
+class _Scene:
+    """Parts of a glTF file, to which shapes, meshes and nodes are added."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict] = field(default_factory=list)
     accessors: list[dict] = field(default_factory=list)
-
-    def add(self, values: np.ndarray, target: int) -> int:
-        """Adds points (n, 3), m, or indices (n,), and returns the index of their accessor."""
-        points = target == VERTICES
-        raw = np.ascontiguousarray(values, "<f4" if points else "<u4")
-        accessor = {"bufferView": len(self.views), "componentType": FLOAT if points else UNSIGNED, "count": len(raw)}
-        accessor |= {"type": "VEC3" if points else "SCALAR"}
-        if points:
-            accessor |= {"min": raw.min(axis=0).tolist(), "max": raw.max(axis=0).tolist()}
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": raw.nbytes, "target": target}
-        self.views.append(view)
-        self.accessors.append(accessor)
-        self.data += raw.tobytes()
-        return len(self.accessors) - 1
+    meshes: list[dict] = field(default_factory=list)
+    nodes: list[dict] = field(default_factory=list)
 
     def shape(self, points: np.ndarray, indices: np.ndarray) -> dict:
-        """Adds points and the indices of lines or triangles between them."""
-        return {"attributes": {"POSITION": self.add(points, VERTICES)}, "indices": self.add(indices.ravel(), INDICES)}
+        """Adds points (n, 3), m, and the indices of lines or triangles between them."""
+        place = len(self.accessors)
+        ends = {"min": points.astype("<f4").min(axis=0).tolist(), "max": points.astype("<f4").max(axis=0).tolist()}
+        for raw, target, component, kind, more in (
+            (points.astype("<f4"), VERTICES, FLOAT, "VEC3", ends),
+            (indices.ravel().astype("<u4"), INDICES, UNSIGNED, "SCALAR", {}),
+        ):
+            accessor = {"bufferView": len(self.views), "componentType": component, "count": len(raw), "type": kind}
+            self.accessors.append(accessor | more)
+            view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": raw.nbytes, "target": target}
+            self.views.append(view)
+            self.data += raw.tobytes()
+        return {"attributes": {"POSITION": place}, "indices": place + 1}
+
+    def mesh(self, name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
+        self.meshes.append({"name": name, "primitives": [shape | {"material": colour, "mode": mode}]})
+        return len(self.meshes) - 1
+
+    def node(self, **own) -> int:
+        self.nodes.append({key: value for key, value in own.items() if value != []})
+        return len(self.nodes) - 1
 
 
 def gltf(content: Content) -> str:
@@ -353,45 +338,34 @@ def glb(content: Content) -> bytes:
 
 
 def _tree(content: Content) -> tuple[dict, bytes]:
-    buffer, meshes, nodes = _Buffer(), [], []
-    factor = _exaggeration(content)
-    ball, disc = buffer.shape(*_ball()), buffer.shape(*_disc())
-
-    def mesh(name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
-        meshes.append({"name": name, "primitives": [shape | {"material": colour, "mode": mode}]})
-        return len(meshes) - 1
-
-    def node(**own) -> int:
-        nodes.append({key: value for key, value in own.items() if value != []})
-        return len(nodes) - 1
-
+    scene, factor, target, rgb = _Scene(), _exaggeration(content), content.target, colours(content.run)
+    ball, disc = scene.shape(*_ball()), scene.shape(*_disc())
     below = []
-    for place, (face, pose) in enumerate(content.faces.items()):
-        grey, own = (
-            mesh(f"sigma of face {face}", ball, len(content.faces)),
-            mesh(f"circles of face {face}", disc, place),
-        )
+    for place, (face, pose) in enumerate(target.target_from_face.items()):
+        grey = scene.mesh(f"sigma of face {face}", ball, len(target.target_from_face))
+        own = scene.mesh(f"circles of face {face}", disc, place)
         circles = []
-        for circle in content.of_face(face):
-            radius_m = MM_M * circle.radius_mm
-            children = [node(name=str(circle.label), mesh=own, scale=[radius_m, radius_m, 1.0])]
-            extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
-            if circle.covariance_mm2 is not None:
-                children.append(node(**_sigma(circle, pose, factor), mesh=grey))
-                extras["covariance_mm2"] = circle.covariance_mm2.tolist()
-            name, at = content.circle_frame(circle.label), (MM_M * (pose.inverse() @ circle.xyz_mm)).tolist()
-            circles.append(node(name=name, translation=at, children=children, extras=extras))
+        for label in content.circles_of(face):
+            radius_mm, covariance = content.run.faces.radius_mm[label], target.circle_covariance.get(label)
+            children = [scene.node(name=str(label), mesh=own, scale=[MM_M * radius_mm, MM_M * radius_mm, 1.0])]
+            extras = {"label": str(label), "xyz_mm": target.circles[label].tolist(), "radius_mm": radius_mm}
+            if covariance is not None:
+                ellipsoid = _ellipsoid(covariance, pose, factor)
+                children.append(scene.node(name=f"sigma of {label}, times {factor:g}", **ellipsoid, mesh=grey))
+                extras["covariance_mm2"] = covariance.tolist()
+            name, at = content.circle_frame(label), (MM_M * content.xyz_face(label)).tolist()
+            circles.append(scene.node(name=name, translation=at, children=children, extras=extras))
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
-        if face in content.covariances:
-            extras["covariance_rad_mm"] = content.covariances[face].tolist()
-        below.append(node(name=content.face_frame(face), **_placed(pose), children=circles, extras=extras))
+        if face in target.face_covariance:
+            extras["covariance_rad_mm"] = target.face_covariance[face].tolist()
+        below.append(scene.node(name=content.face_frame(face), **_placed(pose), children=circles, extras=extras))
     if content.photographs:
-        below += _cameras(content, buffer, mesh, node)
-    below_up = node(name=content.root, children=below, extras={"said": content.said(), "sigma_drawn_times": factor})
-    up = node(name="y_up", rotation=Y_UP, children=[below_up])
+        below += _cameras(content, scene)
+    extras = {"said": content.said(), "sigma_drawn_times": factor}
+    up = scene.node(name="y_up", rotation=Y_UP, children=[scene.node(name=content.root, children=below, extras=extras)])
     materials = []
-    for rgb in (*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB):
-        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
+    for colour in (*(rgb[face] for face in target.target_from_face), (40, 40, 40), BOARD_RGB):
+        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in colour]
         surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
         materials.append({"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}})
     tree = {
@@ -399,37 +373,36 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         "extensionsUsed": [UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [up]}],
-        "nodes": nodes,
-        "meshes": meshes,
+        "nodes": scene.nodes,
+        "meshes": scene.meshes,
         "materials": materials,
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
+        "accessors": scene.accessors,
+        "bufferViews": scene.views,
     }
     if content.photographs:
-        tree["cameras"] = [_lens(content)]
-    return tree, bytes(buffer.data)
+        tree["cameras"] = [_lens(content.camera)]
+    return tree, bytes(scene.data)
 
 
-def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
-    camera, places = content.camera, [circle.xyz_mm for circle in content.circles]
-    places += [pose.translation for pose in content.photographs.values()]
+def _cameras(content: Content, scene: _Scene) -> list[int]:
+    camera, count = content.camera, len(content.target.target_from_face)
+    places = [*content.target.circles.values(), *(pose.translation for pose in content.photographs.values())]
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
     rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
     shape = np.vstack([np.zeros(3), CAMERA_SHARE * np.ptp(np.array(places), axis=0).max() * rays])
     lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
-    frustum = mesh("image at depth", buffer.shape(MM_M * shape @ GL_FROM_CV, lines), len(content.faces) + 1, LINES)
+    frustum = scene.mesh("image at depth", scene.shape(MM_M * shape @ GL_FROM_CV, lines), count + 1, LINES)
     nodes = []
     for (name, group), pose in content.photographs.items():
         placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
         extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
-        nodes.append(node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
+        nodes.append(scene.node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
     return nodes
 
 
-def _lens(content: Content) -> dict:
+def _lens(camera: Camera) -> dict:
     """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
-    camera = content.camera
     across, up = (np.array([camera.width, camera.height]) / camera.focal).tolist()
     perspective = {"yfov": 2 * float(np.arctan(up / 2)), "aspectRatio": across / up, "znear": NEAR_M}
     lens = {"focal_px": camera.focal, "centre_px": camera.centre, "distortion": camera.distortion}
@@ -438,13 +411,12 @@ def _lens(content: Content) -> dict:
     return {"name": "camera", "type": "perspective", "perspective": perspective, "extras": extras}
 
 
-def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
-    """Returns the node that turns the unit ball into the ellipsoid of σ in the face's axes, times ``factor``."""
+def _ellipsoid(covariance_mm2: np.ndarray, pose: Rigid, factor: float) -> dict:
+    """Returns how the unit ball becomes the ellipsoid of σ in the face's axes, times ``factor``."""
     turn = np.array(pose.rotation)
-    values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
+    values, axes = np.linalg.eigh(turn.T @ covariance_mm2 @ turn)
     turned = xyzw(Rigid(axes * [np.sign(np.linalg.det(axes)), 1, 1], np.zeros(3)))
-    size = (factor * MM_M * np.sqrt(np.maximum(values, 0))).tolist()
-    return {"name": f"sigma of {circle.label}, times {factor:g}", "rotation": turned, "scale": size}
+    return {"rotation": turned, "scale": (factor * MM_M * np.sqrt(np.maximum(values, 0))).tolist()}
 
 
 def _disc() -> tuple[np.ndarray, np.ndarray]:
@@ -457,7 +429,8 @@ def _disc() -> tuple[np.ndarray, np.ndarray]:
 
 def _exaggeration(content: Content) -> float:
     """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
-    known = [(float(np.linalg.norm(c.sigma_mm)), c.radius_mm) for c in content.circles if c.sigma_mm is not None]
+    radius_mm = content.run.faces.radius_mm
+    known = [(float(np.sqrt(np.trace(c))), radius_mm[label]) for label, c in content.target.circle_covariance.items()]
     if not any(sigma for sigma, _ in known):
         return 1.0
     sigma, radius = np.median(known, axis=0)
@@ -557,11 +530,11 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
 def export_text(written: ExportedRun) -> str:
     """Returns a text on the contents of the file, and on the results that it lacks."""
     content = written.content
+    count, target = f"{len(content.target.circles)} circles", content.target
     lines = [
-        f"{len(content.faces)} faces and {len(content.circles)} circles, frame {content.root}, as {written.form}: "
-        f"{written.path}"
+        f"{len(target.target_from_face)} faces and {count}, frame {content.root}, as {written.form}: {written.path}"
     ]
-    if not content.covariances:
+    if not content.target.face_covariance:
         lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
     if lost := FORMS[written.form].lost:
         lines.append(f"not in it: {lost}")

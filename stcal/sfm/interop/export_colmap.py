@@ -422,8 +422,7 @@ def _numbers(*values: float) -> str:
     return " ".join(map(repr, values))
 
 
-IDEAL = {"nvm": _nvm, "bundler": _bundler}
-"""Writers of the formats that know an ideal camera alone."""
+IDEAL = {"nvm": _nvm, "bundler": _bundler}  # writers of the formats that know an ideal camera alone
 
 
 def model_text(written: ExportedModel, kind: str) -> str:

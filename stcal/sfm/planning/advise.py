@@ -14,7 +14,7 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import Named, ResultFile
-from stcal.labels import CircleLabel, DotLabel, Label
+from stcal.labels import BOARD, CircleLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.report.text import join, number, text_table
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
@@ -143,14 +143,22 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         poses.append(stand.pose(np.array([ahead * x, y, ahead * right]) @ stand.axes, stand.axes[1], roll))
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
-    limit = _largest_tilt(scene, model)
+    board, middle = (
+        -scene.groups[model.group].target_from_board.rotation[:, 2],
+        scene.board_outline(model.group).mean(0),
+    )
+    planes = {BOARD: (board, middle)}  # outward normal, and middle
+    for face in (face.id for face in scene.target.faces):
+        planes[face] = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
+    limit = _largest_tilt(planes, model)
     members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     views = []
     for i, place in enumerate(places):
         labels = set(model.labels) & shown(scene, model.group, i, limit)
-        if members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board"):
+        if members[BOARD] <= labels and any(own <= labels for key, own in members.items() if key != BOARD):
             position = poses[i].inverse().translation
-            tilts = _tilts_deg(scene, model.group, position, labels)
+            seen = [BOARD, *sorted({label.plane for label in labels} - {BOARD})]
+            tilts = {plane: tilt_deg(*planes[plane], position) for plane in seen}
             cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
             own = single(model, f"view {place}", poses[i], sorted(labels), setup, noise)
             nearest = model.images[stand.middle], model.images[int(cosine.argmax())], angle_deg(cosine.max())
@@ -158,11 +166,9 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     return views
 
 
-def _largest_tilt(scene: Scene, model: MetricModel) -> float:
+def _largest_tilt(planes: dict[str, tuple[np.ndarray, np.ndarray]], model: MetricModel) -> float:
     """Returns the largest tilt of the circles that the run measured in the group, rad, up to ``MAX_FOUND_TILT_RAD``."""
-    normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
-    board = -scene.groups[model.group].target_from_board.rotation[:, 2]
-    normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
+    normals = np.array([planes.get(label.plane, planes[BOARD])[0] for label in model.labels])
     centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
     ray = centres - model.xyz_model[model.point_index]
     cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
@@ -189,15 +195,6 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
         from_corner = depth_ratio[..., None] * xyz_camera - origin[:, None]
         u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in (a, b))
         return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
-
-
-def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
-    normal, middle = scene.groups[group].target_from_board.rotation[:, 2], scene.board_outline(group).mean(0)
-    tilts = {"board": tilt_deg(-normal, middle, position)}
-    for face in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
-        outward, middle = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
-        tilts[face] = tilt_deg(outward, middle, position)
-    return tilts
 
 
 def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> float:
@@ -308,7 +305,6 @@ class KnownRun(Brief):
     """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
 
     models: tuple[MetricModel, ...]
-    joint: JointResult
     setup: Setup
     noise: CentreNoise
     scene: Scene
@@ -333,7 +329,7 @@ def known_of(run: SavedRun) -> KnownRun:
         rims_mm2=rims,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
-    return KnownRun(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
+    return KnownRun(joint.models, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
 
 
 def doubts(run: SavedRun) -> str:

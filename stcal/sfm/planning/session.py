@@ -215,7 +215,11 @@ def plan(
     now = forecast(models, setup)
     better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
     if isinstance(setup.board, ScaleReference):
-        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
+        away = np.linalg.norm(models[0].xyz_model[:, None] - models[0].xyz_model, axis=2)
+        ends = circle_labels(models[0].labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
+        known = KnownDistance(*ends, float(away.max()), DISTANCE_SIGMA_MM)
+        size = replace(setup.board, distances=(*setup.board.distances, known))
+        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = replace(setup, board=size)
     remedies = (
         _remedy(make, replace(options, images=2 * options.images), "twice the images"),
         *([] if printed else [_wider(make, options)]),
@@ -244,13 +248,6 @@ def _kept_dots(board: BoardDesign) -> set[DotLabel]:
         for count in (board.rows, board.columns)
     )
     return {DotLabel(row, column) for row in rows for column in columns}
-
-
-def _with_distance(setup: Setup, size: ScaleReference, model: MetricModel) -> Setup:
-    away = np.linalg.norm(model.xyz_model[:, None] - model.xyz_model, axis=2)
-    one, two = circle_labels(model.labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
-    known = KnownDistance(one, two, float(away.max()), DISTANCE_SIGMA_MM)
-    return replace(setup, board=replace(size, distances=(*size.distances, known)))
 
 
 def _remedy(make: Photographs, options: PlanOptions, what: str) -> Remedy:

@@ -10,14 +10,11 @@ Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 ORDER: tuple[Verdict, ...] = ("failed", "suspicious", "passed", "not possible")
 NOT_APPLICABLE = "not applicable"
 """What is told of checks that what was photographed has nothing for, such as those of circles where it shows tags."""
-SUSPICIOUS = 1e-3
+SUSPICIOUS = 1e-3  # limit of the probability that, among all values of a check, one is as large by chance
 FAILED = 1e-5
-"""Limits of the probability that, among all values of a check, one is as large or larger by chance."""
 BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
-CAUSE = "cause"
-"""Key of the check that names what all images have in common and makes others fail."""
-OF_WHOLE_SET = "Cause of the whole set: "
-"""How the title of that check begins, before the cause."""
+CAUSE = "cause"  # key of the check that names what all images have in common and makes others fail
+OF_WHOLE_SET = "Cause of the whole set: "  # how the title of that check begins, before the cause
 EVERY_SIGMA, DISTANCES = "every σ", "all distances and the size"
 PLACES, CENTRES = "the places of all faces", "all centres of circles"
 CHECKS: dict[str, tuple[str, tuple[str, ...]]] = {

@@ -15,12 +15,10 @@ from stcal.report.text import join, number, significant
 from stcal.sfm.data.group_model import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN
 from stcal.sfm.report.check import CAUSE, SUSPICIOUS, Check, invalidated, ranked
 
-TAIL = 2.0
-"""Ratio of a face's σ to the median of the others above which this face limits the result by itself."""
+TAIL = 2.0  # ratio of a face's σ to the median of the others above which this face limits the result by itself
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
-MOST_PPM = 1000.0
-"""Relative σ, in ppm, from which it is stated in %."""
+MOST_PPM = 1000.0  # relative σ, in ppm, from which it is stated in %
 MORE = 4
 """How many times the images the answer gives σ for."""
 FEW_IMAGES = 6
@@ -96,14 +94,33 @@ Cause = tuple[str, str]
 """What limits a result, and the remedy."""
 
 
-def judged(report: dict) -> dict:
+def with_judgement(report: dict) -> dict:
     """Returns the content of ``report.json`` with a new judgement."""
     return report | {"judgement": judgement_of(report).model_dump()}
 
 
 def judgement_of(report: dict) -> Judgement:
     """Returns the judgement of a run from the content of ``report.json``."""
-    return _Run(report).judgement()
+    run = _Run(report)
+    verdict, reserved, use = run.use()
+    limit, remedy = run.limit()
+    keys = ("translation_sigma_um", "rotation_sigma_mdeg")
+    position, rotation = (None if verdict == "no" else run.largest(key) for key in keys)
+    invalid = invalidated(check.key for check in run.every if check.verdict == "failed")
+    return Judgement(
+        verdict=verdict,
+        reserved=reserved,
+        use=use,
+        quality=run.unknown(invalid) if verdict == "no" and run.faces else run.quality(position, rotation),
+        limit=limit,
+        next=" ".join([*filter(None, [remedy]), *run.further(verdict)]),
+        position_sigma_um=position and position[0],
+        position_face=position and position[1],
+        rotation_sigma_mdeg=rotation and rotation[0],
+        rotation_face=rotation and rotation[1],
+        invalid=invalid,
+        missing=[*run.missing, *(f"group {note['place']}" for note in run.lost)],
+    )
 
 
 def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
@@ -129,13 +146,9 @@ class _Run:
     """What is decided by, of the content of ``report.json``."""
 
     def __init__(self, report: dict):
-        self.report, (self.faces, self.summary, self.options) = (
-            report,
-            (report[k] for k in ("faces", "summary", "options")),
-        )
-        self.every = ranked(
-            [Check.read(row) for row in report.get("checks", [])], {i["name"] for i in report["images"]}
-        )
+        self.report, self.faces, self.summary = report, report["faces"], report["summary"]
+        self.options, images = report["options"], {image["name"] for image in report["images"]}
+        self.every = ranked([Check.read(row) for row in report.get("checks", [])], images)
         self.cause = next((check for check in self.every if check.key == CAUSE), None)
         self.checks = [check for check in self.every if check is not self.cause]
         self.open = [check for check in self.checks if check.told() == "not possible"]
@@ -148,33 +161,10 @@ class _Run:
         self.lacking = [face for face in unseen if not wanted or face in wanted] if self.faces else []
         self.missing = [face for face in unseen if face in (self.summary.get("faces_expected") or [])]
         alone = all(group["name"] == TOP_GROUP for group in report["groups"])
+        self.different = report.get("crosscheck", {}).get("differences", [])
         self.are_few = alone and self.summary["images_mapped"] < FEW_IMAGES
 
-    def judgement(self) -> Judgement:
-        """Returns the answers."""
-        verdict, reserved, use = self._use()
-        limit, remedy = self._limit()
-        keys = ("translation_sigma_um", "rotation_sigma_mdeg")
-        position, rotation = (None if verdict == "no" else self._largest(key) for key in keys)
-        invalid = invalidated(check.key for check in self.every if check.verdict == "failed")
-        return Judgement(
-            verdict=verdict,
-            reserved=reserved,
-            use=use,
-            quality=self._unknown(invalid) if verdict == "no" and self.faces else self._quality(position, rotation),
-            limit=limit,
-            next=" ".join([*filter(None, [remedy]), *self._more(verdict)]),
-            position_sigma_um=position and position[0],
-            position_face=position and position[1],
-            rotation_sigma_mdeg=rotation and rotation[0],
-            rotation_face=rotation and rotation[1],
-            invalid=invalid,
-            missing=[*self.missing, *(f"group {note['place']}" for note in self.lost)],
-        )
-
-    # --- may I use it -------------------------------------------------------------------------------------------------
-
-    def _use(self) -> tuple[Use, bool, str]:
+    def use(self) -> tuple[Use, bool, str]:
         """Returns verdict, whether it is to be used with care, and both in words."""
         verdict, words = self._by_result()
         begin, reasons, gaps = "", [words], self._gaps() if self.faces else []
@@ -204,8 +194,8 @@ class _Run:
             return "no", f"{cause.cause}{of}"
         if failed:
             return "no", f"{failed} of {made} checks failed, the first: {self.checks[0].title}"
-        if different := self._different():
-            return "with care", f"the native COLMAP comes to other faces ({different[0]})"
+        if self.different:
+            return "with care", f"the native COLMAP comes to other faces ({self.different[0]})"
         if words := self._larger():
             return "with care", f"{words}{f'; the likely cause: {cause.cause}' if cause else ''}"
         if cause:
@@ -224,9 +214,6 @@ class _Run:
             return "with care", f"the photographs are too few to test one another, {missing} checks were not possible"
         open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
         return "yes", f"{f'{passed} checks passed' if passed else 'nothing was checked'}{open_}"
-
-    def _different(self) -> list[str]:
-        return self.report.get("crosscheck", {}).get("differences", [])
 
     def _larger(self) -> str:
         """Returns by how much σ are larger than pixels explain, and why; empty if they are not."""
@@ -257,15 +244,13 @@ class _Run:
             words.append(f"one image alone shows {_faces(single)}")
         return words + [f"group {note['place']} was left out completely" for note in self.lost]
 
-    # --- how good -----------------------------------------------------------------------------------------------------
-
-    def _unknown(self, invalid: list[str]) -> str:
+    def unknown(self, invalid: list[str]) -> str:
         """Returns the answer of a result that must not be used: no number, and what does not hold."""
         if invalid:
             return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
         return "That is unknown: biased faces have no valid σ." if self._control() else "That is unknown."
 
-    def _quality(self, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
+    def quality(self, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
         if not self.faces:
             worst = max((group["scale"]["board_rms_um"] for group in self.report["groups"]), default=0.0)
             return f"The board's dots are within {number(worst, 1)} µm RMS of their design."
@@ -288,14 +273,12 @@ class _Run:
             f"axis{scale}; that holds where {' and '.join(premises)} {are} as stated.{surface}"
         )
 
-    def _largest(self, key: str) -> tuple[float, str] | None:
+    def largest(self, key: str) -> tuple[float, str] | None:
         """Returns (largest value over the axes, face) of the worst face."""
         others = {name: face for name, face in self.faces.items() if name != self.report["reference_face"]}
         return max(((max(f[key]), name) for name, f in others.items() if f[key] is not None), default=None)
 
-    # --- what limits it, what next ------------------------------------------------------------------------------------
-
-    def _limit(self) -> Cause:
+    def limit(self) -> Cause:
         """Returns what limits a result, and the remedy."""
         worst, lost = self.every[0].verdict if self.every else "passed", _noted(self.lost, "Left out")
         return (
@@ -335,9 +318,9 @@ class _Run:
                 return found, remedy
             limits = self._by_gaps() or self._by_size() or self._by_sigma()
             return limits[0], f"{found} {remedy}"  # what is suspicious is to be looked at; σ still tell
-        if different := self._different():
+        if self.different:
             remedy = "Look at the cross-check to see which of the two is right."
-            return f"The native COLMAP differs: {different[0]}.", remedy
+            return f"The native COLMAP differs: {self.different[0]}.", remedy
         return None
 
     def _by_gaps(self) -> Cause | None:
@@ -363,7 +346,7 @@ class _Run:
         if len(self.faces) == 1:
             remedy = "Photograph it together with other faces."
             return "There is only one face, and nothing links it to others.", remedy
-        found = self._largest("translation_sigma_um")
+        found = self.largest("translation_sigma_um")
         if found is None:
             return "What limits it is unknown without σ.", "Run it with --solve joint."
         sigma, worst = found
@@ -374,8 +357,13 @@ class _Run:
         source = max(variance, key=lambda kind: variance[kind], default="")
         of_all = f"% of the variance of face {worst} along {'xyz'[axis]} (σ {number(sigma, 1)} µm)"
         if source and variance[source] > photographs:
-            name, remedy = self._source(source)
-            return f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy
+            share = number(100 * variance[source] / sigma**2, 0)
+            given = "a longer or better known" if "distances" in self.scale_from else "the"
+            distance = f"state {given} distance of two points of the target with [[scale]] in target.toml"
+            if source == "sizes" and (self.summary.get("edge_share") or 0.0) > 0.5:
+                source = "edges"
+            few, (name, remedy) = "" if self.are_few else "More photographs help little: ", SOURCES[source]
+            return f"{name}: {share} {of_all}.", sentence(f"{few}{remedy.format(distance=distance)}")
         others = [
             max(row["translation_sigma_um"])
             for name, row in self.faces.items()
@@ -388,14 +376,10 @@ class _Run:
                 f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
                 f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
             )
-        return self._by_images(sigma, photographs, of_all)
-
-    def _by_images(self, sigma: float, variance: float, of_all: str) -> Cause:
-        """Returns the cause where photographs limit the result, by their part of ``sigma``², 0 if unknown."""
         centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says which do most."
-        if not variance:
+        if not photographs:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
-        fewer, share = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0)), 100 * variance / sigma**2
+        fewer, share = math.sqrt(max(sigma**2 - photographs * (1 - 1 / MORE), 0.0)), 100 * photographs / sigma**2
         centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
             f"{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands out.",
@@ -403,16 +387,7 @@ class _Run:
             f"{number(sigma, 1)} µm, and {advice}",
         )
 
-    def _source(self, kind: str) -> Cause:
-        """Returns the name of a source other than the photographs that limits the result, and its remedy."""
-        given = "a longer or better known" if "distances" in self.scale_from else "the"
-        distance = f"state {given} distance of two points of the target with [[scale]] in target.toml"
-        if kind == "sizes" and (self.summary.get("edge_share") or 0.0) > 0.5:
-            kind = "edges"
-        few, (name, remedy) = "" if self.are_few else "More photographs help little: ", SOURCES[kind]
-        return name, sentence(f"{few}{remedy.format(distance=distance)}")
-
-    def _more(self, verdict: Use) -> list[str]:
+    def further(self, verdict: Use) -> list[str]:
         """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
         advice = []
         if self.faces and self.are_few:

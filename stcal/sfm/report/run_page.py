@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
-from itertools import chain, product
+from itertools import chain, compress, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,10 +46,8 @@ from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
 
-FIRST_IMAGES = 100
-"""Number of rows and overlays that the page has room for."""
-LONGEST = 0.04
-"""Length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width."""
+FIRST_IMAGES = 100  # number of rows and overlays that the page has room for
+LONGEST = 0.04  # length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width
 Residuals = np.ndarray
 """Array (n, 4) of circles: centre x, y and residual x, y, px."""
 
@@ -407,12 +405,18 @@ FIRST_NAMES = 6
 """Number of names that a row has room for."""
 
 
-def checks_section(rows: list[dict]) -> list[Block]:
+def checks_section(checks_of_report: list[dict]) -> list[Block]:
     """Returns the checks that did not pass; the others, and what all of them measured, folded."""
-    checks = sorted(map(Check.read, rows), key=lambda check: ORDER.index(check.verdict))
+    checks = sorted(map(Check.read, checks_of_report), key=lambda check: ORDER.index(check.verdict))
     heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
     is_open = [check.verdict in ("failed", "suspicious") for check in checks]
-    open_, others = ([_check_row(c) for c, own in zip(checks, is_open, strict=True) if own is k] for k in (True, False))
+    rows = []
+    for check in checks:
+        surplus = len(check.names) - FIRST_NAMES
+        names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
+        value = check.measured[0].texts() if check.measured else [NONE, NONE]
+        rows.append([check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy])
+    open_, others = (list(compress(rows, of)) for of in (is_open, [not each for each in is_open]))
     measured = [
         [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
         for check in checks
@@ -430,13 +434,6 @@ def checks_section(rows: list[dict]) -> list[Block]:
             Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
         ),
     ]
-
-
-def _check_row(check: Check) -> list:
-    surplus = len(check.names) - FIRST_NAMES
-    names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
-    value = check.measured[0].texts() if check.measured else [NONE, NONE]
-    return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
 
 
 def published_section(comparison: dict) -> list[Block]:
@@ -501,10 +498,8 @@ def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
 
 DIGITS = 2
 """Number of decimals of coordinates in mm: far finer than a screen shows."""
-AXIS = 0.2
-"""Length of the faces' axes, as a share of the target's extent."""
-CAMERA = 0.07
-"""Depth of a camera's pyramid, as a share of the scene's extent."""
+AXIS = 0.2  # length of the faces' axes, as a share of the target's extent
+CAMERA = 0.07  # depth of a camera's pyramid, as a share of the scene's extent
 SHEET = "#7f93a8"
 LEAST_UPRIGHT = 0.5  # length of the mean of the photographs' upward directions from which on they agree
 
@@ -526,15 +521,10 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
     for camera in scene["cameras"]:
         path, colour = frustum(camera, report["camera"], depth), colours.get(camera["group"], INK)
         parts.append(_part("line", path, colour, name=camera["image"], size=1.1))
-    return upright(parts, scene["cameras"])
-
-
-def upright(parts: list[dict], cameras: list[dict]) -> list[dict]:
-    """Returns the parts of the scene as they stood for upright photographs, else with the target's Z up."""
-    up = -np.mean([camera["axes"][1] for camera in cameras] or [np.zeros(3)], axis=0)
+    up = -np.mean([camera["axes"][1] for camera in scene["cameras"]] or [np.zeros(3)], axis=0)
     if np.linalg.norm(up) < LEAST_UPRIGHT:
         return parts
-    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]
+    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]  # as it stood for upright photographs
     return [part | {"xyz": np.round(turn.apply(part["xyz"]), DIGITS).tolist()} for part in parts]
 
 
@@ -562,13 +552,7 @@ def _part(kind: str, xyz, colour: str, **more) -> dict:
 
 
 def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> dict:
-    """Returns all photographs that the page shows, with vectors on one scale.
-
-    ``each`` : of each its ``name``, what was found in it, its JPEG as a data URI, and the path of its ``vectors``;
-    ``box`` : the images' place in px, pixel centres integer; ``aspect`` : width by height; ``factor`` : by which all
-    vectors are lengthened, 0 if there are none; ``stroke`` : width of their lines, px; ``bar`` : path of a bar, as long
-    as the vector of a residual of ``bar_px``.
-    """
+    """Returns all photographs that the page shows, with vectors on one scale, and a bar of that scale."""
     width, height = report["camera"]["size_px"]
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
     lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])

@@ -220,9 +220,7 @@ class ResidualRms(Part):
     run: float
 
 
-class FaceDifference(Part):
-    translation_um: float
-    rotation_mdeg: float
+class FaceDifference(FaceOff):
     sigmas: float | None = None
 
 

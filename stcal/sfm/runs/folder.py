@@ -62,12 +62,11 @@ from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import QUESTIONS, Judgement, judged, without_sigma_of
+from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
 from stcal.sfm.report.run_page import (
     CONTROL,
     FIRST_IMAGES,
     PUBLISHED,
-    Residuals,
     faces_table,
     report_html,
     shown_overlays,
@@ -80,10 +79,8 @@ from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complet
 LONGEST_NAME, HASH_DIGITS = 200, 12
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
 during writing."""
-WEAK_FOCAL = 0.01
-"""Relative σ of a focal length beyond which the views lack what determines it."""
-FIRST = 20
-"""Number of images that are named."""
+WEAK_FOCAL = 0.01  # relative σ of a focal length beyond which the views lack what determines it
+FIRST = 20  # number of images that are named
 
 
 @contextlib.contextmanager
@@ -159,7 +156,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     save_target(out / TARGET, result.target_design)
     if result.board_design.rows:
         save_board(out / BOARD, result.board_design)
-    report = judged(report_of(result).content())
+    report = with_judgement(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
     faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces
@@ -247,18 +244,14 @@ def _report_page(run: Path, report: dict) -> tuple[str, int]:
     shown = shown_overlays(report)
     overlays = {name: path.read_bytes() for name in shown if (path := overlay_path(run, name)).is_file()}
     gone = len(shown) - len(overlays)
-    return report_html(report, overlays, _residuals(run, list(overlays)), gone), gone
-
-
-def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
-    """Returns centres and residuals of these images from ``labels.csv``."""
-    rows: dict[str, list[list[float]]] = {name: [] for name in names}
+    residuals: dict[str, list[list[float]]] = {name: [] for name in overlays}
     with as_written(run / "labels.csv"):
         for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
-            if row["image"] in rows and row["residual_x_px"]:
+            if row["image"] in residuals and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
-                rows[row["image"]].append(values)
-    return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
+                residuals[row["image"]].append(values)
+    arrays = {name: np.array(values).reshape(-1, 4) for name, values in residuals.items()}
+    return report_html(report, overlays, arrays, gone), gone
 
 
 def require_report(saved: SavedRun) -> None:

@@ -20,8 +20,7 @@ from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 
 Compare = Literal["paper"]
-VAGUE = 0.01
-"""Relative σ of a camera file's focal length above which the boards tell it better."""
+VAGUE = 0.01  # relative σ of a camera file's focal length above which the boards tell it better
 
 
 @dataclass(frozen=True, slots=True)

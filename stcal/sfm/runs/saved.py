@@ -68,9 +68,6 @@ from stcal.sfm.runs.transaction import (
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from stcal.sfm.runs.report_file import ReportCamera
-
-ReportPart = TypeVar("ReportPart", bound=Part)
 Value = TypeVar("Value")
 Rows = Literal["faces", "circles", "images", "observations"]
 """Tables of :meth:`RunResult.to_dataframe`."""
@@ -177,18 +174,7 @@ class SavedRun(Brief):
     @property
     def target(self) -> CalibratedTarget:
         """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
-        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
-        return CalibratedTarget(
-            faces.reference_face,
-            faces.poses(),
-            by_circle(faces.circles),
-            {},
-            dict(faces.target_from_face_covariance),
-            by_circle(faces.circle_covariance_mm2),
-            {},
-            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
-            None if joint is None else joint.matrix(),
-        )
+        return target_in(self.faces)
 
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Returns the observations by group, in order."""
@@ -210,18 +196,6 @@ class SavedRun(Brief):
         """Returns the checks that failed, as ``report.json`` has them."""
         return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
 
-    def report_as(self, part: type[ReportPart]) -> ReportPart:
-        """Returns the part of ``report.json`` that a command needs."""
-        with as_written(self.folder / "report.json"):
-            return checked(self.report, part)
-
-    def adjusted_camera(self, own: "ReportCamera") -> Camera:
-        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
-        if not self.options.refine_camera:
-            return self.camera
-        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
-        return Camera.of(camera, self.camera.colmap_model)
-
 
 def no_faces(folder: Path) -> InputError:
     """Returns the error of a run without a result for faces."""
@@ -235,6 +209,22 @@ def no_faces(folder: Path) -> InputError:
 def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
     """Returns values of ``faces.json`` by the labels of the circles."""
     return dict(zip(circle_labels(values), values.values(), strict=True))
+
+
+def target_in(faces: FacesFile) -> CalibratedTarget:
+    """Returns the target in the content of ``faces.json``, which has no poses of groups."""
+    joint = faces.circles_joint_covariance_mm2
+    return CalibratedTarget(
+        faces.reference_face,
+        faces.poses(),
+        by_circle(faces.circles),
+        {},
+        dict(faces.target_from_face_covariance),
+        by_circle(faces.circle_covariance_mm2),
+        {},
+        None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
+        None if joint is None else joint.matrix(),
+    )
 
 
 AnyRun = SavedRun | str | Path

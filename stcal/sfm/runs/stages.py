@@ -244,7 +244,7 @@ class Groups:
         """Labelled centres of the images whose groups can be solved."""
         return [image for image in self.observations if image.group in self.names]
 
-    def explained(self) -> AbstractContextManager[None]:
+    def naming_cause(self) -> AbstractContextManager[None]:
         """Lets errors name what of the camera file is wrong, unless the file is a start alone."""
         return nullcontext() if self.options.refine_camera else explained(self.usable, self.camera, self.board)
 
@@ -287,7 +287,10 @@ def groups_of(task: Task, seen: DetectedImages) -> Groups:
     board_alone = options.board_only or is_board_alone(seen.detection)
     if board_alone and options.solve == "joint":
         options = replace(options, solve="chain", refine_camera=False)
-    board, camera = with_edge_sigma(task.board, observations), start_of(seen.camera, seen, task.options)
+    board, camera = (
+        with_edge_sigma(task.board, observations),
+        start_of(seen.camera, seen.detection.camera, task.options),
+    )
     skipped, needs_board = seen.detection.skipped, not task.target.has_scale
     usable, notes = usable_groups(by_group(observations), skipped, board_alone, needs_board)
     task.progress("map", 0, len(usable))
@@ -295,15 +298,15 @@ def groups_of(task: Task, seen: DetectedImages) -> Groups:
     return Groups(labelled, tuple(usable), graph, camera, board, options, board_alone, tuple(notes))
 
 
-def start_of(model: CameraModel, seen: DetectedImages, options: RunOptions) -> Camera:
+def start_of(model: CameraModel, sized: Camera, options: RunOptions) -> Camera:
     """Returns the camera with which a solution of the images begins."""
-    camera = model.calibrated(seen.detection.camera.width, seen.detection.camera.height)
+    camera = model.calibrated(sized.width, sized.height)
     return refinable(camera) if options.refine_camera else camera
 
 
 def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Groups:
     """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
-    with groups.explained():
+    with groups.naming_cause():
         if faces_of_known_shape(groups.board) and not groups.board_alone:
             solutions, unsolved = _solve_body(task, groups)
         else:
@@ -428,7 +431,6 @@ def solve_groups(
     step = counted(progress, "map", len(inputs))
     for _ in range(len(inputs) - len(pending)):
         step(None)
-    shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
         jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]

@@ -62,8 +62,7 @@ class MarkerFile(ResultFile):
 
 STAGE, READY = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready"
 """Results that are being written, and results that are complete."""
-GONE = "gone.txt"
-"""Names of the earlier results that complete ones lack."""
+GONE = "gone.txt"  # names of the earlier results that complete ones lack
 RESULTS = tuple(name for name in RUN_ENTRIES if name != INTERNAL)
 """Entries that new results replace, or remove if the new results lack them."""
 LOOKED_AT = ("detections.csv", "overlays", "report.html")

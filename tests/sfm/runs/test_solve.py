@@ -14,9 +14,13 @@ from tests.outcome import fails_with, refuses
 
 
 @pytest.fixture(scope="module")
-def group(scene, labels_only):
-    found = labels_only.observations(scene, 0.01, np.random.default_rng(0))
-    return [image for image in found if image.group == found[0].group]
+def all_groups(scene, labels_only):
+    return labels_only.observations(scene, 0.01, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def group(all_groups):
+    return [image for image in all_groups if image.group == all_groups[0].group]
 
 
 def only(group, board: bool):
@@ -54,11 +58,6 @@ def test_a_folder_of_copies_or_of_notes_is_no_group(group):
         Skipped("99/notes.txt", "not an image file"),
     ]
     assert usable_groups({"12": group}, skipped) == ({"12": group}, [])
-
-
-@pytest.fixture(scope="module")
-def all_groups(scene, labels_only):
-    return labels_only.observations(scene, 0.01, np.random.default_rng(0))
 
 
 @pytest.mark.slow
