@@ -1,26 +1,76 @@
-"""What studies share: their options, each stated by its default."""
+"""What studies share: options, each stated by its default, tables, the shared data, and errors of faces."""
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stcal.geometry.rigid import Rigid
+    from stcal.sfm.adjust.chain import CalibratedTarget
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "tests" / "data" / "sample"
+DATA = ROOT.parent / "shared" / "data"
+"""Data sets beside the repository."""
 
 
-def options_of(doc: str | None, **defaults) -> argparse.Namespace:
+def options_of(doc: str | None, places: Mapping[str, object] | None = None, **defaults) -> argparse.Namespace:
     """Returns the options of the command line.
 
     Parameters
     ----------
     doc : the script's own text, which ``--help`` prints
+    places : defaults of arguments by position; a list for several, a type where one must be given
     defaults : by the option's name: a number, text or path; a list for an option with several values; False for a
         switch; a type for an option without a default
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, default in defaults.items():
-        option = f"--{name.replace('_', '-')}"
+    places = places or {}
+    for name, default in (*places.items(), *defaults.items()):
+        words = [name] if name in places else [f"--{name.replace('_', '-')}"]
+        one = default[0] if isinstance(default, list) else default
+        kind = {"type": one if isinstance(one, type) else type(one)}
         if default is False:
-            parser.add_argument(option, action="store_true")
+            kind = {"action": "store_true"}
         elif isinstance(default, list):
-            parser.add_argument(option, nargs="+", type=type(default[0]), default=default)
-        elif isinstance(default, type):
-            parser.add_argument(option, type=default)
-        else:
-            parser.add_argument(option, type=type(default), default=default)
+            kind |= {"nargs": "*" if name in places else "+", "default": default}
+        elif not isinstance(default, type):
+            kind |= {"default": default} | ({"nargs": "?"} if name in places else {})
+        parser.add_argument(*words, **kind)
     return parser.parse_args()
+
+
+def head(*names: str) -> None:
+    """Prints the head of a table in Markdown."""
+    row(*names)
+    print(f"|{'---|' * len(names)}", flush=True)
+
+
+def row(*cells: object) -> None:
+    """Prints a row of a table in Markdown."""
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
+def face_errors(found: "CalibratedTarget", true: "Mapping[str, Rigid]") -> "dict[str, np.ndarray]":
+    """Error (6,), rad and mm, of the pose of each known face against the truth, both in the reference face's frame."""
+    import numpy as np
+
+    from stcal.geometry.rigid import Rigid
+
+    own, errors = found.reference_face, {}
+    for face, pose in found.target_from_face.items():
+        if face != own and face in true:
+            known = true[own].inverse() @ true[face]
+            turn = Rigid(pose.rotation @ known.rotation.T).log()[:3]
+            errors[face] = np.concatenate([turn, pose.translation - known.translation])
+    return errors
+
+
+def normalised(found: "CalibratedTarget", errors: "Mapping[str, np.ndarray]") -> "np.ndarray":
+    """eᵀC⁻¹e/6 of each face's error of :func:`face_errors`, (n,)."""
+    import numpy as np
+
+    return np.array([e @ np.linalg.solve(found.face_covariance[face], e) / 6 for face, e in errors.items()])

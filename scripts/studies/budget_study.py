@@ -16,12 +16,12 @@ Printed for positions and rotations of the faces and the longest distances: budg
 of errors within U = 2 u, beside the share that the budget states.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
 
+from scripts.runner import head, options_of, row
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
@@ -95,14 +95,6 @@ def case_of(refined: bool, images: int = 6) -> Case:
     return Case(scene, tuple(models), Statement(BOARD, TARGET, origin, dict.fromkeys(FIELDS, "")), refined)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Draw:
-    """Models as photographed, with their true circles (at the reference temperature) by label."""
-
-    models: list[MetricModel]
-    circles: dict[CircleLabel, np.ndarray]
-
-
 def stratified(count: int, rng: np.random.Generator) -> np.ndarray:
     """Normal numbers, one of each of ``count`` parts of equal probability, in any order."""
     return norm.ppf((rng.permutation(count) + rng.random(count)) / count)
@@ -114,9 +106,11 @@ def single_inputs(seed: int, count: int) -> np.ndarray:
     return np.column_stack([stratified(count, rng) for _ in range(len(SINGLE) + len(CAMERA_SIGMA))])
 
 
-def drawn(case: Case, which: str, single: np.ndarray, rng: np.random.Generator, common: float = ONE_PLATE) -> Draw:
-    """A simulated calibration's observations; ``single`` : of :func:`single_inputs`; ``common`` : share of the board's
-    variance that all groups have."""
+def drawn(
+    case: Case, which: str, single: np.ndarray, rng: np.random.Generator
+) -> tuple[list[MetricModel], dict[CircleLabel, np.ndarray]]:
+    """Models as photographed in a simulated calibration, with their true circles (at the reference temperature) by
+    label; ``single`` : of :func:`single_inputs`."""
     on = set(ALONE) if which == ALL else {which}
     unit = dict(zip(SINGLE, single, strict=False))
     off = {key: unit[key] if key in on else 0.0 for key in SINGLE}
@@ -136,7 +130,7 @@ def drawn(case: Case, which: str, single: np.ndarray, rng: np.random.Generator, 
             normal = case.scene.target_from_face[label.face].rotation[:, 2]
             circles[label] = circles[label] + case.flatness_mm * rng.standard_normal() * normal
     dots = case.scene.board.labels()
-    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - common, common))
+    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - ONE_PLATE, ONE_PLATE))
     plate = plate * rng.standard_normal((len(dots), 3))
     radius = case.scene.target.radius_of() | case.scene.board.radius_of()
     models = []
@@ -152,12 +146,14 @@ def drawn(case: Case, which: str, single: np.ndarray, rng: np.random.Generator, 
         noise = NOISE_PX * noisy[:, None] * rng.standard_normal(shift.shape)
         measured = camera.project(seen.xyz_camera()) + shift + noise
         models.append(replace(seen, measured_px=measured, shift_px=shift))
-    return Draw(models, circles)
+    return models, circles
 
 
-def whole(case: Case, draw: Draw) -> tuple[JointResult, list[MetricModel], SigmaFactors, CalibratedTarget]:
+def whole(
+    case: Case, drawn: list[MetricModel]
+) -> tuple[JointResult, list[MetricModel], SigmaFactors, CalibratedTarget]:
     """``calibrate`` as in a run: joint adjustment, its models, the factors on σ of the centres, the start."""
-    models = [adjust(m, case.camera).in_world(Similarity(1.0, Rigid())) for m in draw.models]
+    models = [adjust(m, case.camera).in_world(Similarity(1.0, Rigid())) for m in drawn]
     options = RunOptions(refine_camera=case.refined).adjustment(case.scene.target)
     result = calibrate(models, case.camera, case.scene.target, case.board, options, case.prior)
     return result.joint, list(result.models), result.sigma_factors, result.target
@@ -174,8 +170,8 @@ class Stated:
 
 def stated_by(case: Case) -> Stated:
     """Of one simulated calibration in which all inputs err."""
-    draw = drawn(case, ALL, single_inputs(99, 40)[7], np.random.default_rng(99))
-    _, models, factors, start = whole(case, draw)
+    photographed, _ = drawn(case, ALL, single_inputs(99, 40)[7], np.random.default_rng(99))
+    _, models, factors, start = whole(case, photographed)
     start = replace(start, target_from_group=dict.fromkeys(start.target_from_group, Rigid()))
     state = adjusted(models, case.board, case.camera, case.flatness_mm, case.prior)
     found = contributions_of(state)
@@ -186,42 +182,27 @@ def stated_by(case: Case) -> Stated:
     return Stated(factors, found.joint.board_common, rows)
 
 
-def errors(
-    case: Case, stated: Stated, which: str, single: np.ndarray, seed: int, common: float = ONE_PLATE
-) -> list[np.ndarray]:
+def errors(case: Case, stated: Stated, which: str, single: np.ndarray, seed: int) -> list[np.ndarray]:
     """Error (r,) of each measurand of the budget in one simulated calibration, mm and rad; arguments as of
     :func:`drawn`."""
-    draw = drawn(case, which, single, np.random.default_rng([seed, 11]), common)
+    models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]))
     if which == ALL:
-        joint = whole(case, draw)[0]
+        joint = whole(case, models)[0]
     else:
-        weighed = [with_sigma(m, stated.factors) for m in draw.models]
+        weighed = [with_sigma(m, stated.factors) for m in models]
         camera: Camera = case.camera
         joint = adjusted(weighed, case.board, camera, case.flatness_mm, case.prior, common=stated.common).result()
-    true = np.array([draw.circles[label] for label in joint.labels])
-    away = in_place(joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction), true) - true
+    true = np.array([circles[label] for label in joint.labels])
+    xyz = joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction)
+    away = align_rigid(true, xyz) @ xyz - true  # moved as one: derivatives are for small moves
     return [row.measurand.jacobian @ away.ravel() for row in stated.budget.rows]
 
 
-def in_place(xyz: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Moved as one onto the truth: derivatives are for small moves."""
-    return align_rigid(true, xyz) @ xyz
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ratio:
-    """Budget over spread: of all measurands, and the least and largest of one; ``coverage`` : share of errors within U,
-    and as the budget has it."""
-
-    all: float
-    least: float
-    largest: float
-    coverage: float
-    expected: float
-
-
-def ratio_of(stated: Stated, which: str, rows: list[list[np.ndarray]]) -> Ratio:
-    """``rows`` : errors by calibration and measurand."""
+def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float, float], float, float]:
+    """Budget over spread in ``count`` simulated calibrations: of all measurands, and the least and largest of one; the
+    share of errors within U, and as the budget has it."""
+    stated, inputs = stated_by(case), list(single_inputs(1, count))
+    rows = list(pool(errors, [case] * count, [stated] * count, [which] * count, inputs, range(count)))
     shares, inside = [], []
     for k, row in enumerate(stated.budget.rows):
         length = np.array([np.linalg.norm(each[k]) for each in rows])
@@ -231,40 +212,25 @@ def ratio_of(stated: Stated, which: str, rows: list[list[np.ndarray]]) -> Ratio:
             shares.append((length**2).mean() / predicted**2)
     expected = np.mean([row.coverage for row in stated.budget.rows])
     single = 1 / np.sqrt(shares)
-    return Ratio(float(1 / np.sqrt(np.mean(shares))), single.min(), single.max(), np.mean(inside), expected)
-
-
-def study(case: Case, which: str, count: int, pool) -> Ratio:
-    """Of ``count`` simulated calibrations."""
-    stated = stated_by(case)
-    inputs = list(single_inputs(1, count))
-    answers = pool(errors, [case] * count, [stated] * count, [which] * count, inputs, range(count))
-    return ratio_of(stated, which, list(answers))
+    return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 
 
 @one_thread()
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--only", choices=(*ALONE, ALL), help="this row alone")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the calibrations to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, runs=200, only="", scheduler=str)
     fixed, refined = case_of(False), case_of(True)
-    print(
-        f"{given.runs} simulated calibrations a row, 3 groups of 6 images, 2592×1728 px, {NOISE_PX} px (simulated "
-        "centres)\n"
-    )
-    print("| erring | budget / spread | least | largest | within U, % | stated, % |")
-    print("|---|---|---|---|---|---|")
+    said = f"3 groups of 6 images, 2592×1728 px, {NOISE_PX} px (simulated centres)"
+    print(f"{given.runs} simulated calibrations a row, {said}\n")
+    head("erring", "budget / spread", "least", "largest", "within U, %", "stated, %")
     rows = [(which, fixed, which.replace("_", " ")) for which in (*ALONE, ALL)]
     rows += [("intrinsics", refined, "intrinsics, adjusted"), (ALL, refined, "all, intrinsics adjusted")]
     with executor_of(given.scheduler) as pool:
         for which, case, title in rows:
-            if given.only in (None, which):
-                r = study(case, which, given.runs, pool.map)
-                covered = f"{100 * r.coverage:.1f} | {100 * r.expected:.1f}" if which == ALL else "– | –"
-                print(f"| {title} | {r.all:.3f} | {r.least:.3f} | {r.largest:.3f} | {covered} |", flush=True)
+            if given.only in ("", which):
+                ratio, *covered = study(case, which, given.runs, pool.map)
+                covered = [f"{100 * share:.1f}" if which == ALL else "–" for share in covered]
+                row(title, *(f"{each:.3f}" for each in ratio), *covered)
 
 
 if __name__ == "__main__":

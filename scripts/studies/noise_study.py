@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import face_errors, options_of, row
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
@@ -64,13 +64,7 @@ def one_run(seed: int, point: Point) -> np.ndarray:
     radius = target.radius_of() | board.radius_of()
     corrected = [replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)) for m in measured]
     ours, control = (
-        calibrate(
-            [adjust(m, scene.camera) for m in models],
-            scene.camera,
-            target,
-            board,
-            options.adjustment(target),
-        )
+        calibrate([adjust(m, scene.camera) for m in models], scene.camera, target, board, options.adjustment(target))
         for models, options in ((corrected, RunOptions()), (measured, RunOptions(eccentricity=False)))
     )
     scale = (ours.sigma_factors.circles * ours.joint.sigma_scale) ** 2
@@ -81,14 +75,9 @@ def one_run(seed: int, point: Point) -> np.ndarray:
 
 def squared_errors(calibration: Calibration, scene: Scene) -> np.ndarray:
     """Mean squares over the faces: position (µm²), rotation (mdeg²)."""
-    squares = []
-    for face, true in scene.target_from_face.items():
-        if face != scene.reference_face:
-            pose = calibration.target.target_from_face[face]
-            turn = Rigid(pose.rotation @ true.rotation.T).angle_rad()
-            shift = 1e3 * (pose.translation - true.translation)
-            squares.append((shift @ shift, (1e3 * np.degrees(turn)) ** 2))
-    return np.mean(squares, axis=0)
+    off = np.array(list(face_errors(calibration.target, scene.target_from_face).values()))
+    squares = 1e6 * (off**2).reshape(-1, 2, 3).sum(2).mean(0)
+    return np.array([squares[1], squares[0] * np.degrees(1) ** 2])
 
 
 def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
@@ -101,26 +90,19 @@ def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
     return dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
 
 
-def print_table(found: dict[Point, np.ndarray]) -> None:
-    """Markdown."""
-    print("| | | position, µm | bound, µm | position / bound | rotation, mdeg | uncorrected, µm |")
-    print("|---|---|---|---|---|---|---|")
-    for name, (title, values) in PANELS.items():
-        for value in values:
-            position, rotation, bound, control = found[Point(**{name: value})]
-            print(
-                f"| {title} | {value:g} | {position:.2f} | {bound:.2f} | {position / bound:.2f} | {rotation:.2f} | "
-                f"{control:.1f} |"
-            )
-
-
 @one_thread()
 def main() -> None:
     """Print the table."""
     given = options_of(__doc__, seeds=20, scheduler=str)
     found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
-    print_table(found)
+    titles = "position, µm", "bound, µm", "position / bound", "rotation, mdeg", "uncorrected, µm"
+    print(f"| | | {' | '.join(titles)} |\n|{'---|' * 7}")
+    for name, (title, values) in PANELS.items():
+        for value in values:
+            position, rotation, bound, control = found[Point(**{name: value})]
+            figures = (f"{each:.2f}" for each in (position, bound, position / bound, rotation))
+            row(title, f"{value:g}", *figures, f"{control:.1f}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import face_errors, normalised, options_of
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
@@ -48,17 +48,10 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     options = RunOptions(refine_camera=refine).adjustment(scene.target)
     result = calibrate(models, camera, scene.target, board, options, prior)
     scale = (result.sigma_factors.circles * result.joint.sigma_scale) ** 2
-    rows = []
-    for face, pose in result.target.target_from_face.items():
-        if face == result.target.reference_face:
-            continue
-        true = scene.target_from_face[face]
-        shift = pose.translation - true.translation
-        error = np.concatenate([Rigid(pose.rotation @ true.rotation.T).log()[:3], shift])
-        covariance = result.target.face_covariance[face]
-        bound = np.trace(covariance[3:, 3:]) / scale
-        rows.append((float(shift @ shift / bound), float(error @ np.linalg.solve(covariance, error) / 6)))
-    return rows
+    errors = face_errors(result.target, scene.target_from_face)
+    bound = [np.trace(result.target.face_covariance[face][3:, 3:]) / scale for face in errors]
+    shares = [error[3:] @ error[3:] / each for error, each in zip(errors.values(), bound, strict=True)]
+    return list(zip(shares, normalised(result.target, errors), strict=True))
 
 
 @one_thread()
@@ -76,12 +69,9 @@ def main() -> None:
         with executor_of(given.scheduler) as pool:
             answers = list(pool.map(one_run, range(count), [sigma] * count, [refine] * count))
         rows = np.array([row for answer in answers for row in answer])
-        per_run = rows[:, 1].reshape(count, -1).mean(1)
-        print(
-            f"{title:28} {np.sqrt(rows[:, 0].mean()):13.3f}   {rows[:, 1].mean():.3f} ± "
-            f"{per_run.std() / np.sqrt(count):.3f}",
-            flush=True,
-        )
+        spread = rows[:, 1].reshape(count, -1).mean(1).std() / np.sqrt(count)
+        figures = f"{np.sqrt(rows[:, 0].mean()):13.3f}   {rows[:, 1].mean():.3f} ± {spread:.3f}"
+        print(f"{title:28} {figures}", flush=True)
 
 
 if __name__ == "__main__":

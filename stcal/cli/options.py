@@ -245,9 +245,8 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
     from stcal.sfm.detect.candidates import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
-        raise InputError(
-            "E-OPTION-RANGE", f"--max-diameter {max_diameter:g}: over --min-diameter {min_diameter:g} needed"
-        )
+        fault = f"--max-diameter {max_diameter:g}: over --min-diameter {min_diameter:g} needed"
+        raise InputError("E-OPTION-RANGE", fault)
     return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
 
@@ -321,9 +320,8 @@ def _protected(command: Callable) -> Callable:
         exports = (word.partition("=")[2] for word in given.get("export") or ())
         written += [("--export", Path(path)) for path in exports if path]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
-        for option in to_stdout:
-            if option != "--json":
-                raise InputError("E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give a file")
+        for option in [each for each in to_stdout if each != "--json"]:
+            raise InputError("E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give a file")
         written = [each for each in written if each[1] != STANDARD_OUTPUT]
         for option, path in written:
             if option == "--report" and path.suffix.lower() == ".pdf":

@@ -77,11 +77,9 @@ class OpenCVSource:
     def expose(self, exposure: float, settle_s: float) -> tuple[np.ndarray, float]:
         """Return an image and its exposure, see :class:`Source`; frames during the settle time are dropped."""
         if not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
-            raise InputError(
-                "E-DEVICE-SETTING",
-                f"{self.name}: its driver takes no exposure {exposure:g}; give exposures in its unit (V4L2: 100 µs), "
-                "see `v4l2-ctl --list-ctrls`",
-            )
+            remedy = "give exposures in its unit (V4L2: 100 µs), see `v4l2-ctl --list-ctrls`"
+            none = f"{self.name}: its driver takes no exposure {exposure:g}; {remedy}"
+            raise InputError("E-DEVICE-SETTING", none)
         until, frame, read = time.monotonic() + settle_s, None, 0
         while frame is None or read < READINGS or time.monotonic() < until:
             received, frame = self._capture.read()
@@ -148,10 +146,8 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
     pictures = _every(device) if is_file else _newest(device, what)
     try:
         if not device.isOpened():
-            raise InputError(
-                "E-LIVE-SOURCE",
-                f"{what}: cannot be opened; give a camera's number, a stream's URL, a video file or a folder of images",
-            )
+            remedy = "give a camera's number, a stream's URL, a video file or a folder of images"
+            raise InputError("E-LIVE-SOURCE", f"{what}: cannot be opened; {remedy}")
         first = next(pictures, None)
         if first is None:
             raise InputError("E-LIVE-SOURCE", f"{what}: opened, but gives no picture; is another program using it?")

@@ -105,50 +105,43 @@ def image_file(path: Path) -> ImageFile:
 @lru_cache(maxsize=4)
 def _mosaics(path: Path, _: int) -> tuple[str, ...]:
     """Return the patterns that an image may be a mosaic of; commands look for the same images more than once."""
-    with Image.open(path) as image:
-        if image.mode not in ("L", "I", "I;16", "I;16B"):
-            return ()
-    return patterns_seen(decode(read_bytes(path, IMAGE_BYTES), path.name))
+    with contextlib.suppress(Exception), Image.open(path) as image:  # whoever reads it says what is wrong
+        if image.mode in ("L", "I", "I;16", "I;16B"):
+            return patterns_seen(decode(read_bytes(path, IMAGE_BYTES), path.name))
+    return ()
 
 
 def _refuse_mosaics(files: Sequence[ImageFile]) -> None:
-    first = next((file for file in files if file.path.suffix.lower() in UNPACKED), None)
-    if first is None:
+    for first in [file for file in files if file.path.suffix.lower() in UNPACKED][:1]:
+        if seen := _mosaics(first.path, first.path.stat().st_mtime_ns):
+            fault = f"{first.name}: its pixels are a mosaic of colours, {' or '.join(seen)}, as a sensor with a Bayer "
+            remedy = "filter delivers them; give the grey or colour images that the camera's program makes of it"
+            raise InputError("E-IMAGE-MOSAIC", fault + remedy)
+
+
+def _entries(root: Path) -> Iterator[tuple[Path, str, str]]:
+    """Yield path, name and group of a single file, or of what lies in a folder and in its groups."""
+    if root.is_file():
+        yield root, root.name, TOP_GROUP
         return
-    try:
-        seen = _mosaics(first.path, first.path.stat().st_mtime_ns)
-    except Exception:  # whoever reads it says what is wrong
-        return
-    if seen:
-        raise InputError(
-            "E-IMAGE-MOSAIC",
-            f"{first.name}: its pixels are a mosaic of colours, {' or '.join(seen)}, as a sensor with a Bayer filter "
-            "delivers them; give the grey or colour images that the camera's program makes of it",
-        )
+    for path in sorted(root.iterdir(), key=lambda p: (p.is_dir(), p.name)):
+        if not path.is_dir():
+            yield path, path.name, TOP_GROUP
+        elif not path.name.startswith(".") and not (path / RUN_MARKER).exists():
+            for inner in sorted(path.iterdir(), key=lambda p: p.name):
+                yield inner, f"{path.name}/{inner.name}", path.name
 
 
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     """Return the image files below a folder, or the one image, by group and name, and the files that are skipped."""
     root = Path(folder)
-    files: list[ImageFile] = []
-    skipped: list[Skipped] = []
-    if root.is_file():
-        _sort_in(root, root.name, TOP_GROUP, files, skipped)
-        if files:
-            _refuse_mosaics(files)
-            return files, skipped
-    if not root.is_dir():
+    entries = _entries(root) if root.exists() else ()
+    judged = [_judged(*entry) for entry in entries if not entry[0].name.startswith(".")]
+    files = [each for each in judged if isinstance(each, ImageFile)]
+    skipped = [each for each in judged if isinstance(each, Skipped)]
+    if not files and not root.is_dir():
         fault = f"not a folder, and {skipped[0].reason}" if skipped else "does not exist"
         raise InputError("E-IMAGES-FOLDER", f"image folder {root}: {fault}; give a folder or an image")
-    for path in sorted(root.iterdir(), key=lambda p: (p.is_dir(), p.name)):
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            if not (path / RUN_MARKER).exists():
-                for inner in sorted(path.iterdir(), key=lambda p: p.name):
-                    _sort_in(inner, f"{path.name}/{inner.name}", path.name, files, skipped)
-        else:
-            _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         unread = set(decoding.UNREAD.values())  # then a nested folder is the most helpful hint: images lie too deep
         telling = sorted(
@@ -184,28 +177,24 @@ def without_excluded(
     return remaining, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in excluded)]
 
 
-def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> None:
-    if path.name.startswith("."):
-        return
+def _judged(path: Path, name: str, group: str) -> ImageFile | Skipped:
     plain = name.encode("utf-8", "backslashreplace").decode()
     if path.is_dir():
         reason = "a folder inside a group; images lie in <group>/ directly"
         with contextlib.suppress(OSError):  # the folder cannot be read
             if any(inner.suffix.lower() in SUFFIXES for inner in path.iterdir()):
                 reason += f"; {HOLDS_IMAGES}: did you mean {path.parent}?"
-        skipped.append(Skipped(plain, reason, "folder"))
-    elif path.suffix.lower() not in SUFFIXES:
+        return Skipped(plain, reason, "folder")
+    if path.suffix.lower() not in SUFFIXES:
         kinds, suffix = ", ".join(USUAL), path.suffix.lower()
         reason = decoding.UNREAD.get(suffix, "not an image file")
-        skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
-    elif plain != name or name_fault(name):
-        # Result files cannot store such a name.
+        return Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds)
+    if plain != name or name_fault(name):  # result files cannot store such a name
         reason = f"its name {name_fault(name) or 'is not UTF-8'}; rename it"
-        skipped.append(Skipped(repr(plain)[1:-1], reason, "file_name"))
-    elif not path.is_file():
-        skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
-    else:
-        files.append(ImageFile(path, name, group))
+        return Skipped(repr(plain)[1:-1], reason, "file_name")
+    if not path.is_file():
+        return Skipped(name, "cannot be read: not a file, or a broken link")
+    return ImageFile(path, name, group)
 
 
 def name_fault(name: str) -> str | None:
@@ -345,16 +334,12 @@ def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], st
 def size_fault(name: str, own: tuple[int, int], wanted: tuple[int, int], stated_by: str) -> Skipped:
     """Return why an image of another size is skipped; ``stated_by`` : what says the size that is ``wanted``, px."""
     own_text, wanted_text = ("{}×{} px".format(*size) for size in (own, wanted))
+    reason = f"{own_text}, but {stated_by} says {wanted_text}; "
     if own == wanted[::-1]:
-        reason = (
-            f"sides swapped: {own_text}, but {stated_by} says {wanted_text}; a program turned it by 90°, and nothing "
-            "says which way: turn it back without loss (jpegtran -rotate), or copy it again as the camera wrote it"
-        )
+        reason = f"sides swapped: {reason}a program turned it by 90°, and nothing says which way: turn it back "
+        reason += "without loss (jpegtran -rotate), or copy it again as the camera wrote it"
     else:
-        reason = (
-            f"{own_text}, but {stated_by} says {wanted_text}; use images as the camera took them, or the camera file "
-            "that belongs to them"
-        )
+        reason += "use images as the camera took them, or the camera file that belongs to them"
     return Skipped(name, reason, "image_size", own_text, wanted_text)
 
 

@@ -151,18 +151,14 @@ def keys_of(key: str, first: Table | None = None) -> tuple[str, str]:
 def _places(table: Table, key: str, number: int) -> dict[str, int]:
     if key not in table:
         both = f"{key}=NAME" if number else f"NAME={key}"
-        raise InputError(
-            "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: no column {key}; the header is {table.header()}; give another --key, or --key {both!r} "
-            "where the columns of both files have different names",
-        )
+        fault = f"{table.where}: no column {key}; the header is {table.header()}"
+        remedy = f"give another --key, or --key {both!r} where the columns of both files have different names"
+        raise InputError("E-TABLE-COLUMN-MISSING", f"{fault}; {remedy}")
     row_of: dict[str, int] = {}
     for row, name in enumerate(table.text(key)):
         if name in row_of:
-            raise InputError(
-                "E-TABLE-ROW-REPEATED",
-                f"{table.where}: line {table.lines[row]}: {key} {name} stands on line {table.lines[row_of[name]]} too; "
-                "every one once needed",
-            )
+            first = f"{key} {name} stands on line {table.lines[row_of[name]]} too"
+            fault = f"{table.where}: line {table.lines[row]}: {first}"
+            raise InputError("E-TABLE-ROW-REPEATED", f"{fault}; every one once needed")
         row_of[name] = row
     return row_of

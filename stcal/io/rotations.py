@@ -75,11 +75,9 @@ def convention_of(name: str) -> Convention:
     known = order in (ROTATION_VECTOR, *QUATERNIONS)
     euler = bool(_ORDER.fullmatch(order)) and order[0] != order[1] != order[2]
     if not (known or euler) or unit not in ("", *ANGLES) or (order in QUATERNIONS and unit):
-        raise InputError(
-            "E-OPTION-VALUE",
-            f"--rotation {name}: unknown; rotvec, an order of axes (xyz … about fixed axes, ZYX … about turned ones), "
-            f"each also with -deg or -rad, wxyz, xyzw, {', '.join(ALIASES)}",
-        )
+        orders = "rotvec, an order of axes (xyz … about fixed axes, ZYX … about turned ones)"
+        others = f"each also with -deg or -rad, wxyz, xyzw, {', '.join(ALIASES)}"
+        raise InputError("E-OPTION-VALUE", f"--rotation {name}: unknown; {orders}, {others}")
     return Convention(order, unit)
 
 
@@ -108,18 +106,14 @@ def rotations(
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
     if not unit:
         if largest <= MOST_RAD:
-            raise InputError(
-                "E-ROTATION-AMBIGUOUS",
-                f"{where}: angles up to {largest:.3g} may be radians or degrees; give --rotation "
-                f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg",
-            )
+            either = f"{where}: angles up to {largest:.3g} may be radians or degrees"
+            option = f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg"
+            raise InputError("E-ROTATION-AMBIGUOUS", f"{either}; give --rotation {option}")
         unit, guessed = "deg", True
     if unit == "rad" and largest > MOST_RADIANS:
-        raise InputError(
-            "E-ANGLE-UNIT",
-            f"{where}: angles up to {largest:.4g} rad, a turn is 6.28; if they are degrees, name the columns _deg, or "
-            f"give --rotation {convention.order}-deg",
-        )
+        fault = f"{where}: angles up to {largest:.4g} rad, a turn is 6.28"
+        remedy = f"if they are degrees, name the columns _deg, or give --rotation {convention.order}-deg"
+        raise InputError("E-ANGLE-UNIT", f"{fault}; {remedy}")
     angles = values * ANGLES[unit]
     words = f"{convention.words()}, {'degrees' if unit == 'deg' else 'radians'}{' by their size' if guessed else ''}"
     if convention.order == ROTATION_VECTOR:
@@ -148,13 +142,10 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
     if len(bad):
         i = bad[0]
         suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        if off[i] <= UNIT_WITHIN:
-            finding = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
-        else:
-            finding = (
-                f"not a rotation: its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, "
-                f"1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
-            )
+        finding = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
+        if off[i] > UNIT_WITHIN:
+            stretched = f"its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}"
+            finding = f"not a rotation: {stretched}, 1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
         raise InputError("E-ROTATION-IMPROPER", f"{where}: {places[i]}: the 3×3 part is {finding}{suffix}")
     return u @ vt
 
@@ -199,20 +190,13 @@ class Reading:
 
 
 LAST = Reading("x, y, z, w in the order of their columns", "give --quaternions xyzw", (3, 0, 1, 2))
-FIRST = Reading(
-    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or rename them", (1, 2, 3, 0)
-)
+_RENAME = "leave --quaternions xyzw out, or rename them"
+FIRST = Reading("z, w, x, y in the columns qw, qx, qy, qz", _RENAME, (1, 2, 3, 0))
 ORDERS = (LAST, FIRST)
-INVERTED = Reading("conjugated (the first frame seen from the second)", "change the sign of qw", conjugated=True)
-READINGS = (
-    LAST,
-    FIRST,
-    INVERTED,
-    *(
-        Reading(f"{each.held}, and conjugated", f"{each.remedy} and change the sign of qw", each.order, True)
-        for each in ORDERS
-    ),
-)
+_SIGN = "change the sign of qw"
+INVERTED = Reading("conjugated (the first frame seen from the second)", _SIGN, conjugated=True)
+_BOTH = (Reading(f"{one.held}, and conjugated", f"{one.remedy} and {_SIGN}", one.order, True) for one in ORDERS)
+READINGS = (*ORDERS, INVERTED, *_BOTH)
 TRIPLES = {
     ("rx", "ry", "rz"): {"rad": "ur-rotvec"},
     ("a", "b", "c"): {"deg": "kuka-abc"},
@@ -262,15 +246,13 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
         words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
         matrices = of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where)
         return Turned(matrices, words, tuple(columns))
-    for unit in ANGLES:
-        columns = [f"{prefix}rotvec_{axis}_{unit}" for axis in "xyz"]
+    stated = [(ROTATION_VECTOR, "rotvec_{}", "xyz", unit) for unit in ANGLES]
+    stems = (column.removeprefix(prefix) for column in table.columns if column.startswith(prefix))
+    stated += [(found[1], f"euler_{found[1]}_{{}}", "123", found[2]) for s in stems if (found := _EULER.fullmatch(s))]
+    for order, name, axes, unit in stated:
+        columns = [f"{prefix}{name.format(axis)}_{unit}" for axis in axes]
         if (values := _all(table, columns)) is not None:
-            return Turned(*rotations(values, Convention(ROTATION_VECTOR, unit), places, where), tuple(columns))
-    for column in table.columns:
-        if column.startswith(prefix) and (euler := _EULER.fullmatch(column.removeprefix(prefix))):
-            columns = [f"{prefix}euler_{euler[1]}_{i}_{euler[2]}" for i in (1, 2, 3)]
-            if (values := _all(table, columns)) is not None:
-                return Turned(*rotations(values, Convention(euler[1], euler[2]), places, where), tuple(columns))
+            return Turned(*rotations(values, Convention(order, unit), places, where), tuple(columns))
     matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     if (values := _all(table, matrix)) is not None:
         return Turned(proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices", tuple(matrix))
@@ -279,12 +261,12 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
 
 def _all(table: Table, columns: list[str]) -> np.ndarray | None:
     """Return the values (m, k) of columns; None if all columns are missing, an error if only some are."""
-    present = [column for column in columns if column in table]
-    if not present:
+    missing = [column for column in columns if column not in table]
+    if len(missing) == len(columns):
         return None
-    if len(present) < len(columns):
-        missing = next(column for column in columns if column not in table)
-        without = f"{table.where}: {', '.join(present)} without {missing}; all {len(columns)} needed"
+    if missing:
+        present = ", ".join(column for column in columns if column in table)
+        without = f"{table.where}: {present} without {missing[0]}; all {len(columns)} needed"
         raise InputError("E-TABLE-COLUMN-MISSING", without)
     return np.column_stack([table.numbers(column) for column in columns])
 
@@ -297,10 +279,9 @@ def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | 
             if len(names) < len(wanted):
                 continue
             what = "".join(triple) if len(triple[0]) == 1 else ", ".join(triple)
-            if rotation is None and unit in stated:
-                convention = convention_of(stated[unit])
-            else:
-                convention = said_convention(rotation, what, table.where, len(triple))
+            by_names = rotation is None and unit in stated
+            said = stated[unit] if by_names else rotation
+            convention = said_convention(said, what, table.where, len(triple))
             says_unit = (rotation or "").endswith(tuple(f"-{name}" for name in ANGLES))  # a robot's name implies one
             if unit and says_unit and convention.unit not in ("", unit):
                 both = f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one"

@@ -116,11 +116,9 @@ class Table(ByValue):
         given = [unit for unit in units if f"{name}_{unit}" in self.columns]
         if len(given) != 1:
             wanted = " or ".join(f"{name}_{unit}" for unit in units)
-            finding = "no such column" if not given else f"{len(given)} of them"
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING",
-                f"{self.where}: {finding}, {wanted} needed; the header is {self.header()}{self.open_unit(name, units)}",
-            )
+            fault = f"{self.where}: {f'{len(given)} of them' if given else 'no such column'}, {wanted} needed"
+            header = f"the header is {self.header()}{self.open_unit(name, units)}"
+            raise InputError("E-TABLE-COLUMN-MISSING", f"{fault}; {header}")
         return given[0]
 
     def open_unit(self, name: str, units: dict[str, float]) -> str:
@@ -139,8 +137,8 @@ class Table(ByValue):
 
     def has_rotation(self, prefix: str = "") -> bool:
         """Return True if there are quaternions; raise an error if only some of their columns exist."""
-        present = [prefix + c for c in QUATERNION if prefix + c in self]
-        missing = [prefix + c for c in QUATERNION if prefix + c not in self]
+        names = [prefix + c for c in QUATERNION]
+        present, missing = ([name for name in names if (name in self) is there] for there in (True, False))
         if present and missing:
             both = f"{', '.join(present)} without {', '.join(missing)}"
             raise InputError("E-TABLE-COLUMN-MISSING", f"{self.where}: {both}; all four or none needed")
@@ -185,9 +183,8 @@ class Table(ByValue):
         if not count:
             return None
         if covariance is None:
-            raise InputError(
-                "E-TABLE-COVARIANCE", f"{self.where}: columns common1_… without cov_…, which include them; give both"
-            )
+            fault = f"{self.where}: columns common1_… without cov_…, which include them"
+            raise InputError("E-TABLE-COVARIANCE", f"{fault}; give both")
         names = [prefix + name for name in common_columns(count)]
         self._need_all(names, "columns common1_rx …")
         values = np.column_stack([self.numbers(name) for name in names])
@@ -248,9 +245,8 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
-        raise InputError(
-            "E-TABLE-HEADER", f"{where}: line {used[0][0]} is numbers, a header with units needed, like x_mm"
-        )
+        fault = f"{where}: line {used[0][0]} is numbers"
+        raise InputError("E-TABLE-HEADER", f"{fault}, a header with units needed, like x_mm")
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
@@ -279,11 +275,10 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     for line, row in zip(numbers, cells, strict=True):
         if len(row) != len(names):
             raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, the header has {len(names)}")
-    columns = {name: [row[k] for row in cells] for k, name in enumerate(names)}
-    if between == ",":
-        return Table(where, dict(columns), numbers, quaternions)
-    columns, commas = decimal_points(columns, between, where)
-    form = SEPARATORS[between] + (", decimal commas" if commas else "")
+    columns, form = {name: [row[k] for row in cells] for k, name in enumerate(names)}, ""
+    if between != ",":
+        columns, commas = decimal_points(columns, between, where)
+        form = SEPARATORS[between] + (", decimal commas" if commas else "")
     return Table(where, dict(columns), numbers, quaternions, form=form)
 
 
@@ -336,17 +331,16 @@ FORMULA = re.compile(r"'*[=+\-@\t\r]")
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Return CSV of rows; an apostrophe keeps a spreadsheet from running names that begin as formulas do."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([_shown(cell) for cell in row] for row in rows)
+    csv.writer(out, lineterminator="\n").writerows([_shown(str(cell)) for cell in row] for row in rows)
     return out.getvalue()
 
 
-def _shown(cell: object) -> str:
-    text = str(cell)
+def _shown(text: str) -> str:
     try:
         float(text)
+        return text
     except ValueError:
         return text if FORMULA.match(text) is None else "'" + text
-    return text
 
 
 def plain(cell: str) -> str:
@@ -421,8 +415,8 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
 def _separator(lines: Sequence[str]) -> str:
     """Return what separates the columns of a table, by its header; a comma where nothing does."""
     header = lines[0]
-    if separator_stated(header):
-        return separator_stated(header)
+    if stated := separator_stated(header):
+        return stated
     if ";" in header and header.count(";") >= header.count(","):
         return ";"
     if "," in header:
@@ -505,8 +499,5 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
     bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))
     if len(bad):
         suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        raise InputError(
-            "E-QUATERNION-LENGTH",
-            f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{suffix}; "
-            f"{remedy}",
-        )
+        fault = f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}"
+        raise InputError("E-QUATERNION-LENGTH", f"{fault}, 1 ± {UNIT_WITHIN:g} needed{suffix}; {remedy}")

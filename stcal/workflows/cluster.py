@@ -36,9 +36,8 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
                 yield
         except (CancelledError, KilledWorker, CommClosedError, ConnectionError) as error:
             lost = "its workers were" if isinstance(error, KilledWorker) else "the connection to it was"
-            raise DetectionError(
-                "E-WORKER-DIED", f"--scheduler {address}: {lost} lost; run the same command again"
-            ) from error
+            fault = f"--scheduler {address}: {lost} lost"
+            raise DetectionError("E-WORKER-DIED", f"{fault}; run the same command again") from error
 
 
 @contextlib.contextmanager
@@ -58,9 +57,8 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError(
-            "E-EXTRA-MISSING", "--scheduler: needs Dask; install stereo-target-calibration[dask]"
-        ) from error
+        missing = "--scheduler: needs Dask; install stereo-target-calibration[dask]"
+        raise InputError("E-EXTRA-MISSING", missing) from error
     for name in ("distributed", "distributed.client"):  # Dask logs each lost worker; a fault shows by its effect
         logging.getLogger(name).setLevel(logging.CRITICAL)
     _require_scheduler(address)
@@ -68,10 +66,8 @@ def _connected(address: str) -> Iterator[Any]:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except OSError as error:
-            raise InputError(
-                "E-CLUSTER-WORKERS",
-                f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`",
-            ) from error
+            none = f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
+            raise InputError("E-CLUSTER-WORKERS", none) from error
         _require_same(client.run(versions), address)  # type: ignore[arg-type]
         client.register_worker_callbacks(_limit_threads)
         yield client
@@ -87,17 +83,14 @@ def _require_scheduler(address: str) -> None:
             await peer.identity()
 
     if not ADDRESS.fullmatch(address):
-        raise InputError(
-            "E-OPTION-VALUE", f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786"
-        )
+        none = f"--scheduler {address}: no address of a scheduler; give one like tcp://host:8786"
+        raise InputError("E-OPTION-VALUE", none)
     try:
         asyncio.run(asyncio.wait_for(ask(), ANSWER_S))
     except Exception as error:  # a program that is not a scheduler may answer anything
-        raise InputError(
-            "E-CLUSTER-SCHEDULER",
-            f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
-            "give the address that it prints",
-        ) from error
+        none = f"--scheduler {address}: no scheduler answers within {ANSWER_S} s"
+        remedy = "start one with `dask scheduler`, and give the address that it prints"
+        raise InputError("E-CLUSTER-SCHEDULER", f"{none}; {remedy}") from error
 
 
 def versions() -> str:
@@ -114,11 +107,8 @@ def versions() -> str:
 def _require_same(found: dict[str, str], address: str) -> None:
     for worker, theirs in found.items():
         if theirs != versions():
-            raise InputError(
-                "E-CLUSTER-VERSIONS",
-                f"--scheduler {address}: worker {worker} has {theirs}, here {versions()}; results would differ; "
-                "install the same versions",
-            )
+            differ = f"worker {worker} has {theirs}, here {versions()}; results would differ"
+            raise InputError("E-CLUSTER-VERSIONS", f"--scheduler {address}: {differ}; install the same versions")
 
 
 def _limit_threads() -> None:

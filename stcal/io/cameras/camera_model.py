@@ -77,11 +77,9 @@ class CameraModel(ByValue):
         """Refuse an image without the principal point: a file that states no size may belong to another camera."""
         x, y = self.centre
         if self.source != OF_IMAGES and not (0 < x < width and 0 < y < height):
-            raise InputError(
-                "E-CAMERA-CENTRE",
-                f"camera file {self.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {image} "
-                f"({width}×{height} px); use the camera file that belongs to the images",
-            )
+            where = f"principal point ({x:.0f}, {y:.0f}) px is outside of {image} ({width}×{height} px)"
+            remedy = "use the camera file that belongs to the images"
+            raise InputError("E-CAMERA-CENTRE", f"camera file {self.source}: {where}; {remedy}")
 
 
 def model_of(camera: Camera, source: str = "camera") -> CameraModel:
@@ -202,11 +200,9 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraMo
         fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
         raise InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
-        raise InputError(
-            "E-CAMERA-CENTRE",
-            f"principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×"
-            f"{height:g} px; pixels from the image's corner needed; check that they are not from its middle",
-        )
+        fault = f"principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×{height:g} px"
+        remedy = "pixels from the image's corner needed; check that they are not from its middle"
+        raise InputError("E-CAMERA-CENTRE", f"{fault}; {remedy}")
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, "")
 
@@ -219,9 +215,8 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
             raise InputError("E-CAMERA-MODEL", f"model {colmap_model} is not supported; use one of {known}")
         layout = COLMAP_LAYOUT[colmap_model]
         if len(params) != len(layout):
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters of {colmap_model}, {len(layout)} needed"
-            )
+            fault = f"{len(params)} parameters of {colmap_model}"
+            raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}, {len(layout)} needed")
         flat = np.zeros(len(PARAMETER_NAMES))
         for place, value in zip(layout, params, strict=True):
             flat[list(place) if isinstance(place, tuple) else place] = value

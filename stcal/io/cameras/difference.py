@@ -91,9 +91,8 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     first, second = (each.rays(flat) if isinstance(each, SizedLens) else rays(each, flat) for each in (one, two))
     good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
     if good.sum() < LEAST_POINTS:
-        raise DegenerateError(
-            "E-CAMERA-NO-RAYS", f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed"
-        )
+        fault = f"{good.sum()} of {len(flat)} pixels have a ray in both cameras"
+        raise DegenerateError("E-CAMERA-NO-RAYS", f"{fault}, {LEAST_POINTS} needed")
     unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
     near = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
 
@@ -219,15 +218,13 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
 def _best(
     lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
 ) -> FittedLens:
-    best = None
+    fits = []
     for model in CANDIDATES:
         camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)
         off = np.linalg.norm(camera.project(camera_from_lens @ rays) - pixels, axis=1)
-        if best is None or not off.max() > best.most_px - AS_GOOD_PX:
-            rms = float(np.sqrt((off**2).mean()))
-            best = FittedLens(camera, rms, float(off.max()), share, camera_from_lens)
-    assert best is not None
-    return best
+        if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
+            fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, camera_from_lens))
+    return fits[-1]
 
 
 def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, float]:

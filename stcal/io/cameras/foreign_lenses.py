@@ -2,10 +2,11 @@
 
 import re
 import sqlite3
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,18 +117,16 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
                 raise sqlite3.DatabaseError("no such table: cameras")
             rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
         cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
-        model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice))]
+        model, width, height, params = chosen_of_colmap(cameras, choice)
         return of_colmap(model, width, height, np.frombuffer(params, "<f8"))
     except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
         with open(path, "rb") as stream:
             head = stream.read(20)
         if isinstance(error, sqlite3.Error) and head[18:] == WRITE_AHEAD and not _has_log(path):
-            raise InputError(
-                "E-CAMERA-UNREADABLE",
-                f"a database whose newest content is in {path.name}-wal, which is missing or empty "
-                f"({reason}); copy both, or close the program that has it open and copy again",
-            ) from error
+            fault = f"a database whose newest content is in {path.name}-wal, which is missing or empty ({reason})"
+            remedy = "copy both, or close the program that has it open and copy again"
+            raise InputError("E-CAMERA-UNREADABLE", f"{fault}; {remedy}") from error
         raise InputError("E-CAMERA-UNREADABLE", f"no database of COLMAP ({reason}); check it") from error
 
 
@@ -141,9 +140,9 @@ def _has_log(path: Path) -> bool:
     return log.is_file() and log.stat().st_size > 0
 
 
-def numbered(cameras: Collection[str], choice: str) -> str:
-    """Return the choice among numbered cameras; of a single one, a word is the name to write, and chooses nothing."""
-    return choice if choice.isdigit() or len(cameras) > 1 else ""
+def chosen_of_colmap(cameras: Mapping[str, Any], choice: str) -> Any:
+    """Return a numbered camera's values; of a single one, a word is the name to write, and chooses nothing."""
+    return cameras[one_of(list(cameras), choice if choice.isdigit() or len(cameras) > 1 else "")]
 
 
 def one_of(names: list[str], choice: str) -> str:

@@ -61,8 +61,7 @@ def _xml_values(root: ElementTree.Element) -> dict:
     for node in root:
         if node.tag in values:
             raise ValueError(f"the key {node.tag[:40]} twice")
-        data = node.find("data")
-        if data is not None:
+        if (data := node.find("data")) is not None:
             values[node.tag] = [float(word) for word in (data.text or "").split()]
         else:
             values[node.tag] = _xml_values(node) if len(node) else (node.text or "").strip().strip('"')
@@ -120,10 +119,8 @@ def from_keys(values: dict, choice: str) -> Lens:
         if cameras := cameras_of(values):
             names = list(cameras)
             return read(Keys(dict(cameras["" if names == [""] else one_of(names, choice)])))
-    raise InputError(
-        "E-CAMERA-CONTENT",
-        f"no camera of {READ}; convert it there, or write camera_matrix and distortion_coefficients as OpenCV has them",
-    )
+    remedy = "convert it there, or write camera_matrix and distortion_coefficients as OpenCV has them"
+    raise InputError("E-CAMERA-CONTENT", f"no camera of {READ}; {remedy}")
 
 
 def from_ini(text: str, choice: str) -> Lens:
@@ -202,11 +199,9 @@ def _require_whole_image(keys: Keys, width: float, height: float) -> None:
     whole = {"binning_x": 1, "binning_y": 1, "roi.width": width, "roi.height": height}
     for key, value in stated.items():
         if not is_neutral(value) and value != whole.get(key):
-            raise InputError(
-                "E-CAMERA-KEY",
-                f"{key} = {value}, so that K is for a larger image of which yours is a part; set it to 0 if your "
-                "images have the file's full size, else calibrate at their size",
-            )
+            fault = f"{key} = {value}, so that K is for a larger image of which yours is a part"
+            remedy = "set it to 0 if your images have the file's full size, else calibrate at their size"
+            raise InputError("E-CAMERA-KEY", f"{fault}; {remedy}")
 
 
 def _lens_of(matrix: np.ndarray | None) -> tuple[list[float], float]:
@@ -215,18 +210,13 @@ def _lens_of(matrix: np.ndarray | None) -> tuple[list[float], float]:
         raise InputError("E-CAMERA-COEFFICIENTS", f"camera_matrix of {count} numbers; 3×3 needed")
     matrix = matrix.reshape(3, 3)
     if not matrix.any():
-        raise InputError(
-            "E-CAMERA-UNCALIBRATED",
-            "camera_matrix is all zero, as published by a driver for an uncalibrated camera; calibrate it with "
-            "`stcal-sfm calibrate-camera`, or load its calibration into the driver",
-        )
+        fault = "camera_matrix is all zero, as published by a driver for an uncalibrated camera"
+        remedy = "calibrate it with `stcal-sfm calibrate-camera`, or load its calibration into the driver"
+        raise InputError("E-CAMERA-UNCALIBRATED", f"{fault}; {remedy}")
     if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
         turned = (matrix.T[[1, 2, 2, 2], [0, 0, 1, 2]] == [0, 0, 0, 1]).all()
-        raise InputError(
-            "E-CAMERA-MATRIX",
-            "camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; "
-            + ("it is transposed: write it row by row" if turned else "write it row by row, with 0 0 1 last"),
-        )
+        order = "it is transposed: write it row by row" if turned else "write it row by row, with 0 0 1 last"
+        raise InputError("E-CAMERA-MATRIX", f"camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; {order}")
     if np.isnan(matrix[0, 1]):
         raise InputError("E-CAMERA-SKEW", "skew nan; a finite number needed")
     return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float(matrix[0, 1])
@@ -236,12 +226,10 @@ def _say_no_model(given: np.ndarray) -> None:
     """Name four coefficients without a model, as OpenCV's fisheye has; refuse those that must be a fisheye's."""
     model = "distortion_model: equidistant"
     if np.abs(given[2:]).max() > MOST_TANGENTIAL:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"4 coefficients D without a lens model: for a perspective lens, the tangential ones {given[2]:g} and "
-            f"{given[3]:g} are larger than {MOST_TANGENTIAL:g}; add {model} if the lens is OpenCV's fisheye, else "
-            "distortion_model: plumb_bob",
-        )
+        large = f"the tangential ones {given[2]:g} and {given[3]:g} are larger than {MOST_TANGENTIAL:g}"
+        remedy = f"add {model} if the lens is OpenCV's fisheye, else distortion_model: plumb_bob"
+        fault = f"4 coefficients D without a lens model: for a perspective lens, {large}"
+        raise InputError("E-CAMERA-MODEL", f"{fault}; {remedy}")
     if given.any():
         note(f"4 coefficients without a model, taken as k1, k2, p1, p2; of OpenCV's fisheye, add {model}")
 
@@ -250,11 +238,9 @@ def _require_order(lens: list[float], width: float, height: float) -> None:
     size = np.array([width, height])
     near = [(np.abs(np.array(lens[2:]) - each / 2) < NEAR * each).all() for each in (size, size[::-1])]
     if not near[0] and near[1]:
-        raise InputError(
-            "E-CAMERA-SIZE",
-            f"size {width:g}×{height:g} px, but the principal point ({lens[2]:g}, {lens[3]:g}) px is near the middle "
-            "of the sides exchanged; width first needed",
-        )
+        place = f"({lens[2]:g}, {lens[3]:g}) px is near the middle of the sides exchanged"
+        fault = f"size {width:g}×{height:g} px, but the principal point {place}"
+        raise InputError("E-CAMERA-SIZE", f"{fault}; width first needed")
 
 
 def _of_kalibr(keys: Keys) -> Lens:
@@ -266,11 +252,8 @@ def _of_kalibr(keys: Keys) -> Lens:
     kind = LENSES.get(word, word)
     distortion = "radtan" if kind == "perspective" else kind
     if lens not in ("pinhole", "omni", "eucm", "ds") or distortion not in ("radtan", "equidistant", "fov", "none"):
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"{lens[:40]} with {distortion[:40]}; pinhole, omni, eucm, ds with radtan, equidistant, fov or none are "
-            "read",
-        )
+        known = "pinhole, omni, eucm, ds with radtan, equidistant, fov or none are read"
+        raise InputError("E-CAMERA-MODEL", f"{lens[:40]} with {distortion[:40]}; {known}")
     assert numbers is not None  # by which the format is recognised
     given = np.zeros(0) if given is None else given
     if lens != "pinhole" or distortion == "fov":
@@ -341,18 +324,16 @@ def _kalibr_cameras(values: dict) -> dict[str, dict]:
     return {key: shared | value for key, value in values.items() if _has_intrinsics(value)}
 
 
-def _if(test: Callable[[dict], bool]) -> Callable[[dict], dict[str, dict]]:
-    return lambda values: {"": values} if test(values) else {}
+def _industrial_camera(values: dict) -> dict[str, dict]:
+    intrinsics = values.get("intrinsics")
+    return {"": values} if isinstance(intrinsics, Mapping) and "fx" in intrinsics else {}
 
 
 FORMATS: tuple[tuple[Callable[[dict], dict[str, dict]], Callable[[Keys], Lens]], ...] = (
-    (_if(lambda values: not values.keys().isdisjoint(MARKS)), lambda keys: from_structure(keys.left)),
-    (_if(lambda values: "model_type" in values), _of_camodocal),
+    (lambda values: {} if values.keys().isdisjoint(MARKS) else {"": values}, lambda keys: from_structure(keys.left)),
+    (lambda values: {"": values} if "model_type" in values else {}, _of_camodocal),
     (_kalibr_cameras, _of_kalibr),
-    (
-        _if(lambda values: isinstance(values.get("intrinsics"), Mapping) and "fx" in values["intrinsics"]),
-        _of_industrial,
-    ),
+    (_industrial_camera, _of_industrial),
     (_matrix_cameras, of_matrix),
 )
 """For each format a function that finds its cameras by name, a single one without a name, and the reader of one."""

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -106,9 +107,13 @@ def may_be_coefficients(value: object) -> bool:
 def numbers_of(value: object) -> np.ndarray:
     """Return the numbers of a list or of a text of them, flat; empty if it is neither."""
     try:
-        return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
+        return _flat(value)
     except (TypeError, ValueError):
         return np.zeros(0)
+
+
+def _flat(value: Any) -> np.ndarray:
+    return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
 
 
 def is_neutral(value: object) -> bool:
@@ -138,7 +143,7 @@ def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: 
     ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it."""
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
-    pass_over(_with_numbers(unread))
+    pass_over([".".join(keys) for keys, value in leaves(unread) if _says_numbers(value)])
     for keys, value in leaves(unread):
         path = [part for key in keys for part in key.split(".")]
         names = [*map(plain, path), plain("".join(path))]
@@ -156,25 +161,19 @@ def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: 
             taken = "call it distortion_coefficients if it is OpenCV's k1, k2, p1, p2, k3 …; " if coefficients else ""
             text = " ".join(str(value).split())
             shown = text if len(text) <= 40 else f"{text[:40]} …"
-            raise InputError(
-                "E-CAMERA-KEY",
-                f"{'.'.join(path)[:80]} = {shown} may change the projection and is not "
-                f"supported; {taken}remove it if the lens is right without it, or calibrate without it",
-            )
+            fault = f"{'.'.join(path)[:80]} = {shown} may change the projection and is not supported"
+            remedy = f"{taken}remove it if the lens is right without it, or calibrate without it"
+            raise InputError("E-CAMERA-KEY", f"{fault}; {remedy}")
     if unknown:
         note(f"not known, and passed over: {_first(unknown)}")
 
 
-def _with_numbers(unread: Mapping) -> list[str]:
-    """Return the names of the keys that hold numbers, such as poses and σ; without zeros and identity matrices."""
-    named = []
-    for keys, value in leaves(unread):
-        numbers = numbers_of(value)
-        is_identity = numbers.size == 9 and (numbers == np.eye(3).ravel()).all()
-        is_nested = isinstance(value, list) and any(isinstance(each, dict | list) for each in value)
-        if not isinstance(value, str | bool) and (numbers.any() if numbers.size else is_nested) and not is_identity:
-            named.append(".".join(keys))
-    return named
+def _says_numbers(value: object) -> bool:
+    """Return True for numbers, such as poses and σ, but not for zeros and identity matrices."""
+    numbers = numbers_of(value)
+    is_identity = numbers.size == 9 and (numbers == np.eye(3).ravel()).all()
+    is_nested = isinstance(value, list) and any(isinstance(each, dict | list) for each in value)
+    return not isinstance(value, str | bool) and bool(numbers.any() if numbers.size else is_nested) and not is_identity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +202,7 @@ class Keys:
         value = self.take(*names)
         if isinstance(value, bool):
             raise InputError("E-CAMERA-CONTENT", f"{names[0]} is {value}; numbers needed")
-        return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
+        return _flat(value)
 
     def number(self, name: str, default: float | None = None) -> float:
         """Return one number; ``default`` where there is no such key."""

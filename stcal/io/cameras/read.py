@@ -26,7 +26,7 @@ from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
 from stcal.io.cameras import foreign_lenses as foreign
 from stcal.io.cameras import matlab, metashape
 from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv, cameras_txt, model_of, stated_covariance
-from stcal.io.cameras.foreign_lenses import ForeignLens, numbered, of_colmap, of_database, one_of
+from stcal.io.cameras.foreign_lenses import ForeignLens, chosen_of_colmap, of_colmap, of_database
 from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
 from stcal.io.cameras.keys import pass_over, reading, require_known
 from stcal.io.cameras.matlab import mat
@@ -66,62 +66,56 @@ def is_photograph(path: str | Path) -> bool:
 
 def camera_of_photograph(path: str | Path) -> Photograph:
     """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes."""
+    where = f"camera file {path}"
     try:
         data = read_bytes(path, IMAGE_BYTES)
         if is_heic(data):
-            let_pillow_read_heic(f"camera file {path}")
+            let_pillow_read_heic(where)
         with Image.open(BytesIO(data)) as image:
             (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
         if is_heic(data) and heic_turns(data) % 2:
             width, height = height, width
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         reason = " ".join(str(error).split())[:100]
-        fault = f"camera file {path}: no photograph that can be read ({reason})"
+        fault = f"{where}: no photograph that can be read ({reason})"
         raise InputError("E-CAMERA-UNREADABLE", f"{fault}; give another") from error
-    focal, source = _focal_px(exif, width, height)
+    focal, told = _focal_px(exif, width, height)
     if focal is None:
-        focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
-        what = f"{focal_mm:g} mm, but no size of its pixels" if focal_mm else "no focal length"
-        fault = f"camera file {path}: a photograph whose EXIF states {what}"
-        raise InputError("E-CAMERA-EXIF", f"{fault}; give a camera file, or `stcal-sfm calibrate-camera`")
-    zoom = _positive(exif.get(ExifTags.Base.DigitalZoomRatio)) or 1.0
-    if zoom != 1:
-        raise InputError(
-            "E-CAMERA-EXIF",
-            f"camera file {path}: a photograph with a digital zoom of {zoom:g}; makers differ in whether the focal "
-            f"length includes it, so that it is {focal:.0f} or {zoom * focal:.0f} px; take one without zoom",
-        )
+        none = f"{where}: a photograph whose EXIF states {told}"
+        raise InputError("E-CAMERA-EXIF", f"{none}; give a camera file, or `stcal-sfm calibrate-camera`")
+    if (zoom := _positive(exif, "DigitalZoomRatio") or 1.0) != 1:
+        zoomed = f"{where}: a photograph with a digital zoom of {zoom:g}; makers differ in whether the focal length"
+        either = f"includes it, so that it is {focal:.0f} or {zoom * focal:.0f} px"
+        raise InputError("E-CAMERA-EXIF", f"{zoomed} {either}; take one without zoom")
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
-        source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
+        told += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
     centre = [(width - 1) / 2, (height - 1) / 2]
     camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height).sized(width, height)
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
-    return Photograph(Camera.of(camera, "OPENCV", covariance), source)
+    return Photograph(Camera.of(camera, "OPENCV", covariance), told)
 
 
 def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
-    """Return the focal length in px of this image, None if unknown, and the EXIF entries used, in words."""
-    full = _positive(exif.get(ExifTags.Base.ExifImageWidth)) or max(width, height)
-    scale = max(width, height) / max(full, _positive(exif.get(ExifTags.Base.ExifImageHeight)) or 0)
-    focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
-    per_unit = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
+    """Return the focal length in px of this image, None if unknown, and in words the entries used, or the fault."""
+    full = _positive(exif, "ExifImageWidth") or max(width, height)
+    scale = max(width, height) / max(full, _positive(exif, "ExifImageHeight") or 0)
+    focal_mm, per_unit = _positive(exif, "FocalLength"), _positive(exif, "FocalPlaneXResolution")
     unit_mm = UNIT_MM.get(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and per_unit and unit_mm:
         pitch_um = 1e3 * unit_mm / per_unit / scale
         sensor = "×".join(f"{1e-3 * pitch_um * side:.3g}" for side in (width, height))
         told = f"focal length {focal_mm:g} mm, pixels of {pitch_um:.3g} µm, so a sensor of {sensor} mm (check it)"
         return focal_mm / pitch_um * 1e3, told
-    film_mm = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    if film_mm:
+    if film_mm := _positive(exif, "FocalLengthIn35mmFilm"):
         return film_mm / FILM_DIAGONAL_MM * float(np.hypot(width, height)), f"{film_mm:g} mm in 35 mm film"
-    return None, ""
+    return None, f"{focal_mm:g} mm, but no size of its pixels" if focal_mm else "no focal length"
 
 
-def _positive(value) -> float | None:
+def _positive(exif: dict, name: str) -> float | None:
     try:
-        number = float(value)
+        number = float(exif.get(ExifTags.Base[name], np.nan))
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return number if 0 < number < np.inf else None
@@ -157,12 +151,7 @@ class Written:
     lost: tuple[str, ...]
 
 
-def is_mrcal(text: str) -> bool:
-    """Return True if a text has the keys of a ``.cameramodel``; PhotonVision names mrcal's lens models, too."""
-    return "lensmodel" in text and "imagersize" in text
-
-
-def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
+def from_mrcal(text: str, _: str) -> CameraModel | ForeignLens:
     """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined."""
     try:
         values = ast.literal_eval(text.strip())
@@ -171,7 +160,13 @@ def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
     except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
         reason = " ".join(str(error).split())[:100]
         raise InputError("E-CAMERA-UNREADABLE", f"not mrcal's form ({reason}); write it anew with mrcal") from error
-    region = _region(values.get("valid_intrinsics_region"))
+    stated = values.get("valid_intrinsics_region")
+    try:
+        region = None if stated is None or not np.size(stated) else np.array(stated, float)
+    except (TypeError, ValueError):
+        region = np.full(1, np.nan)  # refused below
+    if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
+        raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
     taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
     require_known({key: value for key, value in values.items() if key not in taken}, MRCAL_HARMLESS)
     if str(lens).startswith("LENSMODEL_SPLINED"):
@@ -181,25 +176,12 @@ def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
     elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
         made = foreign.of_opencv(numbers[:4], np.array(numbers[4:]), width, height)
     else:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"{lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
-            "ones are read: mrcal-convert-lensmodel makes one of another",
-        )
-    if isinstance(made, foreign.ForeignLens):
+        known = f"{', '.join(MRCAL)}, CAHVOR and splined ones are read: mrcal-convert-lensmodel makes one of another"
+        raise InputError("E-CAMERA-MODEL", f"{lens} with {len(numbers)} intrinsics; {known}")
+    if isinstance(made, ForeignLens):
         return replace(made, region=region)
     pass_over([] if region is None else ["valid_intrinsics_region"])
     return made
-
-
-def _region(stated: object) -> np.ndarray | None:
-    try:
-        region = np.array([] if stated is None else stated, float)
-    except (TypeError, ValueError):
-        region = np.full(1, np.nan)  # refused below
-    if region.size and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
-        raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
-    return region if region.size else None
 
 
 def is_colmap_binary(content: bytes) -> bool:
@@ -208,7 +190,7 @@ def is_colmap_binary(content: bytes) -> bool:
     return len(content) >= 8 and count <= (len(content) - 8) // LEAST_CAMERA_BYTES
 
 
-def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.ForeignLens:
+def from_colmap_binary(content: bytes, choice: str) -> CameraModel | ForeignLens:
     """Return the camera of ``cameras.bin``, or the one of number ``choice``."""
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
@@ -223,8 +205,7 @@ def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.For
         raise InputError("E-CAMERA-UNREADABLE", "neither text nor a cameras.bin of known models; check it") from error
     if at != len(content) or not cameras:
         raise InputError("E-CAMERA-UNREADABLE", "neither text nor COLMAP's cameras.bin; check it")
-    model, width, height, params = cameras[foreign.one_of(list(cameras), foreign.numbered(cameras, choice))]
-    return foreign.of_colmap(model, width, height, params)
+    return of_colmap(*chosen_of_colmap(cameras, choice))
 
 
 def name_to_write(name: str) -> str:
@@ -292,16 +273,14 @@ def _ros(camera: Camera, name: str) -> str:
 
 
 def _kalibr(camera: Camera, name: str) -> str:
-    if camera.fisheye:
-        kind, values = "equidistant", _fisheye_four(camera, "kalibr")
-    else:
-        kind, values = "radtan", camera.distortion[:4].tolist()
-        if camera.distortion[4:].any():
-            raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
+    if not camera.fisheye and camera.distortion[4:].any():
+        raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
+    kind = "equidistant" if camera.fisheye else "radtan"
+    values = _fisheye_four(camera, "kalibr") if camera.fisheye else camera.distortion[:4].tolist()
     return (
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {camera.parameters()[:4].tolist()}\n"
-        f"  distortion_model: {kind}\n"
-        f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
+        f"  distortion_model: {kind}\n  distortion_coeffs: {values}\n"
+        f"  resolution: [{camera.width}, {camera.height}]\n"
     )
 
 
@@ -356,11 +335,8 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
 
 def unsupported(lens: ForeignLens, path: str | Path) -> InputError:
     """Return the error of a lens whose model is not supported."""
-    return InputError(
-        "E-CAMERA-MODEL",
-        f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}; fit one of them to it with "
-        "`stcal camera convert`",
-    )
+    none = f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}"
+    return InputError("E-CAMERA-MODEL", f"{none}; fit one of them to it with `stcal camera convert`")
 
 
 def camera_model(camera: str | Path | Camera | CameraModel) -> CameraModel:
@@ -404,7 +380,7 @@ def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
     cameras = {row[0]: row[1:] for row in rows}
     if len(cameras) < len(rows):
         raise InputError("E-CAMERA-REPEATED", "two cameras of one number; correct it")
-    model, *values = cameras[one_of(list(cameras), numbered(cameras, name))]
+    model, *values = chosen_of_colmap(cameras, name)
     try:
         width, height, *params = (float(value) for value in values)
     except ValueError as error:
@@ -457,7 +433,7 @@ BINARY_FORMATS = (
 TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraModel | ForeignLens]], ...] = (
     (lambda text: COLMAP_LINE.search(text) is not None, _from_colmap),
     (metashape.is_metashape, metashape.from_metashape),
-    (is_mrcal, from_mrcal),
+    (lambda text: "lensmodel" in text and "imagersize" in text, from_mrcal),  # PhotonVision has the former, too
     (matlab.is_script, matlab.from_script),
     (is_ini, from_ini),
     (lambda text: True, lambda text, name: from_keys(values_of(text), name)),
@@ -498,11 +474,8 @@ def form_of(path: str | Path, form: str | None) -> CameraForm:
     kind = SUFFIXES.get(suffix) if form is None else form
     if kind not in WRITERS:
         unknown = f"form {form} unknown" if form else f"no form of suffix {suffix or 'none'}"
-        raise InputError(
-            "E-OPTION-FORM",
-            f"{path}: {unknown}; give the form (--form), one of {', '.join(WRITERS)}, or one of the suffixes "
-            f"{', '.join(SUFFIXES)}",
-        )
+        known = f"the form (--form), one of {', '.join(WRITERS)}, or one of the suffixes {', '.join(SUFFIXES)}"
+        raise InputError("E-OPTION-FORM", f"{path}: {unknown}; give {known}")
     return cast(CameraForm, kind)
 
 
