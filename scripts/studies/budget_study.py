@@ -204,11 +204,11 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
     stated, inputs = stated_by(case), list(single_inputs(1, count))
     rows = list(pool(errors, [case] * count, [stated] * count, [which] * count, inputs, range(count)))
     shares, inside = [], []
-    for k, row in enumerate(stated.budget.rows):
+    for k, own in enumerate(stated.budget.rows):
         length = np.array([np.linalg.norm(each[k]) for each in rows])
-        predicted = row.standard if which == ALL else row.contributions[which]
-        inside.append((length <= row.expanded).mean())
-        if predicted > LEAST * row.standard:
+        predicted = own.standard if which == ALL else own.contributions[which]
+        inside.append((length <= own.expanded).mean())
+        if predicted > LEAST * own.standard:
             shares.append((length**2).mean() / predicted**2)
     expected = np.mean([row.coverage for row in stated.budget.rows])
     single = 1 / np.sqrt(shares)
