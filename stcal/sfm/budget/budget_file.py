@@ -578,6 +578,6 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
         *(note for note, applies in told.items() if applies),
         *_unusual(statement),
         *verified.notes(),
-        "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
-        "the frame is in the poses of the other faces",
+        f"face {budget.reference_face} defines the target frame, which is exact; errors of its own points are in the "
+        "poses of the other faces",
     ]

@@ -23,6 +23,10 @@ NEARLY_ALL = 0.9  # share of the board that ends the search for a larger grid
 MIN_SIDE = 3  # smallest number of rows and columns
 CORNER_MARGIN = 0.4
 """A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
+PITCHES = 2.2, 3.1, 4.3, 6.0, 8.4
+"""Pitches in radii that are tried where a board is not found; each stands for those within the tolerance of a step."""
+MOST_OF_IT = 0.8
+"""Smallest share of a board's dots by which another pitch than stated is believed."""
 MAX_UNEXPLAINED = 2
 """Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
@@ -53,6 +57,23 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
             free[reading.rows] = False
             readings.append(reading)
     return sorted(readings, key=lambda r: -len(r.rows))
+
+
+def as_stated(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> str:
+    """Returns a note if there is a grid of the board's dots with another ratio of pitch and radius; else nothing."""
+    for ratio in PITCHES:
+        other = replace(board, radius_mm=board.pitch_mm / ratio, corner=None, rings=())
+        for found in find_boards(candidates, other, image_corners)[:1]:
+            if len(found.rows) >= MOST_OF_IT * len(board.cells()):
+                cells = board.flat(found.numberings[0][:, ::-1].astype(float))
+                slope = homography_jacobian(fit_homography(cells, candidates.xy[found.rows]), cells)
+                radii = singular_values(np.linalg.solve(slope, candidates.shape[found.rows]))
+                measured, stated = 1 / float(np.median(radii)), board.pitch_mm / board.radius_mm
+                return (
+                    f"a grid of the board's dots is there, its pitch {measured:.2f} times their radius, in the board "
+                    f"file {stated:.2f} times: correct pitch_mm or radius_mm"
+                )
+    return ""
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:

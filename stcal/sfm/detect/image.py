@@ -24,7 +24,7 @@ from stcal.sfm.detect.candidates import (
     find_ellipses,
 )
 from stcal.sfm.detect.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.dot_grid import by_rings, find_boards
+from stcal.sfm.detect.dot_grid import as_stated, by_rings, find_boards
 from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
@@ -43,6 +43,7 @@ class ImageReading:
     faces: FaceFinding
     mirrored: tuple[str, ...]  # ids of faces
     untried: int = 0  # number of outlines beyond ``MAX_FREE``
+    misstated: str = ""  # what of the board's file its dots contradict
 
     def face_ids(self) -> set[str]:
         """Returns the ids of the named faces."""
@@ -77,18 +78,20 @@ def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
             inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
             outlines[polarity] = found.select(~np.array(inside, bool))
     boards: list[BoardSighting] = []
+    misstated = ""
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
         dots = Candidates.of(outlines[board.polarity], camera)
         for found in find_boards(dots, board, image_corners(camera)):
             boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
             free[board.polarity][found.rows] = False
+        misstated = "" if boards else as_stated(dots, board, image_corners(camera))
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
     faces = finder.find(candidates)
     mirrored = finder.find_mirrored(candidates, faces.faces)
-    return ImageReading(outlines, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
+    return ImageReading(outlines, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses), misstated)
 
 
 def detect_target(
@@ -173,7 +176,7 @@ def _detect_circles(
     for grid in reading.boards if dots else ():
         patterns.append((of_board, reading.found[of_board], grid.rows, [DOT] * len(grid.rows), (grid,)))
     measured = _measured(grey_fine(image), camera, patterns, reading.found)
-    notes: list[str] = []
+    notes = [reading.misstated] if reading.misstated else []
     if reading.untried:
         every, tried = len(free) + reading.untried, f"the {len(free)} largest were tried for faces"
         remedy = "keep fine patterns out of view, or raise --min-diameter"
