@@ -71,9 +71,9 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None
             continue
         if (turned := read_rotations(table, prefix, statements.rotation)) is None:
             continue
-        covariance, poses = table.pose_covariances(prefix), Poses(turned.rotation, place[0])
-        read = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
-        sides.append(PoseSide(poses, places_of(table), turned.words, place[1], frames, names, **read))
+        covariance, (at, unit) = table.pose_covariances(prefix), place
+        common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
+        sides.append(PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common))
     if not sides:
         return None
     known = [side.frames for side in sides if side.frames is not None]
