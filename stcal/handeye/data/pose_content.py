@@ -252,12 +252,13 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
         content = _of_pairs(value, form, where)
     if content is None and (side := _side_of(value, where)) is not None:
         return PoseContent(form, (side,))
-    holder = value if content is None and isinstance(value, Mapping) else {}
+    if content is not None or not isinstance(value, Mapping):
+        return content
     for key in HOLDERS:
-        if (held := read_tree(holder.get(key), form, statements, where)) is not None:
-            others = tuple(str(unused_key) for unused_key in holder if unused_key != key)
-            return replace(held, passed_over=(*held.passed_over, *others))
-    return content
+        if (content := read_tree(value.get(key), form, statements, where)) is not None:
+            others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+            return replace(content, passed_over=(*content.passed_over, *others))
+    return None
 
 
 def numbers(value: Any) -> np.ndarray | None:
