@@ -57,19 +57,6 @@ def test_clocks_that_agree_are_not_blamed(seed):
     assert lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1] == ()
 
 
-def stale(pairs: HandEyePoses, rows: slice) -> HandEyePoses:
-    """The flange's pose of the first of these rows in all of them."""
-    rotation, place = np.array(pairs.base_from_flange.rotation), np.array(pairs.base_from_flange.translation)
-    rotation[rows], place[rows] = rotation[rows][0], place[rows][0]
-    return replace(pairs, base_from_flange=Poses(rotation, place))
-
-
-def test_poses_of_the_flange_that_were_not_read_anew_are_refused():
-    pairs = stale(given_of(20, 0.0).pairs, slice(6, 12))
-    with fails_with("E-POSES-IDENTICAL … pose 7, pose 8, pose 9 … 6 rows"):
-        handeye(pairs)
-
-
 def drawn(count: int) -> HandEyePoses:
     return simulated(np.random.default_rng(5), count, robot=(3e-4, 0.1), camera=(4e-4, 0.15)).pairs
 

@@ -145,13 +145,9 @@ ROBOT_MISTAKES = {
     "w x y z": (rolled(3, 0, 1, 2), "the robot's quaternions in another order … --rotation robot=wxyz"),
     "conjugated": (INVERTED.poses, "the robot's quaternions conjugated … sign of qw"),
     "left-handed in x": (left_handed(0), ""),
-    "left-handed in y": (left_handed(1), ""),
-    "left-handed in z": (left_handed(2), ""),
     "x, -y, z": (places(lambda xyz: xyz * [1, -1, 1]), "x, y, z of the robot … taken as x, −y, z"),
-    "y, x, z": (places(lambda xyz: xyz[:, [1, 0, 2]]), "x, y, z of the robot … as y, x, z"),
     "no such places": (WILD, "positions … rotations agree … columns of positions"),
     "ZYX": (read_as("xyz", "ZYX"), "--rotation robot=ZYX-deg (or -rad) if they were read as xyz"),
-    "XYZ": (read_as("xyz", "XYZ"), "--rotation robot=XYZ-deg (or -rad) if they were read as xyz"),
     "zyx": (read_as("XYZ", "zyx"), "--rotation robot=zyx-deg (or -rad) if they were read as XYZ"),
     "other rows": (lambda poses: poses[np.roll(np.arange(len(poses)), 5)], "spread over … pair each pose"),
 }
@@ -161,7 +157,6 @@ BOARD_MISTAKES = {
     "micrometres": (times(1e3), "the board's lengths divided by 1000 … unit camera=mm"),
     "radians": (RADIANS, "angles of the board are radians"),
     "x y z w": (XYZW, "the board's quaternions in another order … name the columns so"),
-    "conjugated": (INVERTED.poses, "the board's quaternions conjugated … sign of qw"),
     "left-handed": (left_handed(0), ""),
 }
 BOTH_MISTAKEN = {

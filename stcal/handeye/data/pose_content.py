@@ -252,11 +252,13 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
         content = _of_pairs(value, form, where)
     if content is None and (side := _side_of(value, where)) is not None:
         return PoseContent(form, (side,))
-    for key in HOLDERS if content is None and isinstance(value, Mapping) else ():
-        if (held := read_tree(value.get(key), form, statements, where)) is not None:
+    if content is not None or not isinstance(value, Mapping):
+        return content
+    for key in HOLDERS:
+        if (content := read_tree(value.get(key), form, statements, where)) is not None:
             others = tuple(str(unused_key) for unused_key in value if unused_key != key)
-            return replace(held, passed_over=(*held.passed_over, *others))
-    return content
+            return replace(content, passed_over=(*content.passed_over, *others))
+    return None
 
 
 def numbers(value: Any) -> np.ndarray | None:

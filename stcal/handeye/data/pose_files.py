@@ -7,6 +7,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,9 +72,9 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None
             continue
         if (turned := read_rotations(table, prefix, statements.rotation)) is None:
             continue
-        covariance, poses = table.pose_covariances(prefix), Poses(turned.rotation, place[0])
-        read = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
-        sides.append(PoseSide(poses, places_of(table), turned.words, place[1], frames, names, **read))
+        covariance, (at, unit) = table.pose_covariances(prefix), place
+        common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
+        sides.append(PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common))
     if not sides:
         return None
     known = [side.frames for side in sides if side.frames is not None]
@@ -173,11 +174,37 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
     file = File(path, data, text, tuple(used), statements, key, quaternions)
     if (text and not file.first) or not data:
         return None
-    content = next(reader(file) for is_of, reader in FORMATS if is_of(file))
+    content = _content(file)
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
         said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
         raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
     return content
+
+
+def _content(file: File) -> PoseContent | None:
+    """Returns the content as of the first format that the file may be of."""
+    value, first = None, file.first
+    if file.data.startswith(NPY):
+        return _of_values(file, _array(file.data, file.where), "NumPy array")
+    if file.data.startswith(NPZ):
+        return _of_npz(file)
+    if file.text.lstrip().startswith(("{", "[")):
+        with suppress(ValueError, RecursionError):
+            value = json.loads(file.text)
+    if value is not None:
+        return _of_values(file, value, "JSON")
+    if _UNIVERSAL.fullmatch(first):
+        return _of_universal(file)
+    name, *others = re.split(r"[\s,;]+", first, maxsplit=1)
+    named = _numbers(others[0]) if others and ":" not in name and name != "-" else None
+    if numbers := _numbers(first) or named:
+        if len(_numbers(first) or ()) == TUM:
+            return _of_tum(file)
+        raise _not_known(file.where, f"rows of {len(numbers)} numbers without a header")
+    if _HEADER.match(_BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first):
+        table = read_table(file.path, "pose file", file.quaternions)
+        return None if todays(table) else read_columns(table, file.key, file.said)
+    return _of_yaml(file)
 
 
 def _not_known(where: str, found: str) -> InputError:
@@ -235,29 +262,6 @@ def _of_tum(file: File) -> PoseContent:
     poses = Poses(of_quaternions(wxyz, places, file.where), values[:, 1:4])
     side = PoseSide(poses, places, turned, unit, names=names, trajectory=True)
     return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
-
-
-def _row_of_numbers(file: File) -> list[float] | None:
-    """Returns the numbers of the first line, with or without a name before them; None for any other line."""
-    name, *others = re.split(r"[\s,;]+", file.first, maxsplit=1)
-    named = others and ":" not in name and name != "-"
-    return _numbers(file.first) or (_numbers(others[0]) if named else None)
-
-
-def _refuse_rows(file: File) -> PoseContent:
-    raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
-
-
-def _of_table(file: File) -> PoseContent | None:
-    table = read_table(file.path, "pose file", file.quaternions)
-    return None if todays(table) else read_columns(table, file.key, file.said)
-
-
-def _is_json(file: File) -> bool:
-    try:
-        return file.text.lstrip().startswith(("{", "[")) and json.loads(file.text) is not None
-    except (ValueError, RecursionError):
-        return False
 
 
 def _of_values(file: File, value: Any, form: str) -> PoseContent:
@@ -329,22 +333,6 @@ def _array(data: bytes, where: str) -> np.ndarray | list[str]:
 def _damaged(where: str, error: Exception) -> InputError:
     said = " ".join(str(error).split())[:80]
     return InputError("E-NUMPY-UNREADABLE", f"{where}: not a file of NumPy ({said}); save it again")
-
-
-FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], PoseContent | None]], ...] = (
-    (
-        lambda file: file.data.startswith(NPY),
-        lambda file: _of_values(file, _array(file.data, file.where), "NumPy array"),
-    ),
-    (lambda file: file.data.startswith(NPZ), _of_npz),
-    (_is_json, lambda file: _of_values(file, json.loads(file.text), "JSON")),
-    (lambda file: bool(_UNIVERSAL.fullmatch(file.first)), _of_universal),
-    (lambda file: len(_numbers(file.first) or ()) == TUM, _of_tum),
-    (_row_of_numbers, _refuse_rows),
-    (lambda file: bool(_HEADER.match(_BRACKETED_UNIT.sub("", file.first)) or _SPACED.fullmatch(file.first)), _of_table),
-    (lambda file: True, _of_yaml),
-)
-"""Whether a file is of a format, by its content, and the reader of that format, in this order."""
 
 
 METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0

@@ -1,6 +1,7 @@
 """The verdict: right on honest poses, and worse for what is wrong."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tests.support.handeye import handeye, simulated
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 
 
+@cache
 def outcome_of(count: int, seed: int, method: str = "pose", pairs=None, **noise) -> Outcome:
     truth = simulated(np.random.default_rng(seed), count, **(noise or NOISE))
     pairs = pairs or truth.pairs
