@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -324,14 +324,14 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
         # of exactly parallel axes the largest σ of that
         variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
         sigma = np.where(np.isfinite(value[3:]), _sigma_of(jacobian[3:], covariance), np.nan)
-        lengths = np.column_stack([np.abs(value[3:]), sigma])
-        lengths[2, 0] = value[5]
+        numbers = np.column_stack([[*np.abs(value[3:5]), value[5]], sigma]).ravel().tolist()
+        lengths: list[Any] = [number if np.isfinite(number) else None for number in numbers]
         pair = Pair(
             i + 1,
             np.pi - acute if opposed else acute,
             float(np.sqrt(max(variance, 0))),
             bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
-            *(length if np.isfinite(length) else None for length in lengths.ravel().tolist()),
+            *lengths,
         )
         pairs.append(replace(pair, refused=_refused(pair, acute, size)))
     return tuple(pairs)

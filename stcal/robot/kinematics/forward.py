@@ -118,7 +118,7 @@ def torques(
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        if "" not in chain.tree.carriers:
+        if "" not in chain.order.carriers:
             raise InputError(
                 "E-ROBOT-TREE",
                 "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
@@ -191,7 +191,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.tree.mounts:
+        if chain.tree is not None:
             moved[i] = axes, origin
     return axes, origin
 
