@@ -174,26 +174,16 @@ def robot_from_sweeps(
     Axes do not determine everything. What :func:`~stcal.robot.kinematics.dh.robot_from_chain` keeps of the nominal
     robot is kept here, and so is the orientation of tools.
 
-    Parameters
-    ----------
-    data : positions of one or more reflectors in sweeps of single joints.
-    nominal : convention, joint types, coupling, and approximate build of the arm.
-    still_rad : change of a revolute joint's value up to which the joint stands still.
-    places : (k, 3) array, optional
-        Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
-        too: those of :func:`~stcal.robot.axes.fit.ring`, or points of a real target. If None, positions alone
-        are used.
+    ``data`` : positions of one or more reflectors in sweeps of single joints; ``nominal`` : convention, joint types,
+    coupling, and approximate build of the arm; ``still_rad`` : change of a revolute joint's value up to which the joint
+    stands still; ``places`` : (k, 3) places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by
+    which orientations are used too: those of :func:`~stcal.robot.axes.fit.ring`, or points of a real target; if None,
+    positions alone are used. Returns axes in the instrument's frame with their covariance, and the robot that they
+    make; mm, rad.
 
-    Returns
-    -------
-    AxesResult : axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
-
-    Raises
-    ------
-    ConvergenceError : the fit of an axis reaches no minimum.
-    InputError : several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of
-        another build; no orientations where they are asked for.
-    DegenerateError : axes that their arcs do not determine.
+    Raises ConvergenceError: the fit of an axis reaches no minimum. Raises InputError: several stations, a joint never
+    swept, a reflector that does not move, mirrored positions, a robot of another build; no orientations where they are
+    asked for. Raises DegenerateError: axes that their arcs do not determine.
 
     References
     ----------

@@ -328,15 +328,11 @@ class Robot(Brief):
     ) -> "Robot":
         """Returns the robot of a table of Denavit–Hartenberg parameters; warns of limits that seem to be degrees.
 
-        Parameters
-        ----------
-        table : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad)
-        convention : {"standard", "modified"}: of all rows; see :class:`DHRow`
-        limits : (n, 2) lowest and highest value of each joint, rad or mm; unlimited if not given
-        types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
-        name : for messages and reports
-
-        Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        ``table`` : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base, and Hayati's β (rad);
+        ``convention`` : of all rows, see :class:`DHRow`; ``limits`` : (n, 2) lowest and highest value of each joint,
+        rad or mm, unlimited if not given; ``types`` : one for each joint, all revolute if not given; ``name`` : for
+        messages and reports. Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and
+        :class:`Joint` refuse.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
