@@ -482,8 +482,8 @@ def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slop
 
 
 def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit], nominal: Robot) -> np.ndarray:
-    """Returns :func:`_values` (r, v) without each instant's rows, nan if the remaining ones determine no axis; what comes
-    after a changed axis is unwound and fitted again."""
+    """Returns :func:`_values` (r, v) without each instant's rows, nan if the rest determines no axis; what comes after
+    a changed axis is unwound and fitted again."""
     kinematic, points = (data.q @ nominal.coupling.T).T, [np.array(data.points())]
     for fit, value in zip(fits, kinematic, strict=True):
         points.append(fit.unwound(points[-1], value)[1])
