@@ -341,22 +341,14 @@ def _refused(pair: Pair, acute: float, size: float) -> str:
     return "; ".join(reasons)
 
 
-def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns cosines, moments and triple products (s,) of directed axes, their signs after a mirror, and the axes
-    (s, n) of each."""
+def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.ndarray:
+    """Returns cosines, moments of revolute axes, and triple products of directed axes."""
     size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
-    found, members = [], []
-    for i, k in combinations(range(len(z)), 2):
-        found.append((z[i] @ z[k], 1 if sliding[i] == sliding[k] else -1))
-        members.append((i, k))
-        if not sliding[i] and not sliding[k]:
-            found.append(((origin[k] - origin[i]) @ np.cross(z[i], z[k]) / size, -1))
-            members.append((i, k))
-    for axes in combinations(range(len(z)), 3):
-        found.append((np.linalg.det(z[list(axes)]), -1 if sliding[list(axes)].sum() % 2 else 1))
-        members.append(axes)
-    values, mirrored = np.array(found).T
-    return values, mirrored, np.array([np.isin(np.arange(len(z)), axes) for axes in members])
+    pairs, three = (np.array(list(combinations(range(len(z)), k)), int).reshape(-1, k) for k in (2, 3))
+    cosines = (z[pairs[:, 0]] * z[pairs[:, 1]]).sum(axis=1)
+    a, b = pairs[~sliding[pairs].any(axis=1)].T
+    moments = ((origin[b] - origin[a]) * np.cross(z[a], z[b])).sum(axis=1) / size
+    return np.concatenate([cosines, moments, np.linalg.det(z[three])])
 
 
 def _apart(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> float:
@@ -376,13 +368,18 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
     rotation, origins = joint_frames(nominal.chain(), np.zeros((1, n)))
     wanted, origin = rotation[:, 0, :, 2], origins[:, 0]
     directions, places = np.array([f.rotation[:, 2] for f in frames]), np.array([f.translation for f in frames])
-    shape = _shape(wanted, origin, sliding)[0]
-    values, mirror, members = _shape(directions, places, sliding)
-    as_it_is, mirrored = (float(np.linalg.norm(v - shape)) for v in (values, values * mirror))
-    reversed_ = {}
-    for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY)):
-        odd = members[:, list(flipped)].sum(axis=1) % 2
-        reversed_[flipped] = np.linalg.norm(np.where(odd, -values, values) - shape)
+    shape = _shape(wanted, origin, sliding)
+
+    def off(sign: np.ndarray, mirror: float = 1.0) -> float:
+        """Returns how far the axes are off the nominal ones after changes of sign (n,), and a mirror if −1."""
+        axes = directions * sign[:, None] * [1, 1, mirror], places * [1, 1, mirror]
+        return float(np.linalg.norm(_shape(*axes, sliding) - shape))
+
+    as_it_is, mirrored = off(np.ones(n)), off(np.where(sliding, 1.0, -1.0), -1.0)
+    reversed_ = {
+        flipped: off(np.where(np.isin(np.arange(n), flipped), -1.0, 1.0))
+        for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY))
+    }
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
     named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
