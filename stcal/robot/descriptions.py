@@ -4,7 +4,6 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated
@@ -96,23 +95,15 @@ def load_urdf(
 ) -> UrdfRobot:
     """Read the chain of joints between two links of a URDF, or the tree of those to several links.
 
-    Parameters
-    ----------
-    path : URDF; a xacro file must be expanded before.
-    from_link : the base; the root if not given. Where the root is called ``world`` and holds a link by a fixed joint,
-        this link is the base, and the joint where it stands.
-    to_link : the tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool`` and
-        ``tool_NAME`` as :func:`robot_urdf` writes them. Several are tools called like the links, on branches of a tree.
-    convention : of the Denavit–Hartenberg rows.
+    ``path`` : URDF; a xacro file must be expanded before; ``from_link`` : the base, the root if not given: where the
+    root is called ``world`` and holds a link by a fixed joint, this link is the base, and the joint where it stands;
+    ``to_link`` : the tool; if not given the only link without children behind the last joint, ``tool0``, or ``tool``
+    and ``tool_NAME`` as :func:`robot_urdf` writes them; several are tools called like the links, on branches of a tree;
+    ``convention`` : of the Denavit–Hartenberg rows. The robot's flange is the link ``flange`` where a row can end
+    there, else the frame of the last joint.
 
-    Returns
-    -------
-    UrdfRobot : its robot's flange is the link ``flange`` where a row can end there, else the frame of the last joint.
-
-    Raises
-    ------
-    InputError : unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or mimic
-        others, several links that may be the tool.
+    Raises InputError: unreadable, no URDF, no such links or none between them that moves, joints that move otherwise or
+    mimic others, several links that may be the tool.
     """
     where = f"URDF {path}"
     try:
@@ -230,10 +221,7 @@ def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     def wrong(said: str, code: str = "E-URDF-CONTENT") -> InputError:
         return InputError(code, f"{where}: joint {name}: {said}")
 
-    def three(tag: str, key: str, default: str) -> np.ndarray:
-        return numbers(parts.get(tag, {}).get(key, default), 3)
-
-    def numbers(text: str, count: int) -> np.ndarray:
+    def numbers(text: str, count: int = 3) -> np.ndarray:
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -250,18 +238,21 @@ def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     parent, child = parts.get("parent", {}).get("link"), parts.get("child", {}).get("link")
     if not (name and parent and child):
         raise wrong("its name, parent or child is missing; all three needed")
-    place, turn, axis = three("origin", "xyz", "0 0 0"), three("origin", "rpy", "0 0 0"), three("axis", "xyz", "1 0 0")
+    origin, along = parts.get("origin", {}), parts.get("axis", {})
+    place, turn = numbers(origin.get("xyz", "0 0 0")), numbers(origin.get("rpy", "0 0 0"))
+    axis = numbers(along.get("xyz", "1 0 0"))
     if (most := float(np.abs(turn).max())) > MOST_RAD:
         raise wrong(f"rpy of {most:g}, more than a turn: URDF is in radians; divide degrees by 57.3")
     length = float(np.linalg.norm(axis))
     if not length > 1e-9:
         raise wrong("its axis has no direction; correct it")
-    limit, unit = None, METRE_MM if kind == "prismatic" else 1.0
+    limit = None
     if "limit" in parts and kind != "continuous":
-        low, high = numbers(" ".join(parts["limit"].get(end, "0") for end in ("lower", "upper")), 2)
+        low, high = numbers(" ".join(parts["limit"].get(end, "0") for end in ("lower", "upper")), 2).tolist()
         if low > high:
             raise wrong(f"lower limit {low:g} is above upper {high:g}; swap or correct them", "E-URDF-LIMITS")
-        limit = (float(low * unit), float(high * unit)) if low < high else None
+        unit = METRE_MM if kind == "prismatic" else 1.0
+        limit = (low * unit, high * unit) if low < high else None
     pose = Rigid(from_roll_pitch_yaw(turn), METRE_MM * place)
     return UrdfJoint(name, kind, parent, child, pose, axis / length, limit, parts.get("mimic", {}).get("joint", ""))
 
@@ -326,19 +317,9 @@ def robot_urdf(robot: Robot) -> str:
     ``flange`` of a tree, the tools of which are fixed to the links that carry them.
 
     Joint values are the kinematic ones: where the controller couples joints, the coupling times its values, and limits
-    are the widest that its limits allow.
-
-    Parameters
-    ----------
-    robot : what to write.
-
-    Returns
-    -------
-    str : XML, in metres and rad; every number reads back to the same double but for the last bit.
-
-    Raises
-    ------
-    InputError : an elastic robot, or a name with control characters, which XML cannot hold.
+    are the widest that its limits allow. Returns XML of ``robot``, in metres and rad, in which every number reads back
+    to the same double but for the last bit. Raises InputError: an elastic robot, or a name with control characters,
+    which XML cannot hold.
     """
     for name in (robot.name, *robot.tools):
         if not name.isprintable():
@@ -428,6 +409,8 @@ LEAST_OFF_MM = 1e-3
 """A micrometre: what angles of few digits round off."""
 DELTAS = {"theta": 1.0, "a": METRE_MM, "d": METRE_MM, "alpha": 1.0}
 """Dimensions that a controller corrects, with the factors of their units."""
+_DELTA = re.compile(r"^\s*delta_(theta|a|d|alpha)\s*=", re.MULTILINE)
+"""A key of a calibration.conf."""
 _LIST = re.compile(r"^\s*(?P<key>\w+)\s*=\s*\[(?P<values>[^\]]*)\]", re.MULTILINE)
 Number = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 
@@ -445,24 +428,17 @@ class _UrFile(Strict):
     kinematics: dict[str, _Link]
 
 
-def kinematics_content(text: str) -> Mapping | None:
-    """Returns the keys and values of the YAML of ur_calibration; None for any other text."""
-    try:
-        content = load_yaml(text) if "kinematics" in text else None
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) and "kinematics" in content else None
+@dataclass(frozen=True, slots=True, eq=False)
+class UniversalRobot:
+    """An arm of Universal Robots: ``robot``, and ``notes`` on how its file was read."""
+
+    robot: Robot
+    notes: tuple[str, ...]
 
 
-def is_conf(text: str) -> bool:
-    """True if a text is the calibration.conf of a controller."""
-    return re.search(r"^\s*delta_(theta|a|d|alpha)\s*=", text, re.MULTILINE) is not None
-
-
-def robot_of_kinematics(content: Mapping, where: str, convention: Convention) -> tuple[Robot, float]:
-    """Returns the arm of ur_calibration's YAML, and by how far (mm) a URDF with the same numbers is off at joint values
-    of 0: roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed ones. The base is the controller's; ROS's
-    base_link is rotated by half a turn about Z. Raises InputError naming the link."""
+def _of_kinematics(content: dict, where: str, convention: Convention) -> UniversalRobot:
+    """Returns the arm of ur_calibration's YAML. Its roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed
+    ones. The base is the controller's; ROS's base_link is rotated by half a turn about Z."""
     held = content["kinematics"]
     if isinstance(held, Mapping):  # the hash of the robot stands among the links
         if missing := [name for name in LINKS if name not in held]:
@@ -472,27 +448,27 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
                 f"{', '.join(LINKS)}: extract its calibration anew with ur_calibration, or copy the whole file",
             )
         content = {**content, "kinematics": {name: held[name] for name in LINKS}}
-    links = validated(content, _UrFile, where).kinematics
+    joints, flange, as_urdf, z = [], Rigid(), Rigid(), np.array([0.0, 0.0, 1.0])
+    for parent, (name, link) in zip(
+        ("base", *LINKS), validated(content, _UrFile, where).kinematics.items(), strict=False
+    ):
+        place, angles = METRE_MM * np.array([link.x, link.y, link.z]), [link.roll, link.pitch, link.yaw]
+        pose = Rigid(Rotation.from_euler("XYZ", angles), place)
+        flange, as_urdf = flange @ pose, as_urdf @ Rigid(from_roll_pitch_yaw(angles), place)
+        joints.append(UrdfJoint(name, "continuous", parent, name, pose, z, None, ""))
+    off_mm = float(np.linalg.norm(flange.translation - as_urdf.translation))
+    said = (
+        "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
+        f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
+    )
+    return UniversalRobot(robot_of({"": joints}, NAME, convention), (said,) if off_mm >= LEAST_OFF_MM else ())
 
-    def chain(turned: Callable[[list[float]], np.ndarray]) -> list[UrdfJoint]:
-        joints = []
-        for parent, (name, link) in zip(("base", *LINKS), links.items(), strict=False):
-            pose = Rigid(turned([link.roll, link.pitch, link.yaw]), METRE_MM * np.array([link.x, link.y, link.z]))
-            joints.append(UrdfJoint(name, "continuous", parent, name, pose, np.array([0.0, 0.0, 1.0]), None, ""))
-        return joints
 
-    moving, as_urdf = chain(lambda angles: Rotation.from_euler("XYZ", angles).as_matrix()), chain(from_roll_pitch_yaw)
-    ends = [reduce(Rigid.__matmul__, (joint.parent_from_child for joint in path)) for path in (moving, as_urdf)]
-    off = np.linalg.norm(ends[0].translation - ends[1].translation)
-    return robot_of({"": moving}, NAME, convention), float(off)
-
-
-def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> Robot:
+def _of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> UniversalRobot:
     """Returns the arm of a calibration.conf: the one of its [DH] section or ``nominal``, and its deviations.
 
     Axes of upper arm, forearm and wrist are nearly parallel: the controller's rows have lengths of many metres that
-    cancel, written here as rows with Hayati's angle. Raises InputError: no nominal arm, not six joints, or lists of
-    other lengths.
+    cancel, written here as rows with Hayati's angle.
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
 
@@ -509,8 +485,10 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     deltas = {name: unit * six(f"delta_{name}") for name, unit in DELTAS.items()}
     joints = (Joint(),) * JOINTS if nominal is None else nominal.joints
     if all(name in lists for name in ("a", "d", "alpha")):
-        a, d, alpha = METRE_MM * six("a"), METRE_MM * six("d"), six("alpha")
-        rows = tuple(DHRow(a[i], alpha[i], d[i], 0.0) for i in range(JOINTS))
+        columns = METRE_MM * six("a"), six("alpha"), METRE_MM * six("d")
+        rows = tuple(
+            DHRow(a, alpha, d, 0.0) for a, alpha, d in zip(*(column.tolist() for column in columns), strict=True)
+        )
         arm = Robot(NAME, "standard", rows, joints, unusual_size=True)
     elif nominal is None:
         raise InputError(
@@ -535,15 +513,7 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     q = fixed_values(JOINTS)
     for tool in arm.tools:
         require_near(found.world_from_base @ forward(found, q, tool), forward(controller, q, tool))
-    return replace(found, world_from_base=arm.world_from_base @ found.world_from_base)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UniversalRobot:
-    """An arm of Universal Robots: ``robot``, and ``notes`` on how its file was read."""
-
-    robot: Robot
-    notes: tuple[str, ...]
+    return UniversalRobot(replace(found, world_from_base=arm.world_from_base @ found.world_from_base), ())
 
 
 @require_arguments
@@ -552,19 +522,10 @@ def load_universal(
 ) -> UniversalRobot:
     """Returns the calibrated arm of Universal Robots of a file of ur_calibration (YAML), or of calibration.conf.
 
-    Parameters
-    ----------
-    path : the file.
-    nominal : the arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
-    convention : convention of the rows of Denavit and Hartenberg.
-
-    Returns
-    -------
-    UniversalRobot : ``robot``, mm and rad, from the controller's base.
-
-    Raises
-    ------
-    InputError : another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
+    ``path`` : the file; ``nominal`` : the arm to whose rows the deviations of a calibration.conf are added, if that
+    does not state it; ``convention`` : of the rows of Denavit and Hartenberg. Returns ``robot``, mm and rad, from the
+    controller's base. Raises InputError: another file, a value that is missing or no number, or ``nominal`` does not
+    fit or is not needed.
     """
     found = read_universal(Path(path), nominal, convention)
     if found is None:
@@ -583,17 +544,15 @@ def read_universal(path: Path, nominal: Robot | str | Path | None, convention: C
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError:
         return None
-    if is_conf(text):
+    if _DELTA.search(text):
         drawn = nominal if nominal is None or isinstance(nominal, Robot) else load_robot(nominal)
-        return UniversalRobot(robot_of_conf(text, str(path), drawn, convention), ())
-    content = kinematics_content(text)
-    if content is None:
+        return _of_conf(text, str(path), drawn, convention)
+    try:
+        content = load_yaml(text) if "kinematics" in text else None
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+    if not isinstance(content, dict) or "kinematics" not in content:
         return None
     if nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
-    robot, off_mm = robot_of_kinematics(content, str(path), convention)
-    said = (
-        "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
-        f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
-    )
-    return UniversalRobot(robot, (said,) if off_mm >= LEAST_OFF_MM else ())
+    return _of_kinematics(content, str(path), convention)

@@ -20,7 +20,7 @@ from stcal.handeye.data.pose_files import read_pairs, read_robot
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
-from stcal.robot.descriptions import is_conf, kinematics_content, load_urdf, robot_of_conf, robot_of_kinematics
+from stcal.robot.descriptions import load_universal, load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.sfm.budget.combine import statement_of
 
@@ -76,13 +76,12 @@ def of_robot(path: Path) -> np.ndarray:
     return np.array(robot_toml(load_robot(path)).splitlines())
 
 
-def of_kinematics(path: Path) -> np.ndarray:
+def of_universal(path: Path) -> np.ndarray:
     try:
-        content = kinematics_content(text_of(path.read_bytes()))
+        text_of(path.read_bytes())
     except UnicodeDecodeError as error:  # named by the command
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error}") from error
-    assert content is not None
-    return np.array(robot_toml(robot_of_kinematics(content, str(path), "standard")[0]).splitlines())
+    return np.array(robot_toml(load_universal(path).robot).splitlines())
 
 
 def of_robot_poses(path: Path) -> np.ndarray:
@@ -115,15 +114,6 @@ MATRICES = [
 
 def of_urdf(path: Path) -> np.ndarray:
     return np.array(robot_toml(load_urdf(path).robot).splitlines())
-
-
-def of_conf(path: Path) -> np.ndarray:
-    try:
-        text = text_of(path.read_bytes())
-    except UnicodeDecodeError as error:  # named by the command
-        raise InputError("E-FILE-UNREADABLE", f"{path}: {error}") from error
-    assert is_conf(text)
-    return np.array(robot_toml(robot_of_conf(text, str(path), None, "standard")).splitlines())
 
 
 def of_statement(path: Path) -> np.ndarray:
@@ -175,7 +165,7 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         "tag_family: tag36h11\ntag_bundles: [{name: a, layout: [{id: 0, size: 0.08, x: 0.1, y: 0, z: 0, qw: 1.0}]}]\n",
         of_board,
     ),
-    "Universal Robots": (UR, of_kinematics),
+    "Universal Robots": (UR, of_universal),
     "poses, rows of TUM": (
         "".join(f"{10 + i}.5 {0.1 * i:.1f} 0.2 0.3 0.0 0.0 {s} {c}\n" for i, s, c in SINES),
         of_robot_poses,
@@ -187,7 +177,7 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         of_robot_poses,
     ),
     "URDF": (URDF, of_urdf),
-    "calibration.conf": (CONF, of_conf),
+    "calibration.conf": (CONF, of_universal),
     "statement": ('[fields]\noperator = "A"\n\n[board]\ntemperature_c = 21.5\n', of_statement),
     "poses, JSON": (json.dumps({"base_from_flange": MATRICES, "units": "m"}, indent=1), of_robot_poses),
     "poses, MoveIt": (

@@ -10,12 +10,9 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.descriptions import (
     LINKS,
-    is_conf,
-    kinematics_content,
+    load_universal,
     load_urdf,
     require_urdf_written,
-    robot_of_conf,
-    robot_of_kinematics,
     robot_urdf,
 )
 from stcal.robot.kinematics.forward import forward
@@ -108,31 +105,36 @@ def poses(robot):
     return np.array([(robot.world_from_base @ pose).matrix() for pose in forward(robot, Q)])
 
 
+@pytest.fixture
+def universal(tmp_path):
+    def read(text: str, *more, name: str = "ur.yaml"):
+        (tmp_path / name).write_text(text)
+        return load_universal(tmp_path / name, *more)
+
+    return read
+
+
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_the_yaml_of_ur_calibration(convention):
-    robot, off_mm = robot_of_kinematics(kinematics_content(yaml_of(UR5E)), "k.yaml", convention)
-    np.testing.assert_allclose(poses(robot), [by_links(q) for q in Q], atol=ROUNDING_MM)
-    assert 1e-4 < off_mm < 0.01  # by yaw of 1e-6 in the upper arm, on 0.9 m
+def test_the_yaml_of_ur_calibration(universal, convention):
+    found = universal(yaml_of(UR5E), None, convention)
+    np.testing.assert_allclose(poses(found.robot), [by_links(q) for q in Q], atol=ROUNDING_MM)
+    assert "its flange is 0.0013 mm off" in found.notes[0]  # by yaw of 1e-6 in the upper arm, on 0.9 m
     if convention == "standard":
         # the program makes the upper arm of a length, a twist and the next zero: a row, by angles about turned axes
-        assert robot.rows[0].alpha == pytest.approx(UR5E["upper_arm"][3], abs=1e-12)
-        assert robot.rows[1].theta == pytest.approx(UR5E["upper_arm"][5], abs=1e-12)
+        assert found.robot.rows[0].alpha == pytest.approx(UR5E["upper_arm"][3], abs=1e-12)
+        assert found.robot.rows[1].theta == pytest.approx(UR5E["upper_arm"][5], abs=1e-12)
 
 
 @pytest.mark.parametrize("with_nominal", [False, True])
-def test_calibration_conf(with_nominal):
+def test_calibration_conf(universal, with_nominal):
     """Tools and base of the nominal arm stay."""
-    lists = (
-        f"{key} = [{', '.join(map(repr, map(float, values)))}]"
-        for key, values in (("a", A), ("d", D), ("alpha", ALPHA))
-    )
-    text = CONF if with_nominal else "[DH]\n" + "\n".join(lists) + "\n" + CONF
-    assert is_conf(text)
+    lists = (f"{key} = {list(map(float, values))}\n" for key, values in (("a", A), ("d", D), ("alpha", ALPHA)))
+    text = CONF if with_nominal else "[DH]\n" + "".join(lists) + CONF
     base = tool = Rigid()
     if with_nominal:
         base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
     given = nominal(world_from_base=base, tools={"": tool}) if with_nominal else None
-    robot = robot_of_conf(text, "calibration.conf", given, "standard")
+    robot = universal(text, given, name="calibration.conf").robot
     wanted = [base.matrix() @ by_rows(q) @ tool.matrix() for q in Q]
     np.testing.assert_allclose(poses(robot), wanted, atol=ROUNDING_MM)
     assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
@@ -141,31 +143,25 @@ def test_calibration_conf(with_nominal):
 @pytest.mark.parametrize(
     ("text", "given", "error"),
     [
-        (CONF, None, "E-ROBOT-NOMINAL … --nominal"),
+        (CONF, None, "E-ROBOT-NOMINAL … nominal"),
         (CONF, Robot("two", "standard", (DHRow(90, 0, 0, 0),) * 2, (Joint(),) * 2), "E-ROBOT-NOMINAL … 2 joints"),
         (CONF.replace("-0.00013]", "]"), nominal(), "E-ROBOT-ENTRIES … delta_d"),
         (CONF.replace("delta_alpha", "delta_beta"), nominal(), "E-ROBOT-ENTRIES … delta_alpha"),
+        (yaml_of({name: UR5E[name] for name in LINKS[:2]}), None, "E-KEY-MISSING … without forearm, wrist_1"),
+        ("a: 1\n", None, "E-ROBOT-FORM … ur.yaml"),
     ],
 )
-def test_mistakes_in_calibration_conf(text, given, error):
+def test_mistakes_in_files_of_universal_robots(universal, text, given, error):
     with fails_with(error):
-        robot_of_conf(text, "calibration.conf", given, "standard")
+        universal(text, given)
 
 
-def test_a_yaml_that_lacks_links():
-    links = {name: UR5E[name] for name in LINKS[:2]}
-    with pytest.raises(InputError, match=r"k\.yaml: kinematics without forearm, wrist_1") as caught:
-        robot_of_kinematics(kinematics_content(yaml_of(links)), "k.yaml", "standard")
-    assert caught.value.code == "E-KEY-MISSING"
-    assert kinematics_content("a: 1\n") is None
-
-
-def test_other_files_of_robots_are_to_be_converted(tmp_path):
+def test_other_files_of_robots_are_to_be_converted(tmp_path, universal):
     for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
         (tmp_path / name).write_text(yaml_of(UR5E))
         with fails_with(f"E-ROBOT-FORM … {name} … robot convert"):
             load_robot(tmp_path / name)
-    robot, _ = robot_of_kinematics(kinematics_content(yaml_of(UR5E)), "k.yaml", "standard")
+    robot = universal(yaml_of(UR5E)).robot
     save_robot(tmp_path / "ur.toml", robot)
     np.testing.assert_allclose(poses(load_robot(tmp_path / "ur.toml")), poses(robot), atol=ROUNDING_MM)
 

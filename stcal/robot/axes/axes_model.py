@@ -1,11 +1,11 @@
 """The robot from the axes of all joints: Denavit–Hartenberg rows, tools, their σ, and what to refuse."""
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -174,26 +174,16 @@ def robot_from_sweeps(
     Axes do not determine everything. What :func:`~stcal.robot.kinematics.dh.robot_from_chain` keeps of the nominal
     robot is kept here, and so is the orientation of tools.
 
-    Parameters
-    ----------
-    data : positions of one or more reflectors in sweeps of single joints.
-    nominal : convention, joint types, coupling, and approximate build of the arm.
-    still_rad : change of a revolute joint's value up to which the joint stands still.
-    places : (k, 3) array, optional
-        Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
-        too: those of :func:`~stcal.robot.axes.fit.ring`, or points of a real target. If None, positions alone
-        are used.
+    ``data`` : positions of one or more reflectors in sweeps of single joints; ``nominal`` : convention, joint types,
+    coupling, and approximate build of the arm; ``still_rad`` : change of a revolute joint's value up to which the joint
+    stands still; ``places`` : (k, 3) places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by
+    which orientations are used too: those of :func:`~stcal.robot.axes.fit.ring`, or points of a real target; if None,
+    positions alone are used. Returns axes in the instrument's frame with their covariance, and the robot that they
+    make; mm, rad.
 
-    Returns
-    -------
-    AxesResult : axes in the instrument's frame with their covariance, and the robot that they make; mm, rad.
-
-    Raises
-    ------
-    ConvergenceError : the fit of an axis reaches no minimum.
-    InputError : several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of
-        another build; no orientations where they are asked for.
-    DegenerateError : axes that their arcs do not determine.
+    Raises ConvergenceError: the fit of an axis reaches no minimum. Raises InputError: several stations, a joint never
+    swept, a reflector that does not move, mirrored positions, a robot of another build; no orientations where they are
+    asked for. Raises DegenerateError: axes that their arcs do not determine.
 
     References
     ----------
@@ -225,12 +215,8 @@ def robot_from_sweeps(
     if virtual is None:
         orientation = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
         robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
-
-    def row_values(frames: list[Rigid]) -> np.ndarray:
-        return dh_values(robot_from_chain(_chain_through(frames, nominal), {}, nominal)).ravel()
-
-    row_sigma = _sigma_of(_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
-    pairs = pairs_of(frames, covariance, robot)
+    slopes, rows = slopes_of(frames, nominal), 5 * len(frames)
+    pairs = pairs_of(frames, slopes, covariance, nominal, sum(abs(row.a) + abs(row.d) for row in robot.rows))
     notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot, nominal)]
     notes += [
         f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
@@ -243,10 +229,10 @@ def robot_from_sweeps(
         covariance=covariance,
         chain=axes,
         robot=robot,
-        row_sigma=row_sigma,
+        row_sigma=_sigma_of(slopes[:rows], covariance).reshape(-1, 5),
         tool_spread_mm=spread,
         pairs=pairs,
-        without_one=_leave_one_out(data, fits, nominal, passed),
+        without_one=_leave_one_out(data, fits, nominal, slopes @ passed),
         off=tuple({int(data.lines[row]): size for row, size in fit.off_mm.items()} for fit in fits),
         notes=tuple(notes),
     )
@@ -272,16 +258,14 @@ def _chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
     return Chain(gaps.rotation, gaps.translation, ends, nominal.prismatic, nominal.coupling)
 
 
-def _by_axes(function: Callable[[list[Rigid]], np.ndarray], frames: list[Rigid], robot: Robot) -> np.ndarray:
-    """Returns the derivative (v, p) of a function of the axes by their parameters, each in its own frame."""
+def slopes_of(frames: list[Rigid], nominal: Robot) -> np.ndarray:
+    """Returns the derivative (v, p) of :func:`_values` by the parameters of the axes, each in its own frame."""
     columns = []
-    for i, sliding in enumerate(robot.prismatic):
+    for i, sliding in enumerate(nominal.prismatic):
         for component in (0, 1) if sliding else (0, 1, 3, 4):
             step = STEP_RAD if component < 3 else STEP_MM
-            twist = step * np.eye(6)[component]
-            high, low = (
-                function([*frames[:i], frames[i] @ Rigid.exp(sign * twist), *frames[i + 1 :]]) for sign in (1, -1)
-            )
+            twists = (sign * step * np.eye(6)[component] for sign in (1, -1))
+            high, low = (_values([*frames[:i], frames[i] @ Rigid.exp(t), *frames[i + 1 :]], nominal) for t in twists)
             columns.append((high - low) / (2 * step))
     return np.column_stack(columns)
 
@@ -291,9 +275,10 @@ def _sigma_of(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.einsum("vp,pq,vq->v", jacobian, covariance, jacobian), 0))
 
 
-def _pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
-    """Returns values (6 (n − 1),) of the pairs: the acute angle as a vector (3), the rows' distance, and the common
-    normal's length and foot from the axis's origin (nan with a prismatic joint)."""
+def _values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
+    """Returns the rows (5 n,) of the robot with these axes, and values (6 (n − 1),) of the pairs: the acute angle as a
+    vector (3), the rows' distance, and the common normal's length and foot from the axis's origin (nan with a prismatic
+    joint)."""
     robot = robot_from_chain(_chain_through(frames, nominal), {}, nominal)
     values = np.full((len(frames) - 1, 6), np.nan)
     for i, (axis, next_axis) in enumerate(pairwise(frames)):
@@ -308,15 +293,16 @@ def _pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
         values[i, 3] = robot.rows[i if nominal.convention == "standard" else i + 1].a
         if sine > EXACTLY:
             values[i, 4:] = between @ across / sine, np.cross(between, next_axis.rotation[:, 2]) @ across / square
-    return values.ravel()
+    return np.concatenate([dh_values(robot).ravel(), values.ravel()])
 
 
-def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple[Pair, ...]:
-    """Returns the pairs of consecutive axes with their σ from the covariance (p, p) of all axes."""
-    values = _pair_values(frames, robot).reshape(-1, 6)
-    jacobians = _by_axes(lambda f: _pair_values(f, robot), frames, robot).reshape(len(values), 6, -1)
-    size = sum(abs(row.a) + abs(row.d) for row in robot.rows)
-    pairs = []
+def pairs_of(
+    frames: list[Rigid], slopes: np.ndarray, covariance: np.ndarray, nominal: Robot, size: float
+) -> tuple[Pair, ...]:
+    """Returns the pairs of consecutive axes with their σ from the covariance (p, p) of all axes; ``slopes`` : of
+    :func:`slopes_of`; ``size`` : of the arm, mm."""
+    values = _values(frames, nominal)[5 * len(frames) :].reshape(-1, 6)
+    jacobians, pairs = slopes[5 * len(frames) :].reshape(len(values), 6, -1), []
     for i, (value, jacobian) in enumerate(zip(values, jacobians, strict=True)):
         acute = float(np.linalg.norm(value[:3]))
         opposed = frames[i].rotation[:, 2] @ frames[i + 1].rotation[:, 2] < 0
@@ -324,14 +310,14 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
         # of exactly parallel axes the largest σ of that
         variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
         sigma = np.where(np.isfinite(value[3:]), _sigma_of(jacobian[3:], covariance), np.nan)
-        lengths = np.column_stack([np.abs(value[3:]), sigma])
-        lengths[2, 0] = value[5]
+        numbers = np.column_stack([[*np.abs(value[3:5]), value[5]], sigma]).ravel().tolist()
+        lengths: list[Any] = [number if np.isfinite(number) else None for number in numbers]
         pair = Pair(
             i + 1,
             np.pi - acute if opposed else acute,
             float(np.sqrt(max(variance, 0))),
             bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
-            *(length if np.isfinite(length) else None for length in lengths.ravel().tolist()),
+            *lengths,
         )
         pairs.append(replace(pair, refused=_refused(pair, acute, size)))
     return tuple(pairs)
@@ -355,18 +341,14 @@ def _refused(pair: Pair, acute: float, size: float) -> str:
     return "; ".join(reasons)
 
 
-def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns cosines, moments and triple products of directed axes, and their signs after a mirror."""
+def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.ndarray:
+    """Returns cosines, moments of revolute axes, and triple products of directed axes."""
     size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
-    found = []
-    for i, k in combinations(range(len(z)), 2):
-        found.append((z[i] @ z[k], 1 if sliding[i] == sliding[k] else -1))
-        if not sliding[i] and not sliding[k]:
-            found.append(((origin[k] - origin[i]) @ np.cross(z[i], z[k]) / size, -1))
-    for i, j, k in combinations(range(len(z)), 3):
-        found.append((z[i] @ np.cross(z[j], z[k]), -1 if (sliding[i] + sliding[j] + sliding[k]) % 2 else 1))
-    values, mirrored = np.array(found).T
-    return values, mirrored
+    pairs, three = (np.array(list(combinations(range(len(z)), k)), int).reshape(-1, k) for k in (2, 3))
+    cosines = (z[pairs[:, 0]] * z[pairs[:, 1]]).sum(axis=1)
+    a, b = pairs[~sliding[pairs].any(axis=1)].T
+    moments = ((origin[b] - origin[a]) * np.cross(z[a], z[b])).sum(axis=1) / size
+    return np.concatenate([cosines, moments, np.linalg.det(z[three])])
 
 
 def _apart(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> float:
@@ -386,13 +368,18 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
     rotation, origins = joint_frames(nominal.chain(), np.zeros((1, n)))
     wanted, origin = rotation[:, 0, :, 2], origins[:, 0]
     directions, places = np.array([f.rotation[:, 2] for f in frames]), np.array([f.translation for f in frames])
-    shape, _ = _shape(wanted, origin, sliding)
-    values, mirror = _shape(directions, places, sliding)
-    as_it_is, mirrored = (float(np.linalg.norm(v - shape)) for v in (values, values * mirror))
-    reversed_ = {}
-    for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY)):
-        sign = np.where(np.isin(np.arange(n), flipped), -1.0, 1.0)[:, None]
-        reversed_[flipped] = np.linalg.norm(_shape(directions * sign, places, sliding)[0] - shape)
+    shape = _shape(wanted, origin, sliding)
+
+    def off(sign: np.ndarray, mirror: float = 1.0) -> float:
+        """Returns how far the axes are off the nominal ones after changes of sign (n,), and a mirror if −1."""
+        axes = directions * sign[:, None] * [1, 1, mirror], places * [1, 1, mirror]
+        return float(np.linalg.norm(_shape(*axes, sliding) - shape))
+
+    as_it_is, mirrored = off(np.ones(n)), off(np.where(sliding, 1.0, -1.0), -1.0)
+    reversed_ = {
+        flipped: off(np.where(np.isin(np.arange(n), flipped), -1.0, 1.0))
+        for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY))
+    }
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
     named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
@@ -473,8 +460,8 @@ def _remarks(
     return notes if moved is None else [*notes, moved.sentence()]
 
 
-def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, passed: np.ndarray) -> LeaveOneOut:
-    """Returns the values of the pairs without each row."""
+def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> LeaveOneOut:
+    """Returns the values of the pairs without each row; ``slopes`` : of these by the joints' own fits."""
     groups, counts = defaultdict(list), Counter()  # rows measured together: the same joint values, each reflector once
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
         key = q.tobytes()
@@ -482,21 +469,22 @@ def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, pass
         groups[key, counts[key, target]].append(row)
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
-    if len(instants) > REFITTED:
-        values = _by_influence(instants, fits, nominal, passed)
-    else:
-        values = _refitted(data, instants, fits, nominal)
-    values = values.reshape(len(instants), -1, 6)
+    every = (
+        _by_influence(instants, fits, nominal, slopes)
+        if len(instants) > REFITTED
+        else _refitted(data, instants, fits, nominal)
+    )
+    values = every[:, 5 * len(fits) :].reshape(len(instants), -1, 6)
     return LeaveOneOut(tuple(int(data.lines[rows[0]]) for rows in instants), values[:, :, 3], values[:, :, 4])
 
 
 def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit], nominal: Robot) -> np.ndarray:
-    """Returns the values (r, 6 (n − 1)) without each instant's rows, nan if the remaining ones determine no axis; what
-    comes after a changed axis is unwound and fitted again."""
+    """Returns :func:`_values` (r, v) without each instant's rows, nan if the rest determines no axis; what comes after
+    a changed axis is unwound and fitted again."""
     kinematic, points = (data.q @ nominal.coupling.T).T, [np.array(data.points())]
     for fit, value in zip(fits, kinematic, strict=True):
         points.append(fit.unwound(points[-1], value)[1])
-    values = np.full((len(instants), 6 * (len(fits) - 1)), np.nan)
+    values = np.full((len(instants), 11 * len(fits) - 6), np.nan)
     for found, rows in zip(values, instants, strict=True):
         first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
         again, at = fits[:first], points[first]
@@ -504,17 +492,15 @@ def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit]
             for fit, value in zip(fits[first:], kinematic[first:], strict=True):
                 again = [*again, fit.without(at, rows)]
                 at = again[-1].unwound(at, value)[1]
-            found[:] = _pair_values([fit.world_from_axis for fit in again], nominal)
+            found[:] = _values([fit.world_from_axis for fit in again], nominal)
     return values
 
 
-def _by_influence(instants: list[list[int]], fits: list[AxisFit], nominal: Robot, passed: np.ndarray) -> np.ndarray:
-    """Returns the values (r, 6 (n − 1)) without each instant's rows, to first order."""
+def _by_influence(instants: list[list[int]], fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> np.ndarray:
+    """Returns :func:`_values` (r, v) without each instant's rows, to first order."""
     number = {row: i for i, rows in enumerate(instants) for row in rows}
     changes = []
     for fit in fits:
         changes.append(np.zeros((len(instants), len(fit.gain))))
         np.add.at(changes[-1], [number[row] for row in fit.rows.tolist()], fit.influence())
-    frames = [fit.world_from_axis for fit in fits]
-    slope = _by_axes(lambda f: _pair_values(f, nominal), frames, nominal)
-    return _pair_values(frames, nominal) + np.concatenate(changes, axis=1) @ (slope @ passed).T
+    return _values([fit.world_from_axis for fit in fits], nominal) + np.concatenate(changes, axis=1) @ slopes.T

@@ -80,9 +80,9 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
     kinematic = data.q @ robot.coupling.T
     still = np.where(robot.prismatic, STILL_MM, still_rad)
     same = np.column_stack([_clusters(v, s) for v, s in zip(kinematic.T, still, strict=True)])
-    arcs, notes, missing = [], [], []
+    arcs, notes = [], []
     for j, joint in enumerate(robot.joints):
-        groups, least, before = defaultdict(list), DISTINCT[joint.type], len(arcs)
+        groups, least = defaultdict(list), DISTINCT[joint.type]
         for row, others in enumerate(np.delete(same, j, axis=1)):
             groups[data.targets[row], *others.tolist()].append(row)
         for (target, *_), rows in groups.items():
@@ -99,7 +99,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
                     f"joint {j + 1}, {called(target)}, line {data.lines[rows[0]]}: an arc of {distinct} positions is "
                     f"not used, {least} needed"
                 )
-        missing += [j] if len(arcs) == before else []
+    missing = sorted(set(range(len(robot.joints))) - {arc.joint for arc in arcs})
     if missing:
         names, least = ", ".join(str(j + 1) for j in missing), DISTINCT[robot.joints[missing[0]].type]
         raise InputError(
@@ -519,10 +519,8 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     """Returns the axis of a joint by robust least squares of the distances of its arcs' points to circles or lines.
 
     ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
-    this joint; ``where`` : the joint, for messages.
-
-    Raises DegenerateError: no redundancy, reflectors on the axis, or arcs too short to give a direction. Raises
-    InputError: the motion observed about the axis is not that of the joint's values.
+    this joint; ``where`` : the joint, for messages. Raises DegenerateError: no redundancy, reflectors on the axis, or
+    arcs too short to give a direction. Raises InputError: a motion that is not that of the joint's values.
     """
     size = np.array([np.linalg.norm(p - p.mean(axis=0), axis=1).max() for p in (points[arc.rows] for arc in arcs)])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:

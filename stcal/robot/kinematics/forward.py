@@ -20,18 +20,11 @@ CHUNK = 8192
 def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
     """Returns base_from_tool of each joint vector.
 
-    Parameters
-    ----------
-    robot : an arm of n joints; where its base stands does not matter.
-    q : (m, n) or (n,) array: values of the controller, rad or mm.
-    tool : name of the tool.
-    payload_kg : float or (m,) array, optional: mass at the flange; that of the robot if not given.
-
-    Returns
-    -------
-    Poses : m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4), ``[i].matrix()`` one.
-
-    Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
+    ``robot`` : an arm of n joints; where its base stands does not matter; ``q`` : (m, n) or (n,) values of the
+    controller, rad or mm; ``tool`` : its name; ``payload_kg`` : mass at the flange, a number or (m,); that of the robot
+    if not given. Returns m transforms, mm; one for a single joint vector. ``.matrix()`` has them as (m, 4, 4),
+    ``[i].matrix()`` one. Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that
+    no arm carries.
     """
     values, flange_from_tool = _joint_vectors(q, robot), robot.tool(tool)
     return flange_poses(_from_base(robot, tool), values, loaded(payload_kg, len(values))) @ flange_from_tool
@@ -118,7 +111,7 @@ def torques(
     if mass is None:
         mass = np.full(len(q), elasticity.payload_kg)
     if mass.any():
-        if "" not in chain.tree.carriers:
+        if "" not in chain.order.carriers:
             raise InputError(
                 "E-ROBOT-TREE",
                 "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
@@ -191,7 +184,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.tree.mounts:
+        if chain.tree is not None:
             moved[i] = axes, origin
     return axes, origin
 

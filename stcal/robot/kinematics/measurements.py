@@ -191,19 +191,11 @@ def read_measurements(
     Poses whose ``status`` says that another pose fits the image as well, and copies of a row, are left out with a note.
     Another note names the columns that are not read.
 
-    Parameters
-    ----------
-    path : table (CSV; form: ``data_layout.md``).
-    robot : the robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
-    quaternions : {"wxyz", "xyzw"}; ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the
-        order of the columns.
-    rotation : convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
-        (``data_layout.md``).
-    payload_kg : mass at the flange in all rows, if there is no column ``payload_kg``.
-
-    Returns
-    -------
-    Measurements : in the instrument's frame; mm, rad.
+    ``path`` : table (CSV; form: ``data_layout.md``); ``robot`` : the robot that was measured: its number and types of
+    joints are needed, and its reach, to check positions; ``quaternions`` : ``wxyz`` reads them by the names of their
+    columns, ``xyzw`` takes x, y, z, w in the order of the columns; ``rotation`` : convention of angles, if their
+    columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` … (``data_layout.md``); ``payload_kg`` : mass at the
+    flange in all rows, if there is no column ``payload_kg``. Returns them in the instrument's frame; mm, rad.
 
     Raises InputError: missing columns, bad rows, joint values of another unit or number than the robot's, angles whose
     convention is open, masses that no arm carries; the message names the line.
@@ -453,15 +445,9 @@ def read_targets(
 ) -> Targets:
     """Reads commanded poses, or joint values that command them.
 
-    Parameters
-    ----------
-    path : table (CSV; form: ``data_layout.md``).
-    robot : the robot with the tools of the targets, and with the joints if joint values are given.
-    quaternions, rotation, payload_kg : as of :func:`read_measurements`.
-
-    Returns
-    -------
-    Targets : base_from_tool, mm; joint values, rad or mm.
+    ``path`` : table (CSV; form: ``data_layout.md``); ``robot`` : the robot with the tools of the targets, and with the
+    joints if joint values are given; ``quaternions``, ``rotation``, ``payload_kg`` : as of :func:`read_measurements`.
+    Returns base_from_tool, mm; joint values, rad or mm.
 
     Raises InputError: neither poses nor joint values, positions without orientation, angles whose convention is open,
     bad rows, masses that no arm carries; the message names the line.

@@ -328,15 +328,11 @@ class Robot(Brief):
     ) -> "Robot":
         """Returns the robot of a table of Denavit–Hartenberg parameters; warns of limits that seem to be degrees.
 
-        Parameters
-        ----------
-        table : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad)
-        convention : {"standard", "modified"}: of all rows; see :class:`DHRow`
-        limits : (n, 2) lowest and highest value of each joint, rad or mm; unlimited if not given
-        types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
-        name : for messages and reports
-
-        Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        ``table`` : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base, and Hayati's β (rad);
+        ``convention`` : of all rows, see :class:`DHRow`; ``limits`` : (n, 2) lowest and highest value of each joint,
+        rad or mm, unlimited if not given; ``types`` : one for each joint, all revolute if not given; ``name`` : for
+        messages and reports. Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and
+        :class:`Joint` refuse.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
@@ -439,7 +435,7 @@ class Chain:
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
-    tree: Tree = None  # pyright: ignore[reportAssignmentType]  # made below: its last joint carries all tools
+    tree: Tree | None = None
     flange_joint: int | None = None
 
     def __post_init__(self):
@@ -448,12 +444,14 @@ class Chain:
         freeze(self, "translation", (n, 3), "chain")
         freeze(self, "prismatic", (n,), "chain", bool)
         freeze(self, "coupling", (n, None), "coupling")
-        if self.tree is None:
-            object.__setattr__(self, "tree", Tree({}, {"": n - 1}))
-            object.__setattr__(self, "flange_joint", n - 1)
 
     def __len__(self) -> int:
         return len(self.prismatic)
+
+    @property
+    def order(self) -> Tree:
+        """The tree, without branches if the arm is serial."""
+        return self.tree or Tree({}, {"": len(self) - 1})
 
     def gap(self, i: int) -> Rigid:
         """Frame of joint ``i`` in that of the joint that carries it."""
@@ -461,7 +459,7 @@ class Chain:
 
     def after(self, i: int) -> int:
         """The joint that carries joint ``i``; −1 for the world."""
-        return self.tree.after(i)
+        return self.order.after(i)
 
     def end(self, i: int) -> Rigid:
         """End of the row of joint ``i`` in its frame; of a serial arm the flange."""
@@ -469,11 +467,11 @@ class Chain:
 
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
-        return self.tree.carriers.get(target, len(self) - 1)
+        return self.order.carriers.get(target, len(self) - 1)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
-        found = {name: np.isin(np.arange(len(self)), self.tree.path(self.carrier(name))) for name in set(targets)}
+        found = {name: np.isin(np.arange(len(self)), self.order.path(self.carrier(name))) for name in set(targets)}
         return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
 
     def behind(self) -> np.ndarray:
@@ -502,11 +500,11 @@ class Chain:
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
-        if self.flange_joint is None:
+        if self.flange_joint is None and self.tree is not None:
             raise InputError(
                 "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
             )
-        return self.tree.path(self.flange_joint)
+        return self.order.path(len(self) - 1 if self.flange_joint is None else self.flange_joint)
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -1,17 +1,12 @@
 """Measured data of robots: units, kinds, and every mistake named by its line."""
 
-import json
-
 import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.robot_file import save_robot
-from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.robot.use.compensation import joint_cells, joint_columns
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
 from tests.outcome import fails_with, refuses
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
@@ -97,28 +92,14 @@ def test_mistakes_are_named(tmp_path, text, words):
         read(tmp_path, text)
 
 
-def test_ambiguous_poses_are_left_out_and_told(tmp_path, stcal_robot):
-    """As ``stcal-sfm measure --joints`` writes it: of 40 poses two are flipped, and said to be ambiguous."""
-    rng = np.random.default_rng(5)
-    true = placed(made(mh80(), rng), Rigid.exp([0.1, 0.2, 0.3, 500, 600, 700]), {"": Rigid()})
-    seen = measured(true, joint_vectors(true, 40, rng), rng)
-    lines = [",".join(["image", "status", *POSE, *joint_columns(true)])]
-    for i, (pose, q) in enumerate(zip(seen.poses(), seen.q, strict=True)):
-        flip, word = (Rigid.exp([0.5, 0, 0, 0, 0, 0]), "ambiguous") if i in (3, 20) else (Rigid(), "certain")
-        lines.append(",".join([f"{i}.jpg", word, *pose_cells(pose @ flip), *map(str, joint_cells(true, q))]))
-    save_robot(tmp_path / "robot.toml", mh80())
-    path = tmp_path / "poses.csv"
-    path.write_text("\n".join(lines) + "\n")
-    data = read_measurements(path, mh80())
-    assert len(data) == 38
-    assert list(data.lines)[:4] == [2, 3, 4, 6]
-    words = "--robot", tmp_path / "robot.toml", "--folds", 0, "--json", tmp_path / "found.json"
-    code, out, _ = stcal_robot("identify", path, *words)
-    assert code == 0
-    assert "2 of 40 rows left out, first line 5: their status is ambiguous" in out
-    assert "38 poses from robot data" in out
-    assert "outliers" not in out
-    assert "2 of 40 rows" in json.loads((tmp_path / "found.json").read_text())["notes"][0]
-    path.write_text(path.read_text().replace("certain", "ambiguous"))
-    with fails_with("E-MEASURED-REACH … 40 … 40"):
-        read_measurements(path, mh80())
+def test_ambiguous_poses_are_left_out_and_told(tmp_path):
+    """As ``stcal-sfm measure --joints`` writes it: two of 8 poses could be flipped."""
+    head = ",".join(["image", "status", *POSE, "q1_mm", "q2_deg"])
+    words = {i: "ambiguous" if i in (3, 6) else "certain" for i in range(8)}
+    lines = [f"{i}.jpg,{word},{','.join(pose_cells(POSES[i % 2]))},{i},{i}" for i, word in words.items()]
+    text = "\n".join([head, *lines])
+    data = read(tmp_path, text)
+    assert list(data.lines) == [2, 3, 4, 6, 7, 9]
+    assert "2 of 8 rows left out, first line 5: their status is ambiguous" in data.notes[0]
+    with fails_with("E-MEASURED-REACH … 8 … 8"):
+        read(tmp_path, text.replace("certain", "ambiguous"))
