@@ -49,18 +49,6 @@ def test_it_ends_where_the_weighted_gradient_is_zero(case):
     assert np.abs(gradient * sigma).max() < 1e-2
 
 
-def test_the_normal_matrix_is_that_of_whitened_derivatives(case):
-    state, seen = case
-    found = ArmProblem(seen, WEIGHTING, robust=False).solve(state)
-    slope = WEIGHTING.whiten(jacobian(found.state, seen), seen).reshape(-1, len(found.units))
-    scaled = found.units * slope
-    np.testing.assert_allclose(
-        found.equations.normal * np.outer(found.units, found.units), scaled.T @ scaled, rtol=1e-9, atol=1e-3
-    )
-    assert found.rank() == len(found.units)
-    assert (found.weights == 1).all()
-
-
 def test_what_is_common_to_all_observations_is_whitened_too():
     """Values with covariance Σ = own + F Fᵀ become independent, of σ 1: the whitened Σ is the identity."""
     rng = np.random.default_rng(0)
