@@ -92,7 +92,7 @@ def swept(cell):
     """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
-    targets, options = wanted(cell.about(12)), IdentifyOptions(repeats=1)
+    targets, options = wanted(cell.about(12)), IdentifyOptions(folds=3, repeats=1)
     return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
 
 

@@ -303,7 +303,7 @@ class ArmSolution:
         """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show. Where the
         same joint values were measured several times, the model errs once."""
         assert self.spread is not None
-        covariance = self.spread.covariance(np.zeros(len(self.spread.least)))
+        covariance = self.spread.covariance()
         measured, whiten, k = self.problem.measured, self.problem.weighting.whiten, len(self.units)
         if measured.kind == "distance":
             blind = self.spectrum()[1][:, : UNSEEN["distance"]]
@@ -351,26 +351,26 @@ class Spread:
         starts = (np.zeros(len(data)), np.where(data, QUIETER, self.parts.expected))
         return self.parts.best(self.least, self.most, starts)
 
-    def covariance(self, best: np.ndarray) -> np.ndarray:
-        """Returns the covariance (k, k) of the parameters about the estimate at ``best`` (p,), by a product rule, or by
+    def covariance(self) -> np.ndarray:
+        """Returns the covariance (k, k) of the parameters about the estimate at the present σ, by a product rule, or by
         a cubature (Arasaratnam & Haykin 2009), over the log σ that are above their lower limit."""
-        free = np.flatnonzero(best > self.least + STEP)
-        moves, f = STEP * np.eye(len(best))[free], len(free)
-        points = np.concatenate([best + moves, best - moves])
+        free = np.flatnonzero(self.least < -STEP)
+        moves, f = STEP * np.eye(len(self.least))[free], len(free)
+        points = np.concatenate([moves, -moves])
         gradient = np.array([self.parts.at(x)[1] for x in points]).reshape(points.shape)
         hessian = (gradient[:f] - gradient[f:])[:, free] / (2 * STEP)
         values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
         # a flat or rising direction is at most as wide as the prior
         values = np.maximum(values, np.min(self.parts.doubt, initial=1.0) ** -2.0)
-        root = np.zeros((len(best), f))
+        root = np.zeros((len(self.least), f))
         root[free] = directions / np.sqrt(values)
         if f > MOST_PRODUCT:
             z, rule = np.sqrt(f) * np.vstack([np.eye(f), -np.eye(f)]), np.full(2 * f, 0.5 / f)
         else:
             index = np.indices((len(NODES),) * f).reshape(f, len(NODES) ** f).T
             z, rule = NODES[index], NODE_WEIGHTS[index].prod(1)
-        log_density, _, step, inverse = map(np.array, zip(*map(self.parts.at, best + z @ root.T), strict=True))
-        middle = self.parts.at(best)
+        log_density, _, step, inverse = map(np.array, zip(*map(self.parts.at, z @ root.T), strict=True))
+        middle = self.parts.at(np.zeros(len(self.least)))
         log_weight = np.log(rule) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()

@@ -402,7 +402,7 @@ class Evaluation:
     @property
     def wrong_lines(self) -> list[int]:
         """Lines of the rows that no robot explains."""
-        return [line for line, wrong in zip(self.lines, self.wrong, strict=True) if wrong]
+        return [self.lines[row] for row in np.flatnonzero(self.wrong)]
 
 
 class EvaluationFile(ResultFile):

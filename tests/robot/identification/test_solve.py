@@ -94,7 +94,7 @@ def test_derivatives_are_those_of_differences(kind, tree):
 @pytest.mark.slow
 def test_held_out_error_is_that_of_new_poses():
     true, data = simulated(5, 60)
-    found = identify(mh80(), data)
+    found = identify(mh80(), data, IdentifyOptions(repeats=1))
     q = joint_vectors(true, 500, np.random.default_rng(7))
     own, of = (tips(each, q, ("",) * 500) for each in (found.state, State(true.chain(), dict(true.tools))))
     model = np.linalg.norm(of.translation - own.translation, axis=1)

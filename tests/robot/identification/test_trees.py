@@ -138,7 +138,7 @@ def test_two_arms_are_identified_together():
     rng = np.random.default_rng(4)
     nominal = two_arms()
     true = made(nominal, rng)
-    found = identify(nominal, seen_by(true, rng), IdentifyOptions(repeats=1))
+    found = identify(nominal, seen_by(true, rng), IdentifyOptions(folds=0))
     assert found.rank == 4 * 14 + 6 * 3
     assert found.undetermined == ()
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.15)
