@@ -47,8 +47,10 @@ def convert(
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    from_xml, to_xml = _is_xml(source), out.suffix.lower() in XML
-    made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
+    known, to_xml = source.suffix.lower() in (*XML, ".toml"), out.suffix.lower() in XML
+    made = None if known else read_universal(source, nominal, convention)
+    begin = b"" if known else source.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")
+    from_xml = source.suffix.lower() in XML or begin.startswith(b"<")
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
     if (from_link or to_link) and (made is not None or not from_xml):
@@ -108,16 +110,6 @@ def _write_table(path: Path | None, text: "Callable[[], str]") -> None:
     if path is not None:
         write(path, content := text())
         require_text_written(path, content)
-
-
-def _is_xml(path: Path) -> bool:
-    if path.suffix.lower() in (*XML, ".toml"):
-        return path.suffix.lower() in XML
-    try:
-        with path.open("rb") as file:
-            return file.read(200).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-    except OSError as error:
-        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
 
 
 def init(file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml")) -> None:

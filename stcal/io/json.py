@@ -189,7 +189,7 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "matrix"):
         return value.matrix().tolist()
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return _plain(value.tolist())
     if is_dataclass(value):
         return Named(_names(type(value))).checked(value)
     if isinstance(value, dict):

@@ -6,6 +6,7 @@ step are those of its own command, so that each step can be repeated by itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from stcal.io.cameras.read import camera_model
 from stcal.io.files import json_text, require_text_written, save
 from stcal.io.images import find_images
 from stcal.io.join import join_tables
-from stcal.io.json import ResultFile, require_result_written
+from stcal.io.json import require_result_written
 from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress, scratch_folder
 from stcal.report.document import Document, Section, bullets, links, listed
@@ -184,54 +185,41 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     ).page()
 
 
-POSES = "poses.csv"
-
-
-def _results(result: FromPhotos) -> dict[str, ResultFile]:
-    models: dict[str, type[ResultFile]] = {
-        "axes": AxesFile,
-        "identified": IdentifiedFile,
-        "compensated": CompensationFile,
-    }
-    parts = {name: getattr(result, name) for name in models}
-    found = {f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None}
-    return {"poses.json": pose_report.poses_file(result.measured), **found}
+def _steps(result: FromPhotos) -> dict[str, tuple]:
+    """Returns for each step: kind, text and check of its table or robot file, its result file, and its page."""
+    measured, axes, identified, compensated = result.measured, result.axes, result.identified, result.compensated
+    source = f"Identified from {result.data.where}: {identified.rank} parameters."
+    table, content = pose_report.poses_csv(measured)[0], pose_report.poses_file(measured)
+    check, page = pose_report.require_table_written, partial(pose_report.measure_report, measured, result.images)
+    steps: dict[str, tuple] = {"poses": ("csv", table, partial(check, result=measured), content, page)}
+    if axes is not None:
+        text = robot_toml(axes.robot, ["Identified by the axis method from the sweeps."])
+        again = partial(require_robot_written, robot=axes.robot, chain=axes.chain)
+        page = partial(axes_report, axes, result.data.where)
+        steps["axes"] = "toml", text, again, AxesFile.model_validate(axes), page
+    text, again = robot_toml(identified.robot, [source]), partial(require_identified_written, result=identified)
+    page = partial(identified_report, identified)
+    steps["identified"] = "toml", text, again, IdentifiedFile.model_validate(identified), page
+    if compensated is not None:
+        text, content = compensated_csv(compensated, identified.robot), CompensationFile.model_validate(compensated)
+        again, page = partial(require_text_written, text=text), partial(compensation_report, compensated)
+        steps["compensated"] = "csv", text, again, content, page
+    return steps
 
 
 def files_of(result: FromPhotos) -> dict[str, str]:
     """Returns the contents of all files, by name."""
-    identified, compensated = result.identified.robot, result.compensated
-    source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
-    files = {name: json_text(content) for name, content in _results(result).items()} | {
-        POSES: pose_report.poses_csv(result.measured)[0],
-        "poses.html": pose_report.measure_report(result.measured, result.images).page(),
-        "identified.toml": robot_toml(identified, [source]),
-        "identified.html": identified_report(result.identified).page(),
-    }
-    if result.axes is not None:
-        files |= {
-            "axes.toml": robot_toml(result.axes.robot, ["Identified by the axis method from the sweeps."]),
-            "axes.html": axes_report(result.axes, result.data.where).page(),
-        }
-    if compensated is not None:
-        files |= {
-            "compensated.csv": compensated_csv(compensated, identified),
-            "compensated.html": compensation_report(compensated).page(),
-        }
-    files = dict(sorted(files.items(), key=lambda item: [*STAGES].index(item[0].split(".")[0])))
+    files: dict[str, str] = {}
+    for name, (kind, text, _, content, page) in _steps(result).items():
+        files |= {f"{name}.json": json_text(content), f"{name}.{kind}": text, f"{name}.html": page().page()}
     return files | {"report.html": from_photos_page(result, tuple(files))}
 
 
 def require_files_written(out: Path, result: FromPhotos) -> None:
     """Read the files of :func:`files_of` in ``out`` again, and require what was reported."""
-    for name, content in _results(result).items():
-        require_result_written(out / name, content)
-    pose_report.require_table_written(out / POSES, result.measured)
-    require_identified_written(out / "identified.toml", result.identified)
-    if result.axes is not None:
-        require_robot_written(out / "axes.toml", result.axes.robot, result.axes.chain)
-    if result.compensated is not None:
-        require_text_written(out / "compensated.csv", compensated_csv(result.compensated, result.identified.robot))
+    for name, (kind, _, again, content, _) in _steps(result).items():
+        require_result_written(out / f"{name}.json", content)
+        again(out / f"{name}.{kind}")
 
 
 PHOTOGRAPHS = "the photographs"
@@ -306,7 +294,7 @@ def from_measured(
     """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
     :func:`robot_from_photos`."""
     with scratch_folder("photos") as folder:
-        written = folder / POSES
+        written = folder / "poses.csv"
         save(written, pose_report.poses_csv(measured)[0])
         joined = join_tables(replace(read_table(written, "poses"), where=PHOTOGRAPHS), values, pose_report.IMAGE)
     data = read_measurements(joined.table, nominal)

@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import require_new_folder, save_folder
 from stcal.io.images import Skipped
-from stcal.io.table import Table, pose_cells, read_table
+from stcal.io.table import POSE, Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Targets
@@ -92,7 +92,7 @@ def swept(cell):
     """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
-    targets, options = wanted(cell.about(12)), IdentifyOptions(repeats=1)
+    targets, options = wanted(cell.about(12)), IdentifyOptions(folds=3, repeats=1)
     return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
 
 
@@ -103,10 +103,10 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_to
     assert axes < drawn / 2
     assert 0.5 * same < held < 1.5 * same  # 30 parameters of 71 poses: √((426 + 30) / (426 - 30)) is 1.07
     assert len(swept.data) == len(SWEEPS) + 29
-    alone = [note for note in swept.notes if "no partner" in note]
-    assert [note.split(" rows")[0] for note in alone] == ["1", "1"]
-    assert "a/071.png" in alone[0]
-    assert "a/lost.png" in alone[1]
+    photograph, row = (note for note in swept.notes if "no partner" in note)
+    assert photograph.startswith("1 rows")
+    assert "a/071.png" in photograph
+    assert "a/lost.png" in row
     # targets among the rows are known as these are
     sigma = swept.sigma_mm()
     assert 0.8 < np.median(sigma) / np.median(swept.identified.predicted.here_mm) < 1.25  # 0.97 to 1.06 of 20 arms
@@ -124,6 +124,7 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_to
 @pytest.mark.slow
 def test_files_are_read_by_the_next_step(tmp_path, swept):
     save_folder(tmp_path / "arm", files_of(swept))
+    work.require_files_written(tmp_path / "arm", swept)
     steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
     names = {f"{step}.{kind}" for step, own in steps.items() for kind in (own, "json", "html")}
     assert {path.name for path in (tmp_path / "arm").iterdir()} == names | {"report.html"}
@@ -145,27 +146,31 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     assert found.errors["as drawn"].rms > 5 * found.errors["identified, the same rows"].rms
 
 
+@pytest.fixture(scope="module")
+def photographed():
+    scene = make_scene(SceneOptions(images_per_group=2))
+    return scene, known_target(scene, NOISE_PX).measured(np.random.default_rng(1))
+
+
 @pytest.fixture
-def given(tmp_path, monkeypatch):
+def given(tmp_path, monkeypatch, photographed):
     """Inputs; measuring would fail the test."""
+    scene, target = photographed
     (tmp_path / "views/a").mkdir(parents=True)
+    (tmp_path / "empty").mkdir()
     for i in range(8):
         (tmp_path / f"views/a/{i:03d}.png").write_bytes(b"")
+
+    def call(header, rows, robot=None, key="image", images="views", targets=None):
+        with (tmp_path / "log.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([header, *rows])
+        log, arm = tmp_path / "log.csv", mh80() if robot is None else robot
+        work.robot_from_photos(tmp_path / images, scene.camera, target, scene.target, log, arm, targets, key=key)
 
     def unwanted(*_):
         raise AssertionError("measured")
 
     monkeypatch.setattr(work, "measure", unwanted)
-
-    def call(header, rows, robot=None, key="image", images="views", targets=None):
-        with (tmp_path / "log.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([header, *rows])
-        robot = mh80() if robot is None else robot
-        scene = make_scene(SceneOptions(images_per_group=2))
-        target = known_target(scene, NOISE_PX).measured(np.random.default_rng(1))
-        log, photographs = tmp_path / "log.csv", tmp_path / images
-        work.robot_from_photos(photographs, scene.camera, target, scene.target, log, robot, targets, key=key)
-
     return call
 
 
@@ -174,11 +179,10 @@ def rows_of(names=None):
     return [[name, *map(float, range(i, i + 6))] for i, name in enumerate(names)]
 
 
-def test_the_inputs_of_these_tests_are_taken(given):
+@pytest.mark.parametrize("key", ["image", "photo"])
+def test_the_inputs_of_these_tests_are_taken(given, key):
     with pytest.raises(AssertionError, match="measured"):
-        given(["image", *JOINTS], rows_of())
-    with pytest.raises(AssertionError, match="measured"):
-        given(["photo", *JOINTS], rows_of(), key="photo")
+        given([key, *JOINTS], rows_of(), key=key)
 
 
 def with_joints(*chosen) -> Robot:
@@ -188,39 +192,28 @@ def with_joints(*chosen) -> Robot:
     return replace(nominal, joints=tuple(joints), rows=tuple(rows), coupling=np.eye(len(chosen)))
 
 
-NAMED, OTHERS, TWICE = rows_of(), rows_of([f"b/{i}.png" for i in range(8)]), rows_of(["a/000.png"] * 2)
+HEAD, NAMED = ["image", *JOINTS], rows_of()
+GRIPPER = Table("targets.csv", {"target": ["gripper"]} | dict.fromkeys(JOINTS, np.zeros(1)), [2])
+WITH_GRIPPER = {"robot": replace(mh80(), tools={"": Rigid(), "gripper": Rigid()}), "targets": GRIPPER}
+SEVEN = "E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_deg"
 
 
 @pytest.mark.parametrize(
-    ("rows", "options", "error"),
+    ("head", "rows", "options", "error"),
     [
-        (NAMED, {"images": "empty"}, "E-IMAGES-NONE … jpg"),
-        (OTHERS, {}, "E-TABLES-UNMATCHED … image … a/000.png … b/0.png"),
-        (NAMED, {"key": "photo"}, "E-TABLE-COLUMN-MISSING … log.csv … photo … --key"),
-        (TWICE, {}, "E-TABLE-ROW-REPEATED … 3 … image … a/000.png … 2"),
-        (NAMED, {"robot": with_joints(*range(5))}, "E-ROBOT-MISMATCH … log.csv … 6 … MH80 … 5"),
-        (
-            NAMED,
-            {"robot": with_joints(*range(6), 0)},
-            "E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_deg",
-        ),
+        (HEAD, NAMED, {"images": "empty"}, "E-IMAGES-NONE … jpg"),
+        (HEAD, rows_of(["b/0.png", "b/1.png"]), {}, "E-TABLES-UNMATCHED … image … a/000.png … b/0.png"),
+        (HEAD, NAMED, {"key": "photo"}, "E-TABLE-COLUMN-MISSING … log.csv … photo … --key"),
+        (HEAD, rows_of(["a/000.png"] * 2), {}, "E-TABLE-ROW-REPEATED … 3 … image … a/000.png … 2"),
+        (HEAD, NAMED, {"robot": with_joints(*range(5))}, "E-ROBOT-MISMATCH … log.csv … 6 … MH80 … 5"),
+        (HEAD, NAMED, {"robot": with_joints(*range(6), 0)}, SEVEN),
+        (HEAD, NAMED, WITH_GRIPPER, "E-ROBOT-NO-TOOL … targets.csv … 2 … 'gripper' … MH80 … ''"),
+        ([*HEAD, *POSE], [[*row, *pose_cells(Rigid())] for row in NAMED], {}, "E-TABLES-BOTH … x_mm"),
     ],
 )
-def test_what_is_refused(given, tmp_path, rows, options, error):
-    (tmp_path / "empty").mkdir()
+def test_what_is_refused(given, head, rows, options, error):
     with fails_with(error):
-        given(["image", *JOINTS], rows, **options)
-
-
-def test_a_tool_that_is_not_photographed_and_poses_beside_joint_values_are_refused(given):
-    nominal = replace(mh80(), tools={"": Rigid(), "gripper": Rigid()})
-    q = np.zeros((1, 6)).T
-    targets = Table("targets.csv", {"target": ["gripper"]} | dict(zip(JOINTS, q, strict=True)), [2])
-    with fails_with("E-ROBOT-NO-TOOL … targets.csv … 2 … 'gripper' … MH80 … ''"):
-        given(["image", *JOINTS], rows_of(), nominal, targets=targets)
-    head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
-    with fails_with("E-TABLES-BOTH … x_mm"):
-        given(["image", *JOINTS, *head], [[*row, *pose_cells(Rigid())] for row in rows_of()])
+        given(head, rows, **options)
 
 
 def test_joint_values_by_another_column_are_those_of_the_photographs(tmp_path):

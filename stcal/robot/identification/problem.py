@@ -13,7 +13,7 @@ from functools import partial
 from itertools import compress
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import eigh
 from scipy.special import chdtr, chdtrc
 from scipy.stats import chi2
 
@@ -160,7 +160,9 @@ class ArmProblem:
             straight, curved = fit.equations + kept(at[1]), fit.curvature() if bends else None
             if curved is None:
                 return straight
-            return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
+            directions, share = bent(straight.normal, curved)
+            along = straight.normal @ directions
+            return replace(straight, normal=straight.normal - (along * share) @ along.T)
 
         def cost(at: Away) -> float:
             return self._cost(self.weighting.whiten(residuals(at[0], measured), measured))[0] + float(kept(at[1]).cost)
@@ -283,7 +285,8 @@ class ArmSolution:
             # At the minimum the data pull as much as held and fixed parts hold; this changes with the σ of these parts.
             holds = np.isfinite(doubt)
             holding = fixed.normal + sum(own.normal for own in compress(each, holds))
-            bends = Bent.of(holding, curved * self.units[:, None] * self.units).bends()
+            directions, share = bent(holding, curved * self.units[:, None] * self.units)
+            bends = (directions * np.sqrt(1 - share)) @ directions.T @ holding
             *each, fixed = (
                 replace(own, normal=bends.T @ own.normal @ bends) if hold else own
                 for own, hold in zip((*each, fixed), (*holds, True), strict=True)
@@ -300,7 +303,7 @@ class ArmSolution:
         """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show. Where the
         same joint values were measured several times, the model errs once."""
         assert self.spread is not None
-        covariance = self.spread.covariance(np.zeros(len(self.spread.least)))
+        covariance = self.spread.covariance()
         measured, whiten, k = self.problem.measured, self.problem.weighting.whiten, len(self.units)
         if measured.kind == "distance":
             blind = self.spectrum()[1][:, : UNSEEN["distance"]]
@@ -323,34 +326,13 @@ class ArmSolution:
         return None if self.problem.measured.kind == "distance" or len(first) == len(rows) else place.ravel()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Bent:
-    """Shares, at most :data:`MOST_BENT`, of a normal matrix (k, k) with this ``root`` that second derivatives take
-    away: ``share`` : (k,) of each of ``directions`` (k, k), columns that are independent in the matrix's metric."""
-
-    root: np.ndarray
-    directions: np.ndarray
-    share: np.ndarray
-
-    @classmethod
-    def of(cls, normal: np.ndarray, curved: np.ndarray) -> "Bent":
-        """Returns the shares for ``curved`` (k, k), all that second derivatives take."""
-        scale = np.sqrt(np.diag(normal))
-        unit = normal / scale[:, None] / scale + ROUNDING * np.eye(len(scale))
-        root = scale[:, None] * np.linalg.cholesky(unit)
-        half = solve_triangular(root, curved, lower=True)
-        share, directions = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-        return cls(root, directions, np.minimum(share, MOST_BENT))
-
-    def taken(self) -> np.ndarray:
-        """Returns what is taken from the normal matrix, (k, k)."""
-        along = self.root @ self.directions
-        return (along * self.share) @ along.T
-
-    def bends(self) -> np.ndarray:
-        """Returns B (k, k): Bᵀ N B is what is left of the normal matrix N."""
-        wider = (self.directions * np.sqrt(1 - self.share)) @ self.directions.T
-        return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
+def bent(normal: np.ndarray, curved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns directions (k, k), in columns that are orthonormal in the metric of a normal matrix (k, k), and the share
+    (k,) of each, at most :data:`MOST_BENT`, that second derivatives ``curved`` (k, k) take from it."""
+    scale = np.sqrt(np.diag(normal))
+    unit = normal / scale[:, None] / scale + ROUNDING * np.eye(len(scale))
+    share, directions = eigh(curved / scale[:, None] / scale, unit)
+    return directions / scale[:, None], np.minimum(share, MOST_BENT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -369,26 +351,26 @@ class Spread:
         starts = (np.zeros(len(data)), np.where(data, QUIETER, self.parts.expected))
         return self.parts.best(self.least, self.most, starts)
 
-    def covariance(self, best: np.ndarray) -> np.ndarray:
-        """Returns the covariance (k, k) of the parameters about the estimate at ``best`` (p,), by a product rule, or by
+    def covariance(self) -> np.ndarray:
+        """Returns the covariance (k, k) of the parameters about the estimate at the present σ, by a product rule, or by
         a cubature (Arasaratnam & Haykin 2009), over the log σ that are above their lower limit."""
-        free = np.flatnonzero(best > self.least + STEP)
-        moves, f = STEP * np.eye(len(best))[free], len(free)
-        points = np.concatenate([best + moves, best - moves])
+        free = np.flatnonzero(self.least < -STEP)
+        moves, f = STEP * np.eye(len(self.least))[free], len(free)
+        points = np.concatenate([moves, -moves])
         gradient = np.array([self.parts.at(x)[1] for x in points]).reshape(points.shape)
         hessian = (gradient[:f] - gradient[f:])[:, free] / (2 * STEP)
         values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
         # a flat or rising direction is at most as wide as the prior
         values = np.maximum(values, np.min(self.parts.doubt, initial=1.0) ** -2.0)
-        root = np.zeros((len(best), f))
+        root = np.zeros((len(self.least), f))
         root[free] = directions / np.sqrt(values)
         if f > MOST_PRODUCT:
             z, rule = np.sqrt(f) * np.vstack([np.eye(f), -np.eye(f)]), np.full(2 * f, 0.5 / f)
         else:
             index = np.indices((len(NODES),) * f).reshape(f, len(NODES) ** f).T
             z, rule = NODES[index], NODE_WEIGHTS[index].prod(1)
-        log_density, _, step, inverse = map(np.array, zip(*map(self.parts.at, best + z @ root.T), strict=True))
-        middle = self.parts.at(best)
+        log_density, _, step, inverse = map(np.array, zip(*map(self.parts.at, z @ root.T), strict=True))
+        middle = self.parts.at(np.zeros(len(self.least)))
         log_weight = np.log(rule) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()

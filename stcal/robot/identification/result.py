@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import AliasPath, BeforeValidator, Field
+from pydantic import AliasPath, Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields, rms
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_written
-from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile, Vector
+from stcal.io.json import ByName, Matrix, Named, ResultFile, Vector
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Kind,
@@ -342,12 +342,6 @@ ERRORS = {
 }
 
 
-class PlacedPose(Part):
-    name: str
-    pose: Pose
-    sigma: Annotated[list[Finite], BeforeValidator(list)]
-
-
 class IdentifiedFile(ResultFile):
     """The result file of ``identify``."""
 
@@ -387,7 +381,7 @@ class IdentifiedFile(ResultFile):
     )
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
-    placed: list[PlacedPose] = Field(
+    placed: list[Annotated[Placed, Named()]] = Field(
         description="base in the instrument's frame, tools in the flange's: `name`, `pose` (mm), `sigma` of rotation "
         "(rad, about the outer frame's axes) and translation (mm); null where not determined"
     )

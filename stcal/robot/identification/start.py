@@ -62,18 +62,13 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     named = sorted(set(data.targets))
     _require_motion(data, named)
     carriers = named if robot.tree is None else robot.tree.carriers
-    for name in named:
-        if name not in carriers:
-            target, key = (
-                (f"target {name}", "it a [[target]] with joint")
-                if name
-                else ("the tool of rows without a target", "[tool] joint")
-            )
-            raise InputError(
-                "E-ROBOT-TREE",
-                f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; "
-                f"give {key}",
-            )
+    for name in (name for name in named if name not in carriers):
+        target = f"target {name}; give it a [[target]] with joint"
+        target = target if name else "the tool of rows without a target; give [tool] joint"
+        raise InputError(
+            "E-ROBOT-TREE",
+            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}",
+        )
     default = robot.tools.get("", Rigid())
     tools = {name: robot.tools.get(name, default) if "tool" in fit else robot.tool(name) for name in named}
     state, misfit = _placed(robot, data, tools, fit)
@@ -97,9 +92,8 @@ def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
     """Returns the state by the rows of the largest station; its positions place the others."""
     (first, most), *others = data.by_station().items()
     state = start(robot, data[most], fit)
-    default = robot.tools.get("", Rigid())
-    tools = {name: state.tools.get(name, robot.tools.get(name, default)) for name in sorted(set(data.targets))}
-    state = replace(state, tools=tools)
+    default, known = robot.tools.get("", Rigid()), {**robot.tools, **state.tools}
+    state = replace(state, tools={name: known.get(name, default) for name in sorted(set(data.targets))})
     stations = dict(state.stations)
     for name, rows in others:
         part = data[rows]
@@ -158,9 +152,10 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
     names = list(tools)
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])
+    turns = np.array([tools[name].rotation for name in names])
     if data.positions is None:  # distances show neither the base nor the instrument's place
         points, misfit = _points_of_distances(robot, flange, data, rows, points, "tool" in fit)
-        return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
+        return State(chain, dict(zip(names, map(Rigid, turns, points), strict=True))), misfit
     if "base" in fit:
         extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
         if len(extents) < 2 or extents[1] <= STILL_MM:
@@ -169,32 +164,22 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
                 f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that the instrument's pose is "
                 "not determined; move joints that take the target off the line",
             )
-    given = None if "base" in fit else robot.world_from_base
-    base, points = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
-    turns = np.array([tools[name].rotation for name in names])
+    base, points = _base_and_points(robot, data.where, flange, data.points(), rows, points, fit)
     if data.rotations is not None and "tool" in fit:
         seen = np.swapaxes(flange.rotation, 1, 2) @ (base.inverse() @ data.poses()).rotation
         turns = [best_rotations(seen[rows == k].sum(0))[0] for k in range(len(names))]
-    state = State(
-        replace(robot, world_from_base=base).chain(),
-        {name: Rigid(turn, point) for name, turn, point in zip(names, turns, points, strict=True)},
-    )
-    return state, _length_rms(base @ (flange @ points[rows]) - data.positions)
+    fitted = dict(zip(names, map(Rigid, turns, points), strict=True))
+    misfit = _length_rms(base @ (flange @ points[rows]) - data.positions)
+    return State(replace(robot, world_from_base=base).chain(), fitted), misfit
 
 
 def _base_and_points(
-    where: str,
-    flange: Poses,
-    positions: np.ndarray,
-    rows: np.ndarray,
-    points: np.ndarray,
-    given: Rigid | None = None,
-    fit_points: bool = True,
+    robot: Robot, where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray, fit: Fit
 ) -> tuple[Rigid, np.ndarray]:
-    """Returns base (unless ``given``) and tool points (t, 3) by least squares, mm."""
-    free = np.array([given is None] * 6 + [fit_points] * points.size)
+    """Returns base and tool points (t, 3) by least squares, mm; the given ones where they are not in ``fit``."""
+    free = np.array(["base" in fit] * 6 + ["tool" in fit] * points.size)
     try:
-        base = given or align_rigid(positions, flange @ points[rows])
+        base = align_rigid(positions, flange @ points[rows]) if "base" in fit else robot.world_from_base
     except DegenerateError as error:
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
@@ -202,6 +187,8 @@ def _base_and_points(
             "instrument's rotation about it is not determined; move other joints, or give the tool in the robot file "
             "if it is off the axis",
         ) from error
+    if not fit:
+        return base, points
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
     information = (np.array([spread] * 3 + [1.0] * (3 + points.size)) / USELESS_MM) ** 2
@@ -212,15 +199,10 @@ def _base_and_points(
         derivative = np.concatenate(
             [-skew(points_base @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2
         )
-        equations = NormalEquations.of(
-            (at[0] @ points_base - positions).ravel(), free * derivative.reshape(-1, derivative.shape[2])
-        )
-        return equations + NormalEquations(
-            float(at[2] @ (information * at[2])), np.diag(information), information * at[2]
-        )
+        errors = (at[0] @ points_base - positions).ravel()
+        held = NormalEquations(float(at[2] @ (information * at[2])), np.diag(information), information * at[2])
+        return NormalEquations.of(errors, free * derivative.reshape(-1, derivative.shape[2])) + held
 
-    if not free.any():
-        return base, points
     minimum = minimise(
         (base, points, np.zeros(len(information))),
         linearise,

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses, Rigid, other_axes
-from stcal.io.json import Part, ResultFile, Shape, Vector
+from stcal.io.json import Named, ResultFile, Shape, Vector
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS, csv_text
 from stcal.parallel import one_thread
@@ -72,16 +72,16 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
         return ""
     said = (
         f"nominal robot {nominal.name} and identified robot {identified.name} are {apart:.4g} mm apart at the same "
-        "joint values (RMS)"
+        "joint values (RMS),"
     )
     if apart > FITS * reach:
         raise InputError(
             "E-ROBOT-MISMATCH",
-            f"{said}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
+            f"{said} {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
             "units, D-H rows, convention and coupling of both",
         )
     return (
-        f"{said}, more than arms are off their drawing ({USUAL_SHARE:.0%} of the reach): are both files of this robot?"
+        f"{said} more than arms are off their drawing ({USUAL_SHARE:.0%} of the reach): are both files of this robot?"
     )
 
 
@@ -452,10 +452,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     return csv_text(rows)
 
 
-class Reached(Part):
-    status: list[str]
-    error_mm: Vector
-    error_rad: Vector
+OF_POSES = Named("status error_mm error_rad")
 
 
 class CompensationFile(ResultFile):
@@ -472,9 +469,13 @@ class CompensationFile(ResultFile):
         BeforeValidator(lambda poses: poses.matrix() if isinstance(poses, Poses) else poses),
     ] = Field(description="commanded base_from_tool, mm")
     joints: list[dict[str, float] | None] = Field(description="joint values by column name; null if not reached")
-    found: Reached = Field(description="`status` of each pose, and what remains: `error_mm`, `error_rad`")
+    found: Annotated[Inverse, OF_POSES] = Field(
+        description="`status` of each pose, and what remains: `error_mm`, `error_rad`"
+    )
     nominal_joints: list[dict[str, float] | None] | None = Field(description="the same of the nominal robot")
-    nominal: Reached | None = Field(description="the same of the nominal robot: `status`, `error_mm`, `error_rad`")
+    nominal: Annotated[Inverse, OF_POSES] | None = Field(
+        description="the same of the nominal robot: `status`, `error_mm`, `error_rad`"
+    )
     before_mm: Vector = Field(description="error of the nominal joint values by the identified robot, where reached")
     before_rad: Vector = Field(description="the same of the orientation")
     notes: list[str] = Field(

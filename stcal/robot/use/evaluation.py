@@ -18,7 +18,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.io.json import Matrix, Part, ResultFile, Texts, Vector
+from stcal.io.json import Named, Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.descriptions import few
 from stcal.robot.identification.adjustment import (
@@ -36,7 +36,7 @@ from stcal.robot.identification.adjustment import (
     tool_motions,
 )
 from stcal.robot.identification.prior import Placed
-from stcal.robot.identification.result import Figures, PlacedPose
+from stcal.robot.identification.result import Figures
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements, unread
@@ -93,25 +93,20 @@ class SetResult(Part):
 
     def doubt(self) -> str:
         """Returns why the measured positions may not belong to the commands; empty if they may."""
-        allowed = max(MISSES * self.pairs_mm, MISSES_MM)
-        if self.elsewhere:
-            said = self.elsewhere
-        elif abs(self.scale - 1) > SCALE_WITHIN:
-            near = abs(self.scale - 1) < MISSES
-            remedy = "check the instrument's scale" if near else "check units and the order of the poses"
+        allowed, off, said = max(MISSES * self.pairs_mm, MISSES_MM), abs(self.scale - 1), self.elsewhere
+        if not said and off > SCALE_WITHIN:
+            remedy = "check the instrument's scale" if off < MISSES else "check units and the order of the poses"
             for unit, words in UNIT_WORDS.items():
                 for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
                     if abs(self.scale / times - 1) < SCALE_WITHIN:
                         remedy = f"check units, as if the {side} ones were {words}"
             said = f"measured distances are {self.scale:.4g} times the commanded ones; {remedy}"
-        elif self.pairs_rms_mm > allowed:
+        elif not said and self.pairs_rms_mm > allowed:
             said = (
                 f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs), "
                 f"{allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
             )
-        else:
-            return ""
-        return f"set {self.name}: {said}"
+        return said and f"set {self.name}: {said}"
 
     def figures(self) -> dict[str, float]:
         """Returns the figures that are compared between sets, mm."""
@@ -201,9 +196,8 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
 def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
     """Returns the names of poses from column ``pose``, or else by equal commanded positions, counted within a set."""
     if "pose" in table:
-        names = tuple(table.text("pose"))
-        keys, first = list(zip(sets, names, strict=True)), {}
-        before = [first.setdefault(key, row) for row, key in enumerate(keys)]
+        names, first = tuple(table.text("pose")), {}
+        before = [first.setdefault(key, row) for row, key in enumerate(zip(sets, names, strict=True))]
         table.refuse(
             np.array(before) != np.arange(len(table)),
             "E-TABLE-ROW-REPEATED",
@@ -229,34 +223,35 @@ def verify(data: MeasuredPoses) -> Verification:
     rows: dict[str, dict[str, int]] = {}
     for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
         rows.setdefault(group, {})[name] = i
-    every = list(dict.fromkeys(data.names))
-    common = [name for name in every if all(name in rows_of_set for rows_of_set in rows.values())]
-    missing = {group: tuple(name for name in every if name not in rows_of_set) for group, rows_of_set in rows.items()}
+    every = dict.fromkeys(data.names)
+    missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
+    common = [name for name in every if not any(name in lacking for lacking in missing.values())]
     if len(common) < 3:
         raise InputError(
             "E-VERIFY-FEW",
             f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
             "at least 3 needed; are the commanded positions of the sets the same?",
         )
-    index = {group: np.array([rows_of_set[name] for name in common]) for group, rows_of_set in rows.items()}
-    first = next(iter(index.values()))
-    for group, rows_of_set in index.items():
-        apart = np.abs(data.commanded[rows_of_set] - data.commanded[first]).max(axis=1)
+    index = {group: np.array([own[name] for name in common]) for group, own in rows.items()}
+    first, at = next(iter(index.items()))
+    for group, own in index.items():
+        apart = np.abs(data.commanded[own] - data.commanded[at]).max(axis=1)
         if apart.max() > SAME_MM:
             k = int(apart.argmax())
             raise InputError(
                 "E-VERIFY-COMMANDED",
-                f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
-                f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
+                f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {first} and {group} "
+                f"(line {data.lines[own[k]]}); the same commands needed",
             )
-    sets = [_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items()]
-    for k, rows_of_set in enumerate(list(index.values())[1:], 1):
-        if (data.measured[rows_of_set] == data.measured[first]).all():
-            same = "measured positions are those of the first set to the last digit; give those of the instrument"
-            sets[k] = sets[k].model_copy(update={"elsewhere": same})
-    at = data.commanded[first]
-    distances = np.linalg.norm(at[1:] - at[0], axis=1)
+    sets = []
+    for group, own in index.items():
+        copied = group != first and (data.measured[own] == data.measured[at]).all()
+        sets.append(_set_result(data, group, own, common, COPIED if copied else ""))
+    distances = np.linalg.norm(data.commanded[at[1:]] - data.commanded[at[0]], axis=1)
     return Verification(data.where, tuple(common), distances, tuple(sets), missing, data.notes)
+
+
+COPIED = "measured positions are those of the first set to the last digit; give those of the instrument"
 
 
 def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
@@ -278,7 +273,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     return f"pose{'s' * int(off.sum() > 1)} {listed}: not where commanded, the others are; correct or remove"
 
 
-def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
+def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str], elsewhere: str) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
     sums = np.zeros(4)  # row by row: all pairs of thousands at once are gigabytes
@@ -291,6 +286,8 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
             "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
         )
     size = np.abs(error)
+    if not elsewhere and len(names) <= MOST_COMPARED:
+        elsewhere = _elsewhere(commanded, measured, names)
     return SetResult(
         name=name,
         error_mm=error,
@@ -300,7 +297,7 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
         pairs_rms_mm=float(np.sqrt(squares / pairs)),
         pairs_mm=float(np.sqrt(commanded_squares / pairs)),
         scale=product / commanded_squares,
-        elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
+        elsewhere=elsewhere,
     )
 
 
@@ -405,21 +402,7 @@ class Evaluation:
     @property
     def wrong_lines(self) -> list[int]:
         """Lines of the rows that no robot explains."""
-        return [line for line, wrong in zip(self.lines, self.wrong, strict=True) if wrong]
-
-
-FINDING = "`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`"
-
-
-class EvaluatedRobot(Part):
-    name: str
-    position_mm: Figures
-    good_mm: Figures
-    orientation_rad: Figures | None
-    placed: list[PlacedPose] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
-    left: list[Finding] | None = Field(description=f"what the residuals go with: {FINDING}; null of too few rows")
-    beyond: list[Finding] | None = Field(description=f"what an identification from these rows would leave: {FINDING}")
-    residuals: Matrix = Field(description="of each row: measured minus modelled position in the base, or distance, mm")
+        return [self.lines[row] for row in np.flatnonzero(self.wrong)]
 
 
 class EvaluationFile(ResultFile):
@@ -431,9 +414,14 @@ class EvaluationFile(ResultFile):
     lines: list[int] = Field(description="of the data file, of each row")
     wrong_lines: list[int] = Field(description="those that no robot explains; nothing was fitted to them")
     best: str = Field(description="the robot that is better than all others by more than chance; empty: none is")
-    robots: list[EvaluatedRobot] = Field(
+    robots: list[
+        Annotated[Evaluated, Named("name position_mm good_mm orientation_rad placed left beyond residuals")]
+    ] = Field(
         description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
-        "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`"
+        "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`; `placed` as "
+        "of `identify`, null what is the file's; what the residuals go with, `left`, and what an identification from "
+        "these rows would leave, `beyond`: as `left` of `identify`; `residuals` of each row: measured minus modelled "
+        "position in the base, or distance, mm"
     )
     differences: list[Difference] = Field(
         description="`mm`: mean error of the `worse` robot less that of the `better` on the same rows without the "
@@ -506,13 +494,12 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
         whole = observed(measured.data, "pose")
         rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
     good = measured[np.flatnonzero(~wrong)]
-    tip, parts = tips_of(state, good.data), [np.zeros((len(good), WIDTH[good.kind], 0))]
+    tip, moves = tips_of(state, good.data), [np.zeros((len(good.data), 6, 0))]
     if "base" in fit and good.kind != "distance":
-        parts.append(as_seen(state, good, tip, frame_motions(tip, base.translation)))
+        moves.append(frame_motions(tip, base.translation))
     if "tool" in fit:
-        tools = (tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools)
-        parts += [as_seen(state, good, tip, moves) for moves in tools]
-    fitted, one = np.concatenate(parts, axis=2), Weighting(1.0, 1.0)
+        moves += [tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools]
+    fitted, one = as_seen(state, good, tip, np.concatenate(moves, axis=2)), Weighting(1.0, 1.0)
     seeks = np.concatenate([fitted, jacobian(state, good)], axis=2)
     if in_base.shape[1] == 3:
         stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
@@ -540,10 +527,8 @@ def _placed(
     covariance = found.ravel() @ found.ravel() / max(found.size - k, 1) * inverse
     at, placed = 0, []
     if with_base:
-        sigma = np.full(6, np.nan)
-        if "base" in fit:
-            sigma, at = np.sqrt(np.diag(covariance)[:6]), 6
-        placed.append(Placed("base", base, sigma))
+        at = 6 * ("base" in fit)
+        placed.append(Placed("base", base, np.sqrt(np.diag(covariance)[:6]) if at else np.full(6, np.nan)))
     for name, tool in state.tools.items():
         sigma = np.full(6, np.nan)
         if "tool" in fit:
@@ -561,7 +546,5 @@ def _differences(robots: tuple[Evaluated, ...], good: np.ndarray) -> tuple[Diffe
         apart = (worse.errors_mm - better.errors_mm)[good]
         mean, sigma = float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else np.inf
         p = 2 * t_distribution.sf(mean / sigma, len(apart) - 1) if 0 < sigma < np.inf else float(mean == 0 or sigma > 0)
-        found.append(
-            Difference(better.robot.name, worse.robot.name, mean, sigma, float(min(1.0, (len(order) - 1) * p)))
-        )
+        found.append(Difference(better.name, worse.name, mean, sigma, float(min(1.0, (len(order) - 1) * p))))
     return tuple(found)

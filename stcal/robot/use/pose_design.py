@@ -167,10 +167,7 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         )
     chosen, exchanges = choose(rows, options.count)
     sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
-    predict = identification_jacobian(robot, q[:TEST_POSES], "position", tool=options.tool)
-    if options.observe == "pose":  # the tool's rotation does not move it
-        predict = np.insert(predict, [predict.shape[2] - 3] * 3, 0.0, axis=2)
-    predict = predict * scale @ basis
+    predict = identification_jacobian(robot, q[:TEST_POSES], options.observe, tool=options.tool)[:, -3:] * scale @ basis
     return PoseDesign(
         q=q[chosen],
         poses=forward(robot, q[chosen], options.tool),

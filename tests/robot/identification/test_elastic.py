@@ -39,12 +39,22 @@ def elsewhere(found: Identified, true: Robot) -> float:
     return rms(np.linalg.norm(seen.translation - really.translation, axis=1))
 
 
-@pytest.mark.slow
-def test_an_elastic_arm_is_told_and_predicted():
-    """Rigid, it is off by 0.15 mm and more at new joint values; its σ of 0.05 mm per coordinate comes out."""
+RIGID, ELASTIC = IdentifyOptions(folds=0), IdentifyOptions(model="elastic", folds=0)
+AUTO = IdentifyOptions(model="auto", folds=3, repeats=1)
+
+
+@pytest.fixture(scope="module")
+def bending():
+    """An elastic arm, its positions, and what is identified of it."""
     true, data = drawn(60, 0)
-    rigid = identify(mh80(), data, IdentifyOptions(folds=0))
-    found = identify(mh80(), data, IdentifyOptions(model="auto", folds=3, repeats=1))
+    return true, data, identify(mh80(), data, AUTO)
+
+
+@pytest.mark.slow
+def test_an_elastic_arm_is_told_and_predicted(bending):
+    """Rigid, it is off by 0.15 mm and more at new joint values; its σ of 0.05 mm per coordinate comes out."""
+    true, data, found = bending
+    rigid = identify(mh80(), data, RIGID)
     assert found.model == "elastic"
     assert found.gain.beyond_chance
     assert found.gain.elastic_mm < found.gain.rigid_mm
@@ -59,11 +69,11 @@ def test_an_elastic_arm_is_told_and_predicted():
 def test_of_a_rigid_arm_the_rigid_model_is_taken_and_the_elastic_one_finds_hardly_anything():
     """σ of what is not there become small, and the errors are as those of the rigid model."""
     true, data = drawn(60, 1, 0.0)
-    rigid = identify(mh80(), data, IdentifyOptions(model="auto", folds=3, repeats=1))
+    rigid = identify(mh80(), data, AUTO)
     assert rigid.model == "rigid"
     assert rigid.robot.elasticity is None
     assert not rigid.gain.beyond_chance
-    found = identify(mh80(), data, IdentifyOptions(model="elastic", folds=0))
+    found = identify(mh80(), data, ELASTIC)
     assert found.deviations["periodic_rad"] < 5e-5
     assert elsewhere(found, true) < 1.5 * elsewhere(rigid, true)
 
@@ -72,7 +82,7 @@ def test_of_a_rigid_arm_the_rigid_model_is_taken_and_the_elastic_one_finds_hardl
 def test_sigma_of_strong_elasticity_settle():
     """Links give way by three and ten times the usual: σ of compliances went in circles, by factors of up to five."""
     for share, seed in ((3.0, 0), (3.0, 1), (10.0, 2)):
-        found = identify(mh80(), drawn(60, seed, share)[1], IdentifyOptions(model="elastic", folds=0))
+        found = identify(mh80(), drawn(60, seed, share)[1], ELASTIC)
         assert not [note for note in found.notes if "still change" in note]
         assert found.deviations["axis_rad"] == pytest.approx(share * 3e-4, rel=0.8)
 
@@ -80,7 +90,7 @@ def test_sigma_of_strong_elasticity_settle():
 def test_the_elasticity_of_the_file_stays_where_a_rigid_arm_is_asked_for():
     true, data = drawn(60, 0)
     known = replace(mh80(), elasticity=true.elasticity)
-    found = identify(known, data, IdentifyOptions(folds=0))
+    found = identify(known, data, RIGID)
     assert found.elasticity_sigma is None
     # turned into the frames of the rows found, by milliradians
     moment = true.elasticity.moment
@@ -93,15 +103,14 @@ def test_wrong_rows_are_named_beside_elasticity():
     true, data = drawn(60, 0)
     positions = np.array(data.points())
     positions[[5, 20, 40]] += [[3.0, 0, 0], [0, -5.0, 0], [0, 0, 10.0]]
-    found = identify(mh80(), replace(data, positions=positions), IdentifyOptions(model="elastic", folds=0))
+    found = identify(mh80(), replace(data, positions=positions), ELASTIC)
     assert [row for row, _ in found.outliers()] == [5, 20, 40]
     assert elsewhere(found, true) < 0.1
 
 
 @pytest.mark.slow
-def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path):
-    _, data = drawn(60, 12)
-    found = identify(mh80(), data, IdentifyOptions(folds=0, model="elastic"))
+def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path, bending):
+    found = bending[2]
     path = tmp_path / "robot.toml"
     path.write_text(robot_toml(found.robot))
     require_identified_written(path, found)
@@ -115,10 +124,10 @@ def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path):
 def test_sigma_elsewhere_hold_what_a_rigid_model_leaves():
     """By the covariance alone 0.1 mm; the arm errs by twice that."""
     true, data = drawn(100, 0)
-    rigid = identify(mh80(), data, IdentifyOptions(folds=0))
+    rigid = identify(mh80(), data, RIGID)
     assert any(note.startswith("σ hold for these rows, and for places like theirs") for note in rigid.notes)
     assert "--model auto" in rigid.notes[-1]
-    alone = identify(mh80(), drawn(100, 0, 0.0)[1], IdentifyOptions(folds=0))
+    alone = identify(mh80(), drawn(100, 0, 0.0)[1], RIGID)
     assert not any(note.startswith("σ hold for these rows") for note in alone.notes)
     assert rms(rigid.predicted.ranges_mm) > 1.5 * rms(alone.predicted.ranges_mm)
     # what goes with the three strongest causes, of more
@@ -158,7 +167,7 @@ def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
     """Of an arm 1.6 times as heavy as usual what 100 kg do (0.4 mm) is known to a sixth from positions of 0.05 mm, and
     not at all where it is taken as usual."""
     true, nominal, data = carrying(80, 5, (0.0, 60.0), 1.6)
-    found = identify(nominal, data, IdentifyOptions(model="elastic", folds=0))
+    found = identify(nominal, data, ELASTIC)
     assert 0.01 < sag_error(found.robot, true, 100.0) < 0.25
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.25)
     own, sigma = (each.compliance[:3, 0] for each in (found.robot.elasticity, found.elasticity_sigma))
@@ -167,14 +176,14 @@ def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
     places = [load_place(each, q) for each in (found.state.chain, found.robot.chain())]
     assert np.abs(places[1] - places[0]).max() < 1e-8
     assert found.robot.elasticity.payload_kg == 0.0
-    without = identify(nominal, replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))
+    without = identify(nominal, replace(data, conditions=USUAL), ELASTIC)
     assert sag_error(without.robot, true, 100.0) > 0.4
 
 
 @pytest.mark.slow
 def test_the_payload_of_all_rows_is_that_of_the_identified_file():
     true, nominal, data = carrying(60, 6, (40.0,))
-    found = identify(nominal, data, IdentifyOptions(model="elastic", folds=0))
+    found = identify(nominal, data, ELASTIC)
     assert found.robot.elasticity.payload_kg == 40.0
     q = joint_vectors(true, 50, np.random.default_rng(97))
     seen = found.robot.world_from_base @ forward(found.robot, q)
@@ -183,7 +192,7 @@ def test_the_payload_of_all_rows_is_that_of_the_identified_file():
 
 def test_a_payload_of_a_rigid_arm_is_said_to_do_nothing():
     data = carrying(60, 6, (40.0,))[2]
-    found = identify(mh80(), data, IdentifyOptions(folds=0))
+    found = identify(mh80(), data, RIGID)
     assert "the arm as identified is rigid, payload_kg moves nothing" in found.notes[-1]
     text = evaluation_report(evaluate({"drawn": mh80()}, data)).text()
     assert "\nrobot drawn is rigid, payload_kg moves nothing" in text
@@ -238,7 +247,7 @@ def approached(rows: int, seed: int, size_rad: float):
 def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     """0.15 mrad (half of it) at up to 2 m is 0.3 mm: joints 1 to 3 to a tenth of it, by 60 positions of 0.05 mm."""
     half, data = approached(60, 8, 1.5e-4)
-    found = identify(mh80(), data, IdentifyOptions(model="auto", folds=3, repeats=1))
+    found = identify(mh80(), data, AUTO)
     assert found.model == "elastic"
     own, sigma = (each.hysteresis for each in (found.robot.elasticity, found.elasticity_sigma))
     assert own[:3] == pytest.approx(half[:3], abs=3e-5)
@@ -247,13 +256,8 @@ def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.3)
     assert "hysteresis" in identified_report(found).text()
     assert IdentifiedFile.model_validate(found).elasticity_sigma["hysteresis"] == sigma.tolist()
-    rigid = identify(mh80(), data, IdentifyOptions(folds=0))
+    rigid = identify(mh80(), data, RIGID)
     assert "the direction from which joint" in rigid.left[0].what
-
-
-@pytest.mark.slow
-def test_where_nothing_says_from_where_joints_came_there_is_no_hysteresis():
-    _, data = approached(60, 8, 1.5e-4)
-    found = identify(mh80(), replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))
-    assert not found.robot.elasticity.hysteresis.any()
-    assert found.deviations["hysteresis_rad"] is None
+    unsaid = identify(mh80(), replace(data, conditions=USUAL), ELASTIC)
+    assert not unsaid.robot.elasticity.hysteresis.any()
+    assert unsaid.deviations["hysteresis_rad"] is None

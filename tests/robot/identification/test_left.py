@@ -75,10 +75,9 @@ def test_a_cause_is_named_once(joint, of, what, kind):
 
 def test_a_coupling_of_the_wrist_is_no_gravity():
     """A hundredth of joint 5 in joint 6."""
-    true, data = bent(4, 60, 6, lambda q, _: 0.01 * q[:, 4])
-    found = identify(replace(mh80(), tools=true.tools), data, QUICK).left[0]
-    assert found.what.startswith("the value of joint 5, along the motion of joint 6, as of a coupling")
-    assert found.share > 0.9
+    finding = left_of(*bent(4, 60, 6, lambda q, _: 0.01 * q[:, 4]), "pose")[0]
+    assert finding.what.startswith("the value of joint 5, along the motion of joint 6, as of a coupling")
+    assert finding.share > 0.9
 
 
 def test_the_effect_is_what_was_put_in():

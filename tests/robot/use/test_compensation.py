@@ -11,12 +11,12 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import read_targets
+from stcal.robot.kinematics.measurements import Targets, read_targets
 from stcal.robot.kinematics.robot_file import robot_toml
 from stcal.robot.kinematics.robot_model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 from tests.support.arms import elastic
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
@@ -42,6 +42,9 @@ class Case:
         path.write_text("\n".join(",".join(r) for r in [header, *rows]) + "\n")
         return path
 
+    def targets(self, header, rows) -> Targets:
+        return read_targets(self.write(list(header), rows), self.real)
+
     def pose_rows(self) -> list[list[str]]:
         return [pose_cells(p) for p in self.poses]
 
@@ -56,8 +59,7 @@ def case(tmp_path):
 
 @pytest.mark.slow
 def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
-    targets = read_targets(case.write(JOINTS, case.joint_rows()), case.real)
-    result = compensate(case.real, targets, case.nominal)
+    result = compensate(case.real, case.targets(JOINTS, case.joint_rows()), case.nominal)
     reached = forward(case.real, result.found.q)
     assert result.found.usable.all()
     np.testing.assert_allclose(reached.translation, case.poses.translation, atol=1e-8)
@@ -71,8 +73,7 @@ def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
 
 
 def test_poses_alone_need_no_nominal_robot(case):
-    targets = read_targets(case.write(list(POSE), case.pose_rows()[:FEW]), case.real)
-    result = compensate(case.real, targets)
+    result = compensate(case.real, case.targets(POSE, case.pose_rows()[:FEW]))
     assert result.found.usable.all()
     assert len(result.before_mm) == 0
     np.testing.assert_allclose(forward(case.real, result.found.q).translation, case.poses.translation[:FEW], atol=1e-8)
@@ -84,8 +85,7 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     flipped[:, 4] *= -1
     flipped[:, 3] -= 2 * np.pi * (flipped[:, 3] > 2 * np.pi)
     rows = [p + q for p, q in zip(case.pose_rows(), case.joint_rows(flipped), strict=True)]
-    targets = read_targets(case.write([*POSE, *JOINTS], rows), case.real)
-    found = compensate(case.real, targets).found
+    found = compensate(case.real, case.targets([*POSE, *JOINTS], rows)).found
     low, high = case.real.limits().T
     inside = ((flipped > low + 0.1) & (flipped < high - 0.1)).all(axis=1) & (np.abs(case.q[:, 4]) > 0.2)
     assert inside.sum() > 5
@@ -94,7 +94,7 @@ def test_joint_values_beside_poses_choose_the_branch(case):
 
 @pytest.mark.slow
 def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
-    targets = read_targets(case.write(JOINTS, case.joint_rows()[:FEW]), case.real)
+    targets = case.targets(JOINTS, case.joint_rows()[:FEW])
     bare = replace(case.nominal, tools={"": Rigid()})
     found = compensate(case.real, targets, bare)
     assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between .* taken in both", found.notes()[0])
@@ -111,7 +111,7 @@ def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
     bare = replace(case.nominal, tools={"": Rigid()})
     flange = forward(bare, case.q)
     rows = [pose_cells(p) + q for p, q in zip(flange, case.joint_rows(), strict=True)]
-    found = compensate(case.real, read_targets(case.write([*POSE, *JOINTS], rows), case.real), bare)
+    found = compensate(case.real, case.targets([*POSE, *JOINTS], rows), bare)
     assert "nominal file is taken in both (joint values beside the poses say so)" in found.notes()[0]
     reached = forward(replace(case.real, tools={"": Rigid()}), found.found.q)
     np.testing.assert_allclose(reached.translation, flange.translation, atol=1e-8)
@@ -127,7 +127,7 @@ def test_poses_of_which_none_is_reached_are_an_error(case, stcal_robot):
 def test_every_tool_by_its_name(case):
     names = ["ball" if i % 2 else "" for i in range(20)]
     rows = [[n, *q] for n, q in zip(names, case.joint_rows(), strict=True)]
-    result = compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
+    result = compensate(case.real, case.targets(["target", *JOINTS], rows), case.nominal)
     for name in ("ball", ""):
         own = np.array([n == name for n in names])
         wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
@@ -137,15 +137,14 @@ def test_every_tool_by_its_name(case):
     path = case.write(["target", *POSE, *JOINTS], [["ball", *pose_cells(pose), *q] for pose, q in posed])
     assert "unreachable" not in compensate(real, read_targets(path, real), nominal).found.status
     rows[3][0] = "cube"
-    with fails_with("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'"):
-        compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
+    refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.targets, ["target", *JOINTS], rows)
 
 
 @pytest.mark.slow
 def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     rows = case.pose_rows()[:FEW]
     rows[4][:3] = ["5000", "0", "0"]
-    result = compensate(case.real, read_targets(case.write(list(POSE), rows), case.real), case.nominal)
+    result = compensate(case.real, case.targets(POSE, rows), case.nominal)
     assert result.found.status[4] == "unreachable"
     note = result.notes()[0]
     assert note.startswith("line 6: no joint values reach it; ")
@@ -199,46 +198,35 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
 def test_a_long_way_near_a_singularity_is_told(case):
     """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
-    result = compensate(case.real, read_targets(case.write(JOINTS, case.joint_rows(q)), case.real), case.nominal)
+    result = compensate(case.real, case.targets(JOINTS, case.joint_rows(q)), case.nominal)
     moved = np.degrees(np.abs(result.found.q - q).max())
     assert moved > 1
     assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
 
 
 def test_bad_targets_are_named(case):
-    with fails_with("E-TARGETS-NO-POSES … x_mm"):
-        read_targets(case.write(["a", "b"], [["1", "2"]]), case.real)
-    with fails_with("E-TARGETS-NO-ORIENTATION"):
-        read_targets(case.write(["x_mm", "y_mm", "z_mm"], [["1", "2", "3"]]), case.real)
-    with fails_with("E-TARGETS-NO-POSES … --nominal"):
-        compensate(case.real, read_targets(case.write(JOINTS, case.joint_rows()), case.real))
+    refuses("E-TARGETS-NO-POSES … x_mm", case.targets, ["a", "b"], [["1", "2"]])
+    refuses("E-TARGETS-NO-ORIENTATION", case.targets, POSE[:3], [["1", "2", "3"]])
+    refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, case.targets(JOINTS, case.joint_rows()))
     shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
-    with fails_with("E-ROBOT-MISMATCH"):
-        compensate(case.real, read_targets(case.write(list(POSE), case.pose_rows()), case.real), shorter)
-
-
-def loaded_rows(case, mass):
-    rows = [[*row, f"{m:g}"] for row, m in zip(case.pose_rows()[: len(mass)], mass, strict=True)]
-    return read_targets(case.write([*POSE, "payload_kg"], rows), case.real)
+    refuses("E-ROBOT-MISMATCH", compensate, case.real, case.targets(POSE, case.pose_rows()), shorter)
+    for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
+        path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
+        refuses(message, read_targets, path, case.real, payload_kg=option)
 
 
 @pytest.mark.slow
 def test_each_row_is_compensated_for_its_payload(case):
     bent = elastic(case.real, np.random.default_rng(4))
     mass, poses = np.tile([0.0, 80.0], 4), case.poses[:8]
-    result = compensate(bent, loaded_rows(case, mass), case.nominal)
+    rows = [[*row, f"{m:g}"] for row, m in zip(case.pose_rows()[:8], mass, strict=True)]
+    result = compensate(bent, case.targets([*POSE, "payload_kg"], rows), case.nominal)
     assert set(result.found.status) == {"reached"}
     reached = forward(bent, result.found.q, payload_kg=mass)
     assert np.abs(poses.difference(reached)[:, 3:]).max() < 1e-8
     assert np.linalg.norm(poses.difference(forward(bent, result.found.q))[1::2, 3:], axis=1).min() > 0.02
     table = list(csv.DictReader(compensated_csv(result, bent).splitlines()))
     assert [row["payload_kg"] for row in table[:2]] == ["0", "80"]
-
-
-def test_payloads_that_cannot_be_are_refused(case):
-    for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
-        path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
-        refuses(message, read_targets, path, case.real, payload_kg=option)
 
 
 def test_files_that_are_exchanged_or_the_same_are_told(case):
@@ -250,11 +238,10 @@ def test_files_that_are_exchanged_or_the_same_are_told(case):
 
 
 def test_axes_that_are_exchanged_and_radians_without_poses_are_told(case):
-    cells = np.column_stack([case.poses.translation[:, [1, 0, 2]], case.poses.quaternions(), np.degrees(case.q)])
-    head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", *JOINTS]
-    path = case.write(head, [[repr(float(v)) for v in row] for row in cells])
-    with fails_with("E-ROBOT-MISMATCH … if x, y, z were y, x, z"):
-        compensate(case.real, read_targets(path, case.nominal), case.nominal)
-    small = case.write(JOINTS, [[repr(float(v)) for v in row] for row in case.q[:FEW]])
-    notes = compensate(case.real, read_targets(small, case.nominal), case.nominal).notes()
+    exchanged = [[y, x, *others] for x, y, *others in case.pose_rows()]
+    rows = [pose + q for pose, q in zip(exchanged, case.joint_rows(), strict=True)]
+    targets = case.targets([*POSE, *JOINTS], rows)
+    refuses("E-ROBOT-MISMATCH … if x, y, z were y, x, z", compensate, case.real, targets, case.nominal)
+    radians = case.targets(JOINTS, case.joint_rows(np.radians(case.q[:FEW])))
+    notes = compensate(case.real, radians, case.nominal).notes()
     assert any("as of radians in columns of degrees" in note for note in notes)

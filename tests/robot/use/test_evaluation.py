@@ -1,6 +1,6 @@
 """Robot files on measurements that they were not made from."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +8,14 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.identify import identify
-from stcal.robot.identification.result import Figures, IdentifyOptions
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.robot_report import evaluated_csv, evaluation_report, names_of
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate, read_measured, verify
 from tests.levels import sampled
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 from tests.robot.identification.test_solve import rokae
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
@@ -54,21 +54,16 @@ def test_figures_by_hand():
     away = off @ BASE.rotation.T  # along x of the base
     [found] = evaluate({"a": true}, replace(data, positions=data.points() + away), "none").robots
     assert found.residuals == pytest.approx(off, abs=1e-9)
-    figures = Figures.of(found.errors_mm)
-    assert figures.rows == 40
-    assert figures.mean == pytest.approx(1.95)
-    assert figures.median == pytest.approx(1.95)
-    assert figures.rms == pytest.approx(np.sqrt(0.01 * (39 * 40 * 79 / 6) / 40))
-    assert figures.p95 == pytest.approx(0.95 * 3.9)
-    assert figures.max == pytest.approx(3.9)
+    rms = np.sqrt(0.01 * (39 * 40 * 79 / 6) / 40)
+    assert astuple(found.position_mm) == pytest.approx((40, 1.95, 1.95, rms, 0.95 * 3.9, 3.9))
 
 
 def test_base_and_tool_are_fitted_by_the_robots_own_axes(pair):
     nominal, true = pair.robots
     # noise of three coordinates, less what 9 parameters take up of 180
-    assert Figures.of(true.errors_mm).rms == pytest.approx(SIGMA_MM * np.sqrt(3 * (1 - 9 / 180)), rel=0.15)
-    assert Figures.of(nominal.errors_mm).rms > 0.3
-    assert Figures.of(true.rotation_rad).rms == pytest.approx(2e-4 * np.sqrt(3), rel=0.2)
+    assert true.position_mm.rms == pytest.approx(SIGMA_MM * np.sqrt(3 * (1 - 9 / 180)), rel=0.15)
+    assert nominal.position_mm.rms > 0.3
+    assert true.orientation_rad.rms == pytest.approx(2e-4 * np.sqrt(3), rel=0.2)
     base, tool = true.placed
     for each, pose in ((base, BASE), (tool, TOOL)):
         off = each.pose.translation - pose.translation
@@ -85,7 +80,7 @@ def test_only_what_is_asked_for_is_fitted(wrong):
     small = Rigid.exp([0.01, 0, 0.01, 5, 0, -5])
     robot = placed(true, BASE @ small if wrong == "base" else BASE, {"": TOOL @ small if wrong == "tool" else TOOL})
     data = seen(true, 3)
-    rms = {refit: Figures.of(evaluate({"a": robot}, data, refit).robots[0].errors_mm).rms for refit in REFITS}
+    rms = {refit: evaluate({"a": robot}, data, refit).robots[0].position_mm.rms for refit in REFITS}
     for refit, found in rms.items():
         if wrong in refit:
             assert found == pytest.approx(SIGMA_MM * np.sqrt(3), rel=0.25)
@@ -170,7 +165,7 @@ def test_distances_have_their_own_errors(refit):
     result = evaluate({"a": true, "nominal": replace(mh80(), tools={"": TOOL})}, data, refit)
     assert len(result.wrong) == 49
     # two positions, the first in all: σ of one distance is √2 times a coordinate's
-    assert 0.6 * SIGMA_MM < Figures.of(result.robots[0].errors_mm).rms < 2 * SIGMA_MM
+    assert 0.6 * SIGMA_MM < result.robots[0].position_mm.rms < 2 * SIGMA_MM
     assert result.best == "a"
     assert "49 distances" in evaluation_report(result).text()
 
@@ -190,8 +185,7 @@ def test_another_arm_is_refused_in_one_line():
 def test_files_are_called_by_their_names():
     assert names_of([Path("a/robot.toml"), Path("a/made.toml")]) == ["robot", "made"]
     assert names_of([Path("a/robot.toml"), Path("b/robot.toml")]) == ["a/robot.toml", "b/robot.toml"]
-    with fails_with("E-OPTION-REPEATED"):
-        names_of([Path("a.toml"), Path("a.toml")])
+    refuses("E-OPTION-REPEATED", names_of, [Path("a.toml"), Path("a.toml")])
 
 
 def test_identify_and_verify_read_what_was_written(tmp_path):
@@ -220,7 +214,7 @@ def test_rokae_on_the_half_that_was_not_identified_from(shared_data, tmp_path):
     identified = identify(robot, data[np.sort(half[:15])], IdentifyOptions(folds=0)).robot
     result = evaluate({"nominal": robot, "identified": identified}, data[np.sort(half[15:])])
     assert result.best == "identified"
-    nominal, own = (Figures.of(each.errors_mm).mean for each in result.robots)
+    nominal, own = (each.position_mm.mean for each in result.robots)
     assert 1.4 < nominal < 2.2
     assert 0.05 < own < 0.15
 
