@@ -206,13 +206,9 @@ def test_points_lines_and_units(tmp_path):
 
 
 def test_noise_of_three_kinds(tmp_path):
-    assert register.read_pairs(written(tmp_path, with_cells([1, 2, 3, 4]), HEAD + ",weight")).weights.tolist() == [
-        1,
-        2,
-        3,
-        4,
-    ]
-    variances = register.read_pairs(written(tmp_path, with_cells([1, 2, 3, 4]), HEAD + ",sigma_um")).covariances
+    numbered = with_cells([1, 2, 3, 4])
+    assert register.read_pairs(written(tmp_path, numbered, HEAD + ",weight")).weights.tolist() == [1, 2, 3, 4]
+    variances = register.read_pairs(written(tmp_path, numbered, HEAD + ",sigma_um")).covariances
     np.testing.assert_allclose(variances, np.array([1, 4, 9, 16]) * 1e-6)
     full = register.read_pairs(written(tmp_path, with_cells(["4,1,0,5,2,6"] * 4), f"{HEAD},{COV}")).covariances
     np.testing.assert_array_equal(full[2], [[4, 1, 0], [1, 5, 2], [0, 2, 6]])
