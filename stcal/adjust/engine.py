@@ -318,10 +318,9 @@ class Solution:
     def told(self, along: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Yield of each factor with clusters their numbers (r,), the derivatives (r, w, q) of the rows by changes
         ``along`` (k, q) of the kept unknowns, and the residuals (r, w)."""
-        ways = self._ways(along)
-        for rows in self.rows:
+        for rows, batch, slope in self.effects(along):
             if rows.factor.cluster is not None:
-                yield rows.factor.cluster, rows.total(ways), rows.residual
+                yield rows.factor.cluster[batch], slope, rows.residual[batch]
 
     def _ways(self, along: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return by block how its members (n, dim, q) change by ``along`` (k, q), of each kept unknown by itself if

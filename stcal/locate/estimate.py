@@ -21,7 +21,6 @@ from stcal.geometry.plane import (
     MAX_SIGMA_RAD,
     Descend,
     Weighed,
-    covariance_of_both,
     generalised_equations,
     poses_of_plane,
     two_minima,
@@ -341,14 +340,6 @@ def reprojection_rms(camera_from_obj: Rigid, xy: np.ndarray, pixels: np.ndarray,
     if (xyz[:, 2] <= 0).any():
         return np.inf
     return float(np.sqrt(((camera.project(xyz) - pixels) ** 2).sum(1).mean()))
-
-
-def covering_both(pose: ObjPose) -> ObjPose:
-    """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
-    if pose.second is None:
-        return pose
-    step = pose.second.difference(pose.camera_from_obj)
-    return replace(pose, covariance=covariance_of_both(pose.covariance, step, pose.delta_chi2))
 
 
 PRIOR_SHARE, PRIOR_WEIGHT = 0.5, 20.0
