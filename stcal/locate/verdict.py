@@ -221,17 +221,15 @@ class PatentOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentExposure:
-    """``tags`` : of the layout in exposure number ``exposure``; ``area_px2`` : of their triangles; None if others show
-    more; ``candidate`` : compared with others; ``poses`` : T_a, T_b by ``errors_px``, or None; ``det_j`` : of the
-    homography's derivative at the normalised centre, 1/mm²."""
+    """Result of one exposure by the patent's method."""
 
     exposure: int
-    tags: int
-    area_px2: float | None = None
-    candidate: bool = False
-    poses: tuple[Rigid, Rigid] | None = None
+    tags: int  # of the layout
+    area_px2: float | None = None  # of their triangles; None if others show more
+    candidate: bool = False  # compared with others
+    poses: tuple[Rigid, Rigid] | None = None  # T_a, T_b by ``errors_px``
     errors_px: tuple[float, float] | None = None
-    det_j: float | None = None
+    det_j: float | None = None  # of the homography's derivative at the normalised centre, 1/mm²
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -96,16 +96,15 @@ class Problem:
     """Point pairs (n, 3) mm of a model, neither copied nor checked, as subsets are taken in inner loops.
 
     ``precision`` : (n,) inverse variances per axis, or (n, 3, 3) inverse covariances in frame b, scaled to mean σ 1
-    (RMS), so that whitened residuals are mm of such a point; ``sigma_mm`` : mean σ if given; ``lines`` : of a file, by
-    which messages name points; subsets have none.
+    (RMS), so that whitened residuals are mm of such a point.
     """
 
     model: Model
     xyz_a: np.ndarray
     xyz_b: np.ndarray
     precision: np.ndarray
-    sigma_mm: float | None = None
-    lines: Sequence[int] | None = None
+    sigma_mm: float | None = None  # mean σ, if given
+    lines: Sequence[int] | None = None  # of a file, by which messages name points; subsets have none
 
     def __len__(self) -> int:
         return len(self.xyz_a)
