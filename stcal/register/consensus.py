@@ -188,10 +188,7 @@ class Problem:
         origin = self[used]._middle()
         by_step = jacobian(self.model, transform, self.xyz_a - origin)
         added = by_step @ np.linalg.inv(self[used]._normal(transform, origin)) @ np.swapaxes(by_step, 1, 2)
-        if self.precision.ndim == 1:
-            return added * self.precision[:, None, None]
-        root = np.linalg.cholesky(self.precision)
-        return np.swapaxes(root, 1, 2) @ added @ root
+        return self.whitened(np.swapaxes(self.whitened(added), 1, 2))
 
     def _middle(self) -> np.ndarray:
         """Returns the weighted mean of a, about which the parameters correlate least."""
