@@ -386,11 +386,11 @@ def by_threshold(threshold: float) -> Score:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
+    """Points that agree on a transform."""
 
-    inliers: np.ndarray
-    value: float
-    samples: int = 0
+    inliers: np.ndarray  # (n,)
+    value: float  # score, less is better
+    samples: int = 0  # 0 if all were tried
 
 
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
@@ -451,14 +451,13 @@ BY_CHANCE = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A transform with the ``inliers`` (n,) that agree on it; ``sigma`` per axis and ``threshold``, which may be
-    infinite, in mm of a point of mean σ; ``samples`` : random ones, 0 if all possible ones were tried."""
+    """A transform and the points that agree on it."""
 
     transform: Transform
-    inliers: np.ndarray
-    sigma: float
-    threshold: float
-    samples: int = 0
+    inliers: np.ndarray  # (n,)
+    sigma: float  # per axis, mm, of a point of mean σ
+    threshold: float  # likewise; may be infinite
+    samples: int = 0  # random ones; 0 if all possible ones were tried
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:

@@ -175,7 +175,7 @@ def test_the_limit_of_lengths_follows_their_tail(freedom, least):
     """Sound lengths beyond the limit are rare, 0.01 in a sample; gross ones do not move it much.
 
     ``least`` : the quantile of Student's distribution, of 0.01 / 200."""
-    rng, count, draws = np.random.default_rng(3), 200, 200
+    rng, count, draws = np.random.default_rng(3), 200, 100
     beyond, limits, spoiled = 0, [], []
     for _ in range(draws):
         shrunk = 1.0 if np.isinf(freedom) else np.sqrt(rng.chisquare(freedom, (count, 1)) / freedom)
@@ -183,7 +183,7 @@ def test_the_limit_of_lengths_follows_their_tail(freedom, least):
         limits.append(tailed_limit(length, 0.01 / count))
         beyond += int((length > limits[-1]).sum())
         spoiled.append(tailed_limit(np.append(length, [60.0, 200.0]), 0.01 / count))
-    assert beyond <= 8  # 2 expected where the tail was known
+    assert beyond <= 5  # 1 expected where the tail was known
     assert np.median(spoiled) < 1.5 * np.median(limits)
     assert least * 0.8 < np.median(limits) < 3 * least
 
@@ -202,13 +202,13 @@ def drawn(rng, n: int, common: float, q: int = 4, rows: int = 30):
 @pytest.mark.parametrize(("common", "formal"), [(0.0, (0.9, 1.1)), (1.0, (5, 30))])
 def test_sigma_by_clusters_hold_with_and_without_common_errors(common, formal):
     rng, squares, plain, larger = np.random.default_rng(1), [], [], []
-    for _ in range(400):
+    for _ in range(200):
         error, found, independent = drawn(rng, 15, common)
         squares.append(error @ np.linalg.solve(found.covariance, error) / 4)
         plain.append(error @ np.linalg.solve(independent, error) / 4)
         larger.append(np.sqrt(np.diag(found.covariance) / np.diag(independent)).mean())
     assert formal[0] < np.mean(plain) < formal[1]
-    # 400 draws of 4 parameters scatter by 4 %, and more where few clusters tell σ.
+    # 200 draws of 4 parameters scatter by 5 %, and more where few clusters tell σ.
     assert 0.75 < np.mean(squares) < 1.25
     if not common:
         assert 1 <= np.mean(larger) < 1.12
