@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.adjust import Adjustment, Huber, Vector
-from stcal.adjust.blocks import Components, Equations, component_variances
+from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, by_pose, perspective
 
@@ -247,14 +247,6 @@ def test_kinds_tell_together_what_all_do():
     at = problem.at({block.name: block.start for block in problem.blocks})
     told = sum(at.equations((kind,)).told(at.reduction.from_kept) for kind in ("error", "between", "none"))
     assert told == pytest.approx(at.normal, rel=1e-9)
-
-
-def test_equations_of_residuals_are_least_squares():
-    design, seen = np.random.default_rng(1).normal(size=(2, 20, 3)) @ np.diag([1, 2, 3.0]), np.arange(20.0)
-    own = Equations.of(seen, -design[0])
-    _, _, step, covariance = Components([own], Equations.nothing(3)).at(np.zeros(1))
-    assert step == pytest.approx(np.linalg.lstsq(design[0], seen, rcond=None)[0])
-    assert covariance == pytest.approx(np.linalg.inv(design[0].T @ design[0]))
 
 
 @pytest.mark.parametrize("bound", [0.0, 3.0])
