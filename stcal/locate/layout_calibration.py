@@ -30,8 +30,8 @@ is gross, such as a misread tag or a hidden corner: weight 0."""
 VARIANCE_ROUNDS, NEAR_PX = 6, 0.005
 LEAST_FACTOR = 1e-3
 """Least factor on the stated σ of the board's points. Exact data would give 0, and rounding would be weighed."""
-STEP_MM = 1e-3
-"""Step of numerical derivatives of the frame {obj}, which turns by 1e-4 rad at most."""
+STEP_MM = 1e-4
+"""Step of numerical derivatives of the frame {obj}, which turns by 1e-5 rad at most."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
 APART = null_space(TOGETHER.T)
