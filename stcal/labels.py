@@ -14,32 +14,29 @@ BOARD = "board"
 
 
 class CircleLabel(str):
-    """Label ``face:circle`` of a circle of the target; ``face`` and ``circle`` are the two ids."""
+    """Label ``face:circle`` of a circle of the target; ``face`` and ``circle`` are ids, ``plane`` is the face."""
 
-    __slots__ = ("circle", "face")
+    __slots__ = ("circle", "face", "plane")
     face: str
     circle: str
+    plane: str
 
     def __new__(cls, face: str, circle: str):
         self = super().__new__(cls, f"{face}:{circle}")
-        self.face, self.circle = face, circle
+        self.face, self.circle, self.plane = face, circle, face
         return self
 
     def __getnewargs__(self) -> tuple[str, str]:
         return self.face, self.circle
 
-    @property
-    def plane(self) -> str:
-        """Plane of the circle: its face."""
-        return self.face
-
 
 class DotLabel(str):
-    """Label ``board:row:column`` of a dot of the board; ``row`` and ``column`` count from 0."""
+    """Label ``board:row:column`` of a dot of the board, its ``plane``; ``row`` and ``column`` count from 0."""
 
     __slots__ = ("column", "row")
     row: int
     column: int
+    plane = BOARD
 
     def __new__(cls, row: int, column: int):
         self = super().__new__(cls, f"{BOARD}:{row}:{column}")
@@ -48,11 +45,6 @@ class DotLabel(str):
 
     def __getnewargs__(self) -> tuple[int, int]:
         return self.row, self.column
-
-    @property
-    def plane(self) -> str:
-        """Plane of the dot: the board."""
-        return BOARD
 
 
 Label: TypeAlias = CircleLabel | DotLabel

@@ -1,13 +1,12 @@
 """How alike two patterns of circles are when turned and scaled, so that a camera could take one for the other."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, wraps
-from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
+
+from stcal.geometry.arrays import kept
 
 MAX_GAP = 0.5  # largest distance of two circles' centres, in radii, at which the circles coincide
 MAX_RADIUS_RATIO = 1.3  # largest ratio of two circles' radii at which the circles coincide
@@ -15,24 +14,6 @@ MIN_COMMON = 4
 BLOCK = 4000  # number of motions tested together, which bounds the memory for patterns of many circles
 MOST_CIRCLES = 100
 """Largest number of circles of a pattern that is compared as a whole; larger ones take minutes."""
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def _kept(function: Callable[P, R]) -> Callable[P, R]:
-    """Keeps results by the content of arrays: the same designs are made again and again."""
-
-    @lru_cache(maxsize=512)
-    def of_content(*parts):
-        arrays = (np.frombuffer(p[0], p[1]).reshape(p[2]) if isinstance(p, tuple) else p for p in parts)
-        return cast(Callable[..., R], function)(*arrays)
-
-    @wraps(function)
-    def with_arrays(*given: P.args, **more: P.kwargs) -> R:
-        parts = (*given, *more.values())
-        return of_content(*((p.tobytes(), p.dtype.str, p.shape) if isinstance(p, np.ndarray) else p for p in parts))
-
-    return with_arrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +32,7 @@ class Likeness:
         return np.array([[c, -s], [s, c]]) @ xy + self.shift_mm
 
 
-@_kept
+@kept
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
     """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest
     gap. ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among
@@ -93,7 +74,7 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
     return None
 
 
-@_kept
+@kept
 def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
     """Finds sets of ``MIN_COMMON`` or more circles that coincide with circles of another pattern under a rigid
     motion. ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``same`` : True if both are the same pattern, so
@@ -102,7 +83,7 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
     return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
 
 
-@_kept
+@kept
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
     """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, as above. Returns
     places of the same circles in ``xy`` and in ``other_xy`` for each motion, the most circles first. A part of

@@ -19,21 +19,17 @@ EQUAL = 4.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """A jump of the rows from ``row`` on, or a drift of all rows in proportion to their place in the order.
-    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift
-    from the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
-    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change
-    by chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors."""
+    """A jump of the rows from ``row`` on, or a drift of all rows in proportion to their place in the order."""
 
     kind: Literal["jump", "drift"]
     row: int
-    first: int
+    first: int  # range of rows that may be the first one after the jump
     last: int
-    motion: np.ndarray
-    moves: np.ndarray
-    share: float
-    log_p: float
-    good: np.ndarray
+    motion: np.ndarray  # (c,) jump, or drift from the first to the last row, in units of the motions given
+    moves: np.ndarray  # (r,) share of the motion in each row
+    share: float  # of the squared residuals that it explains
+    log_p: float  # logarithm of the probability of such a change by chance, wherever it is in the order
+    good: np.ndarray  # (r,) rows that are no gross errors
 
     @property
     def p(self) -> float:

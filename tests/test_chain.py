@@ -65,9 +65,10 @@ class Cell:
         assert ended.value.code == code, shown.err
         return shown.err if code else shown.out
 
-    def write(self, name, header, rows):
+    def write(self, name, columns, images, values):
+        rows = [[image, *each] for image, each in zip(images, values, strict=True)]
         with (self.root / name).open("w", newline="") as file:
-            csv.writer(file).writerows([header, *rows])
+            csv.writer(file).writerows([["image", *columns], *rows])
 
     def photographed(self, name, q):
         """Photographs of the arm at joint values (m, 6), rad, in NAME; names of the images."""
@@ -110,16 +111,14 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
 
     sweeps = np.array([REST + REACH[j] * np.eye(6)[j] * t for j in range(6) for t in np.linspace(-1, 1, 7)])
     images = cell.measured("sweeps", sweeps)
-    cell.write(
-        "sweeps-joints.csv", ["image", *JOINTS], [[n, *q] for n, q in zip(images, np.degrees(sweeps), strict=True)]
-    )
+    cell.write("sweeps-joints.csv", JOINTS, images, np.degrees(sweeps))
     cell.call(
         "stcal robot axes --a {0}/sweeps.csv --b {0}/sweeps-joints.csv --robot {0}/robot.toml --out {0}/axes.toml"
     )
 
     q = cell.about(40)
     images = cell.measured("poses", q)
-    cell.write("joints.csv", ["image", *JOINTS], [[n, *each] for n, each in zip(images, np.degrees(q), strict=True)])
+    cell.write("joints.csv", JOINTS, images, np.degrees(q))
     cell.call(
         "stcal robot identify --a {0}/poses.csv --b {0}/joints.csv --robot {0}/axes.toml --out {0}/identified.toml"
     )
@@ -130,9 +129,8 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
     (root / "controller.toml").write_text(robot_toml(drawn))
     q = cell.about(12)
     names = [f"{cell.group}/IMG_{1000 + k}.png" for k in range(len(q))]
-    wanted = forward(drawn, q)
-    cell.write("targets.csv", ["image", *POSE], [[n, *pose_cells(each)] for n, each in zip(names, wanted, strict=True)])
-    cell.write("branch.csv", ["image", *JOINTS], [[n, *each] for n, each in zip(names, np.degrees(q), strict=True)])
+    cell.write("targets.csv", POSE, names, map(pose_cells, forward(drawn, q)))
+    cell.write("branch.csv", JOINTS, names, np.degrees(q))
     cell.call(
         "stcal robot compensate --a {0}/targets.csv --b {0}/branch.csv --key image --robot {0}/identified.toml "
         "--nominal {0}/controller.toml --out {0}/sent.csv"
@@ -151,17 +149,13 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
     assert before["pairs_rms_mm"] > BUILT_MM / 4
     assert after["pairs_rms_mm"] < 0.03
 
-    flange = forward(replace(identified, tools={"": Rigid()}), np.radians(_joints(root / "joints.csv")))
-    robot = [
-        [n, *pose_cells(each)]
-        for n, each in zip(read_table(root / "joints.csv", "").text("image"), flange, strict=True)
-    ]
-    cell.write("robot.csv", ["image", *POSE], robot)
+    joints = read_table(root / "joints.csv", "joints")
+    q = np.radians(np.column_stack([joints.numbers(name) for name in JOINTS]))
+    flange = forward(replace(identified, tools={"": Rigid()}), q)
+    cell.write("robot.csv", POSE, joints.text("image"), map(pose_cells, flange))
     cell.call("stcal handeye --a {0}/robot.csv --b {0}/poses.csv --setup eye-to-hand --out {0}/handeye.json")
-    tips = [each @ identified.tool() for each in flange]
-    cell.write(
-        "tips.csv", ["image", *POSE[:3]], [[row[0], *each.translation] for row, each in zip(robot, tips, strict=True)]
-    )
+    tips = [(each @ identified.tool()).translation for each in flange]
+    cell.write("tips.csv", POSE[:3], joints.text("image"), tips)
     cell.call("stcal register --a {0}/poses.csv --b {0}/tips.csv --key image --out {0}/register.json")
 
     own = cell.scene.camera
@@ -184,8 +178,3 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
         assert covariance is not None
         mahalanobis = off @ np.linalg.solve(covariance[0], off)
         assert chdtrc(6, mahalanobis) > 1e-3
-
-
-def _joints(path):
-    table = read_table(path, "joints")
-    return np.column_stack([table.numbers(name) for name in JOINTS])

@@ -365,13 +365,6 @@ class Rows:
             return self if own else None
         return replace(self, slopes=[each[:, own] for each in self.slopes], residual=self.residual[:, own])
 
-    def select(self, keep: np.ndarray) -> "Rows":
-        """Return the rows of a mask (r,), or all of them for one mask of all."""
-        own = np.broadcast_to(keep, len(self.residual))
-        on = tuple((block, None if members is None else members[own]) for block, members in self.factor.on)
-        factor, slopes = replace(self.factor, on=on, order={}), [slope[own] for slope in self.slopes]
-        return Rows(factor, self.places, slopes, self.residual[own], self.length[own], self.weight[own])
-
     def total(self, ways: Mapping[str, np.ndarray], part: slice = slice(None)) -> np.ndarray:
         """Return the derivatives (r, w, q) of a part of the rows by changes of all blocks (n, dim, q), by name."""
         total: Any = 0.0

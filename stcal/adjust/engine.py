@@ -41,6 +41,8 @@ from stcal.geometry.normal_equations import (
 
 HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
+LEFT = 1e-9
+"""Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 LOOSE = 1e-10
 """Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
 AT_ONCE = 10_000  # number of rows whose derivatives are multiplied at once; it bounds the memory
@@ -318,10 +320,9 @@ class Solution:
     def told(self, along: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Yield of each factor with clusters their numbers (r,), the derivatives (r, w, q) of the rows by changes
         ``along`` (k, q) of the kept unknowns, and the residuals (r, w)."""
-        ways = self._ways(along)
-        for rows in self.rows:
+        for rows, batch, slope in self.effects(along):
             if rows.factor.cluster is not None:
-                yield rows.factor.cluster, rows.total(ways), rows.residual
+                yield rows.factor.cluster[batch], slope, rows.residual[batch]
 
     def _ways(self, along: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return by block how its members (n, dim, q) change by ``along`` (k, q), of each kept unknown by itself if
@@ -340,13 +341,27 @@ class Solution:
 
     def without(self, cluster: int) -> dict[str, Any]:
         """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
-        others = [rows.select(np.asarray(rows.factor.cluster) != cluster) for rows in self.rows]
-        if all(len(left.residual) == len(rows.residual) for left, rows in zip(others, self.rows, strict=True)):
+        dropped = self.reduction.step.shape
+        totals, slopes, residuals = [], [], []
+        for rows in self.rows:
+            if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
+                continue
+            totals.append(rows.total(self._each)[own].reshape(-1, self.kept))
+            residuals.append(rows.residual[own].ravel())
+            by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
+            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                if block.eliminate:
+                    by_dropped[np.arange(own.sum()), :, numbers(index, slope)[own]] = slope[own]
+            slopes.append(by_dropped.reshape(residuals[-1].size, *dropped))
+        if not totals:
             raise InputError("E-OPTION-NEEDS", f"adjustment: no row of cluster {cluster}; give one that factors have")
-        rest = Solution(self.problem, self.values)
-        vars(rest)["rows"] = others  # what its cached property would compute of all
-        kept = generalised_inverse(rest.normal) @ rest.right
-        return self.problem.moved(self.values, np.concatenate([kept, rest.reduction.back(kept).ravel()]))
+        total, slope, residual = (np.concatenate(each) for each in (totals, slopes, residuals))
+        solved = np.einsum("mab,rmb->rma", self.reduction.inverse, slope)
+        taken = total @ self.inverse @ total.T + np.einsum("rma,sma->rs", slope, solved)
+        pull = np.linalg.lstsq(np.eye(len(residual)) - taken, residual, rcond=LEFT)[0]
+        kept = self.inverse @ (total.T @ pull)
+        away = np.einsum("rma,r->ma", solved, pull) - self.reduction.from_kept @ kept
+        return self.problem.moved(self.values, np.concatenate([kept, away.ravel()]))
 
     def redundancy(self, kind: str | None = None) -> float:
         """Return the redundancy of the rows of one kind, or of all."""

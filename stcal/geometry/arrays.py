@@ -3,6 +3,7 @@ outside."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache, wraps
 from inspect import signature
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
+MOST_KEPT = 512  # number of results that a function keeps
 LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
@@ -233,6 +235,27 @@ def freeze(
 ) -> None:
     """Replace a field of a frozen dataclass by its read-only copy, in ``__post_init__``; see :func:`frozen`."""
     object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))
+
+
+def kept(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function, which then keeps results by the content of its arguments, arrays among them."""
+
+    known: dict[tuple, R] = {}
+
+    @wraps(function)
+    def with_arrays(*given: P.args, **more: P.kwargs) -> R:
+        content = tuple(
+            (each.tobytes(), each.dtype.str, each.shape) if isinstance(each, np.ndarray) else each
+            for each in (*given, *more.items())
+        )
+        with suppress(KeyError):
+            return known[content]
+        if len(known) >= MOST_KEPT:
+            known.clear()
+        result = known[content] = function(*given, **more)
+        return result
+
+    return with_arrays
 
 
 def rms(values: np.ndarray) -> float:

@@ -334,7 +334,9 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
             "E-POINTS-MIRRORED", "plane: its points appear mirrored: they are seen from behind, or numbered wrongly"
         )
     sight_point = homography[:2, 2] / homography[2, 2]
-    camera_from_sight = _turn_to(np.append(sight_point, 1.0))
+    x, y, z = np.append(sight_point, 1.0) / np.hypot(1.0, np.linalg.norm(sight_point))
+    cross = skew(np.array([-y, x, 0.0]))
+    camera_from_sight = np.eye(3) + cross + cross @ cross / (1 + z)  # the smallest turn of Z to the line of sight
     # Derivative of the projection onto a screen perpendicular to the line of sight, at unit distance.
     flat = np.linalg.solve(np.column_stack([np.eye(2), -sight_point]) @ camera_from_sight[:, :2], jacobian)
     large, small = np.linalg.svd(flat, compute_uv=False)
@@ -348,13 +350,6 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
         u, _, vt = np.linalg.svd(camera_from_sight @ turn)
         poses.append(_placed(u @ vt, xy, xy_image))
     return PlanePoses((poses[0], poses[1]), determinant, float(small / large))
-
-
-def _turn_to(sight: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation that takes Z to the direction ``sight``, which points forwards (z > 0)."""
-    x, y, z = sight / np.linalg.norm(sight)
-    cross = skew(np.array([-y, x, 0.0]))
-    return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
 def _placed(rotation: np.ndarray, xy: np.ndarray, seen: np.ndarray) -> Rigid:

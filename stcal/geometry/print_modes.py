@@ -3,10 +3,11 @@ sheared, and by less curved; a sheet bends. All points follow together, by far m
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+
+from stcal.geometry.arrays import kept
 
 PRINT_SHARE = 0.003
 """σ of a print's stretch, shear and curving at its edge, relative to its half extent: printers are 0.2 to 0.5 % off."""
@@ -28,14 +29,9 @@ class PrintModes:
     amplitude: float = 1.0  # factor on the σ of printers and paper
 
     @classmethod
+    @kept
     def of(cls, xy: np.ndarray) -> "PrintModes":
         """Return the modes of points (n, 2) of a plane: stretch, shear, six of second order within it, three bends."""
-        return cls._of(np.ascontiguousarray(xy, float).tobytes())
-
-    @classmethod
-    @lru_cache(maxsize=64)
-    def _of(cls, coordinates: bytes) -> "PrintModes":
-        xy = np.frombuffer(coordinates).reshape(-1, 2)
         xy = xy - xy.mean(axis=0)
         half = max(float(np.ptp(xy, axis=0).max()) / 2, 1e-9)
         x, y = xy.T / half

@@ -21,7 +21,6 @@ from stcal.geometry.plane import (
     MAX_SIGMA_RAD,
     Descend,
     Weighed,
-    covariance_of_both,
     generalised_equations,
     poses_of_plane,
     two_minima,
@@ -40,20 +39,15 @@ WEIGHED = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarProblem:
-    """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
+    """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion."""
 
-    ``xy`` : (n, 2) in {obj}, mm, of covariance ``shape`` (2n, 2n); ``seen`` : (n, 2), of covariance ``noise`` (2n, 2n);
-    ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``common`` : (n, 2, q) derivative of ``seen`` by what corners share
-    (shifts of each tag's edges and of each tag, inexact intrinsics), of covariance ``prior`` (q, q).
-    """
-
-    xy: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    px_by_seen: np.ndarray
-    shape: np.ndarray
-    common: np.ndarray
-    prior: np.ndarray
+    xy: np.ndarray  # (n, 2) in {obj}, mm
+    seen: np.ndarray  # (n, 2)
+    noise: np.ndarray  # (2n, 2n) covariance of ``seen``
+    px_by_seen: np.ndarray  # (n, 2, 2) jacobian of the lens
+    shape: np.ndarray  # (2n, 2n) covariance of ``xy``
+    common: np.ndarray  # (n, 2, q) of ``seen`` by what corners share: shifts of edges and tags, inexact intrinsics
+    prior: np.ndarray  # (q, q) covariance of what they share
 
     def select(self, keep: np.ndarray) -> "PlanarProblem":
         """Returns the selected corners."""
@@ -68,13 +62,12 @@ class PlanarProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedCorners:
-    """``residual`` : (h, n, 2) measured minus projected, of h poses; ``by_pose``, ``by_corner`` : negative derivatives;
-    ``before`` : (h,) all corners in front of the camera."""
+    """Corners as h poses project them; derivatives are negative."""
 
-    residual: np.ndarray
-    by_pose: np.ndarray
-    by_corner: np.ndarray
-    before: np.ndarray
+    residual: np.ndarray  # (h, n, 2) measured minus projected
+    by_pose: np.ndarray  # (h, n, 2, 6)
+    by_corner: np.ndarray  # (h, n, 2, 2)
+    before: np.ndarray  # (h,) whether all corners are in front of the camera
 
 
 def project(problem: PlanarProblem, poses: Poses) -> ProjectedCorners:
@@ -343,14 +336,6 @@ def reprojection_rms(camera_from_obj: Rigid, xy: np.ndarray, pixels: np.ndarray,
     return float(np.sqrt(((camera.project(xyz) - pixels) ** 2).sum(1).mean()))
 
 
-def covering_both(pose: ObjPose) -> ObjPose:
-    """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
-    if pose.second is None:
-        return pose
-    step = pose.second.difference(pose.camera_from_obj)
-    return replace(pose, covariance=covariance_of_both(pose.covariance, step, pose.delta_chi2))
-
-
 PRIOR_SHARE, PRIOR_WEIGHT = 0.5, 20.0
 """Prior of the share of a corner's variance that differs between exposures, and its weight in differences."""
 
@@ -367,19 +352,14 @@ class Shift:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """Corners of all exposures by :func:`merge`: ``seen``, of the layout's tags.
+    """Corners of all exposures by :func:`merge`."""
 
-    ``counts`` : (e,) of these tags in each exposure; ``share`` : of the corners' variance that differs between
-    exposures; ``shifts`` : of each exposure against the one with the most tags in common; ``repeated`` : tags that an
-    exposure shows more than once; ``unknown`` : tags that the layout lacks.
-    """
-
-    seen: SeenTags
-    counts: tuple[int, ...]
-    share: float
-    shifts: tuple[Shift, ...]
-    repeated: tuple[tuple[str, int], ...]
-    unknown: tuple[tuple[str, int], ...]
+    seen: SeenTags  # of the layout's tags
+    counts: tuple[int, ...]  # of these tags in each exposure
+    share: float  # of the corners' variance that differs between exposures
+    shifts: tuple[Shift, ...]  # of each exposure against the one with the most tags in common
+    repeated: tuple[tuple[str, int], ...]  # tags that an exposure shows more than once
+    unknown: tuple[tuple[str, int], ...]  # tags that the layout lacks
 
     @property
     def rows(self) -> np.ndarray:

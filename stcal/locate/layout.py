@@ -158,14 +158,9 @@ def require_layout_written(path: str | Path, layout: TargetLayout) -> None:
     require_written(path, lambda: load_layout(path).corners_mm, layout.corners_mm, WRITTEN_MM, "mm")
 
 
-def square(size_mm: float) -> np.ndarray:
-    """Returns the corners (4, 2) of a tag about its middle."""
-    return size_mm * UNIT_SQUARE
-
-
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square to its corners."""
-    nominal = square(1.0)
+    nominal = UNIT_SQUARE
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)
     across = np.sum((corners - middle) @ np.array([[0, -1], [1, 0]]) * nominal)

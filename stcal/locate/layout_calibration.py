@@ -30,8 +30,8 @@ is gross, such as a misread tag or a hidden corner: weight 0."""
 VARIANCE_ROUNDS, NEAR_PX = 6, 0.005
 LEAST_FACTOR = 1e-3
 """Least factor on the stated σ of the board's points. Exact data would give 0, and rounding would be weighed."""
-STEP_MM = 1e-3
-"""Step of numerical derivatives of the frame {obj}, which turns by 1e-4 rad at most."""
+STEP_MM = 1e-4
+"""Step of numerical derivatives of the frame {obj}, which turns by 1e-5 rad at most."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
 APART = null_space(TOGETHER.T)
@@ -40,63 +40,48 @@ APART = null_space(TOGETHER.T)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCorners:
-    """Board and tags in one image, in normalised coordinates without distortion.
-
-    ``pose`` : camera_from_board; ``board_xyz`` : (b, 3) mm; ``board_seen`` : (b, 2), with ``board_noise`` (b, 2, 2) up
-    to a factor; ``rows`` : (k,) of the tags; ``seen`` : (4k, 2) their corners; ``noise`` : (k, 8, 8) covariance, px²;
-    ``focal_px`` : approximate ratio of pixels to normalised coordinates.
-    """
+    """Board and tags in one image, in normalised coordinates without distortion."""
 
     name: str
-    pose: Rigid
-    board_xyz: np.ndarray
-    board_seen: np.ndarray
-    board_noise: np.ndarray
-    rows: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    focal_px: float
+    pose: Rigid  # camera_from_board
+    board_xyz: np.ndarray  # (b, 3) mm
+    board_seen: np.ndarray  # (b, 2)
+    board_noise: np.ndarray  # (b, 2, 2) its covariance, up to a factor
+    rows: np.ndarray  # (k,) of the tags
+    seen: np.ndarray  # (4k, 2) their corners
+    noise: np.ndarray  # (k, 8, 8) covariance of a tag's corners, px²
+    focal_px: float  # approximate ratio of pixels to normalised coordinates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedLayout:
-    """Result of the adjustment: corners of the tags, and poses of the board.
+    """Result of the adjustment: corners of the tags, and poses of the board."""
 
-    ``corners_mm`` : (n, 4, 2) in the frame of the board, with ``covariance_mm2`` (8n, 8n); ``poses`` :
-    camera_from_board; ``board_factor`` : on the stated σ of the board's points; ``sigma_px``, ``tag_sigma_px`` : σ due
-    to print, lens and flatness, of single corners and of the four of a tag together; ``board_rms_px``, ``tag_rms_px`` :
-    residuals per coordinate; ``image_rms_px`` : (m,) of the tags by image; ``downweighted`` : share of the tags that
-    are damped; ``settled`` : whether the σ converged; ``stretch``, ``shear`` : how much longer the board is printed
-    along its rows than across, and its shear, relative.
-    """
-
-    corners_mm: np.ndarray
-    covariance_mm2: np.ndarray
-    poses: Poses
-    board_factor: float
-    sigma_px: float
-    tag_sigma_px: float
-    board_rms_px: float
+    corners_mm: np.ndarray  # (n, 4, 2) in the frame of the board
+    covariance_mm2: np.ndarray  # (8n, 8n)
+    poses: Poses  # camera_from_board
+    board_factor: float  # on the stated σ of the board's points
+    sigma_px: float  # of single corners, due to print, lens and flatness
+    tag_sigma_px: float  # of the four corners of a tag together
+    board_rms_px: float  # residuals per coordinate
     tag_rms_px: float
-    image_rms_px: np.ndarray
-    downweighted: float
-    settled: bool
-    stretch: float
+    image_rms_px: np.ndarray  # (m,) of the tags by image
+    downweighted: float  # share of the tags that are damped
+    settled: bool  # whether the σ converged
+    stretch: float  # how much longer the board is printed along its rows than across, relative
     shear: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """Board points (c = 1) or tags (c = 4 corners) of all images: ``image`` (r,), ``seen`` (r, c, 2), ``noise``
-    (r, 2c, 2c), ``focal_px`` (r,). ``places`` : returns the points (r, c, 3) on the board for the values of a block;
-    ``slopes`` : the derivatives (r, 2c, k) by these values, from those (r, c, 2, 3) by the points."""
+    """Board points (c = 1) or tags (c = 4 corners) of all images."""
 
-    image: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    focal_px: np.ndarray
-    places: Callable[[Vector], np.ndarray]
-    slopes: Callable[[np.ndarray], np.ndarray]
+    image: np.ndarray  # (r,)
+    seen: np.ndarray  # (r, c, 2)
+    noise: np.ndarray  # (r, 2c, 2c)
+    focal_px: np.ndarray  # (r,)
+    places: Callable[[Vector], np.ndarray]  # returns the points (r, c, 3) on the board for the values of a block
+    slopes: Callable[[np.ndarray], np.ndarray]  # (r, 2c, k) by these values, from those (r, c, 2, 3) by the points
 
     @classmethod
     def of(cls, images: Sequence[ImageCorners], seen: Sequence[np.ndarray], noise: Sequence, *places) -> "_Rows":
@@ -120,23 +105,22 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Noise:
-    """Noise model: ``board``, factor on the σ of the board's points; ``corner_px``, ``tag_px``, additional σ of single
-    corners, and of the four corners of a tag together; ``amplitude`` of the smooth deviations of the board's print."""
+    """Noise model."""
 
-    board: float
-    corner_px: float
-    tag_px: float
-    amplitude: float
+    board: float  # factor on the σ of the board's points
+    corner_px: float  # additional σ of single corners
+    tag_px: float  # of the four corners of a tag together
+    amplitude: float  # of the smooth deviations of the board's print
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """All observations: board points and tags, of which ``tag`` (r,) are the numbers; the board's ``print``."""
+    """All observations."""
 
     board: _Rows
     tags: _Rows
-    tag: np.ndarray
-    print: PrintModes
+    tag: np.ndarray  # (r,) numbers of the tags
+    print: PrintModes  # of the board
 
     @classmethod
     def of(cls, images: Sequence[ImageCorners]) -> "_Layout":
@@ -449,15 +433,11 @@ def _by_board_corners(corners: np.ndarray, origin: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationImages:
-    """Images of a target's calibration.
+    """Images of a target's calibration."""
 
-    ``names`` : names of m readable images of one size; ``views`` : views of the board in them, None if it is not seen;
-    ``symmetries`` : rotations that map the board onto itself; ``left_out`` : files that are not used, and why.
-    """
-
-    names: tuple[str, ...]
-    views: tuple[BoardView | None, ...]
+    names: tuple[str, ...]  # of m readable images of one size
+    views: tuple[BoardView | None, ...]  # of the board in them, None if it is not seen
     tags: tuple[Tags, ...]
     camera: Camera
-    symmetries: tuple[Rigid, ...] = ()
-    left_out: tuple[str, ...] = ()
+    symmetries: tuple[Rigid, ...] = ()  # rotations that map the board onto itself
+    left_out: tuple[str, ...] = ()  # files that are not used, and why

@@ -271,8 +271,6 @@ class LocateOptions:
 
     def __post_init__(self):
         require_fields(self, "locate", workers=1)
-        if self.method not in ("joint", "patent"):
-            raise InputError("E-OPTION-METHOD", f"method {self.method!r}: joint or patent needed")
         if not self.moved_px > 0:
             raise InputError("E-OPTION-RANGE", f"moved_px {self.moved_px:g}: a positive number needed")
 

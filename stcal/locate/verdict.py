@@ -14,10 +14,10 @@ from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import PlanePoses, deciding_delta, poses_of_plane
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.plane import PlanePoses, covariance_of_both, deciding_delta, poses_of_plane
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.locate.estimate import ObjPose, SeenTags, covering_both, locate, reprojection_rms
+from stcal.locate.estimate import ObjPose, SeenTags, locate, reprojection_rms
 from stcal.locate.layout import TargetLayout
 
 Decision = Literal["accept", "ambiguous", "reject"]
@@ -105,10 +105,10 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     options = options or VerdictOptions()
     apart_deg = 0.0
     if pose.second is not None:
-        difference = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
-        apart_deg = float(np.degrees(np.linalg.norm(difference[:3])))
+        away = pose.second.difference(pose.camera_from_obj)
+        apart_deg = float(np.degrees(np.linalg.norm(away[:3])))
         if apart_deg <= options.equal_deg:
-            pose = covering_both(pose)
+            pose = replace(pose, covariance=covariance_of_both(pose.covariance, away, pose.delta_chi2))
     chi2_limit = options.sigma_margin**2 * float(chdtri(pose.redundancy, options.max_p) / pose.redundancy)
     checks = [
         PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
@@ -221,17 +221,15 @@ class PatentOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentExposure:
-    """``tags`` : of the layout in exposure number ``exposure``; ``area_px2`` : of their triangles; None if others show
-    more; ``candidate`` : compared with others; ``poses`` : T_a, T_b by ``errors_px``, or None; ``det_j`` : of the
-    homography's derivative at the normalised centre, 1/mm²."""
+    """Result of one exposure by the patent's method."""
 
     exposure: int
-    tags: int
-    area_px2: float | None = None
-    candidate: bool = False
-    poses: tuple[Rigid, Rigid] | None = None
+    tags: int  # of the layout
+    area_px2: float | None = None  # of their triangles; None if others show more
+    candidate: bool = False  # compared with others
+    poses: tuple[Rigid, Rigid] | None = None  # T_a, T_b by ``errors_px``
     errors_px: tuple[float, float] | None = None
-    det_j: float | None = None
+    det_j: float | None = None  # of the homography's derivative at the normalised centre, 1/mm²
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

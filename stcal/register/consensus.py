@@ -96,16 +96,15 @@ class Problem:
     """Point pairs (n, 3) mm of a model, neither copied nor checked, as subsets are taken in inner loops.
 
     ``precision`` : (n,) inverse variances per axis, or (n, 3, 3) inverse covariances in frame b, scaled to mean σ 1
-    (RMS), so that whitened residuals are mm of such a point; ``sigma_mm`` : mean σ if given; ``lines`` : of a file, by
-    which messages name points; subsets have none.
+    (RMS), so that whitened residuals are mm of such a point.
     """
 
     model: Model
     xyz_a: np.ndarray
     xyz_b: np.ndarray
     precision: np.ndarray
-    sigma_mm: float | None = None
-    lines: Sequence[int] | None = None
+    sigma_mm: float | None = None  # mean σ, if given
+    lines: Sequence[int] | None = None  # of a file, by which messages name points; subsets have none
 
     def __len__(self) -> int:
         return len(self.xyz_a)
@@ -189,10 +188,7 @@ class Problem:
         origin = self[used]._middle()
         by_step = jacobian(self.model, transform, self.xyz_a - origin)
         added = by_step @ np.linalg.inv(self[used]._normal(transform, origin)) @ np.swapaxes(by_step, 1, 2)
-        if self.precision.ndim == 1:
-            return added * self.precision[:, None, None]
-        root = np.linalg.cholesky(self.precision)
-        return np.swapaxes(root, 1, 2) @ added @ root
+        return self.whitened(np.swapaxes(self.whitened(added), 1, 2))
 
     def _middle(self) -> np.ndarray:
         """Returns the weighted mean of a, about which the parameters correlate least."""
@@ -390,11 +386,11 @@ def by_threshold(threshold: float) -> Score:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
+    """Points that agree on a transform."""
 
-    inliers: np.ndarray
-    value: float
-    samples: int = 0
+    inliers: np.ndarray  # (n,)
+    value: float  # score, less is better
+    samples: int = 0  # 0 if all were tried
 
 
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
@@ -455,14 +451,13 @@ BY_CHANCE = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A transform with the ``inliers`` (n,) that agree on it; ``sigma`` per axis and ``threshold``, which may be
-    infinite, in mm of a point of mean σ; ``samples`` : random ones, 0 if all possible ones were tried."""
+    """A transform and the points that agree on it."""
 
     transform: Transform
-    inliers: np.ndarray
-    sigma: float
-    threshold: float
-    samples: int = 0
+    inliers: np.ndarray  # (n,)
+    sigma: float  # per axis, mm, of a point of mean σ
+    threshold: float  # likewise; may be infinite
+    samples: int = 0  # random ones; 0 if all possible ones were tried
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:

@@ -5,7 +5,6 @@ Rows that moved together are sought along their order, in two groups that overla
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc, ndtr
 
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register import consensus
@@ -188,15 +186,12 @@ UNIT_WITHIN, PAIRS = 0.08, 4000
 
 def mistaken_unit(ratio: float) -> str | None:
     """Returns the unit that a ratio of lengths in b to those in a suggests, in words, or None."""
-    candidates = [
-        Candidate(
-            f"is {side} in {name} (columns {', '.join(f'{side}{x}_{suffix}' for x in 'xyz')})?", partial(float, by)
-        )
-        for factor, (name, suffix) in UNITS.items()
-        for side, by in (("a", factor), ("b", 1 / factor))
-    ]
-    found = explain(candidates, lambda by: abs(ratio / by - 1), UNIT_WITHIN)
-    return found[0][0].words if found else None
+    sides = [(abs(ratio / by - 1), "a", names) for by, names in UNITS.items()]
+    sides += [(abs(ratio * by - 1), "b", names) for by, names in UNITS.items()]
+    off, side, (name, suffix) = min(sides)
+    if off >= UNIT_WITHIN:
+        return None
+    return f"is {side} in {name} (columns {', '.join(f'{side}{x}_{suffix}' for x in 'xyz')})?"
 
 
 def check_units(problem: Problem, seed: int) -> None:
@@ -286,7 +281,7 @@ class Wider:
 
 def wider(problem: Problem, transform: Transform) -> Wider | None:
     """Returns the narrowest wider model that explains the points of ``transform`` better beyond chance, or None."""
-    narrow, best = (problem, transform), None
+    narrow, transform_of, sigma = problem, transform, 0.0
     for model in list(MODELS.values())[list(MODELS).index(problem.model.name) + 1 :]:
         candidate = replace(problem, model=model)
         try:
@@ -295,33 +290,31 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
             fitted = None
         if fitted is None:
             break
-        before, after = (float(p.squares(t).sum()) for p, t in (narrow, (candidate, fitted)))
-        extra, redundancy = model.parameters - narrow[0].model.parameters, candidate.redundancy
+        before, after = (float(p.squares(t).sum()) for p, t in ((narrow, transform_of), (candidate, fitted)))
+        extra, redundancy = model.parameters - narrow.model.parameters, candidate.redundancy
         rounding = 3 * len(problem) * problem.rounding_mm() ** 2
         gain = (before - after) / extra / max(after / redundancy, rounding / redundancy)
-        sigma = float(np.sqrt(max(after, 0) / redundancy))
-        enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
-        if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and enough:
-            narrow = candidate, fitted
-            best = Wider(candidate, fitted, sigma, "")
-    if best is None:
+        decrease = np.sqrt(max(after, 0) / redundancy) / max(np.sqrt(before / narrow.redundancy), 1e-300)
+        if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and decrease < 1 - MATTERS:
+            narrow, transform_of, sigma = candidate, fitted, float(np.sqrt(max(after, 0) / redundancy))
+    if narrow is problem:
         return None
-    scales = np.linalg.svd(parts(best.transform)[0], compute_uv=False)
-    if best.problem.model == AFFINE:
+    scales = np.linalg.svd(parts(transform_of)[0], compute_uv=False)
+    if narrow.model == AFFINE:
         said = (
             f"{', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one instrument is "
             "scaled or not square to the others, or an arm bends; correct it, or use --model affine within these points"
         )
     else:
-        relative = best.sigma_mm * float(np.sqrt(best.problem.unit_covariance(best.transform)[6, 6]))
-        scale, sigma = float(np.cbrt(scales.prod())), float(np.cbrt(scales.prod())) * relative
-        digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+        scale = float(np.cbrt(scales.prod()))
+        of_scale = scale * sigma * float(np.sqrt(narrow.unit_covariance(transform_of)[6, 6]))
+        digits = max(1, 1 - int(np.floor(np.log10(max(of_scale, 1e-15)))))
         said = (
-            f"{scale:.{digits}f} ± {sigma:.{digits}f} times those in a: temperature (steel 11.5, aluminium 23 ppm/K), "
-            "a length standard, a board or an instrument of another scale; correct one of the files, or use --model "
-            "similarity"
+            f"{scale:.{digits}f} ± {of_scale:.{digits}f} times those in a: temperature (steel 11.5, aluminium 23 "
+            "ppm/K), a length standard, a board or an instrument of another scale; correct one of the files, or use "
+            "--model similarity"
         )
-    return replace(best, note=f"lengths in b are {said}")
+    return Wider(narrow, transform_of, sigma, f"lengths in b are {said}")
 
 
 WIDER_THAN = 10.0

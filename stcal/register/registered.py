@@ -114,11 +114,8 @@ def read_pairs(path: str | Path | Table, second: str | Path | Table | None = Non
 
 
 def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
-    """Refuses a repeated pair: equal rows have equal weighted sums, so that one sort replaces a table of tuples."""
-    key = rows @ np.random.default_rng(0).uniform(1, 2, rows.shape[1])
-    order = np.argsort(key, kind="stable")
-    near = np.flatnonzero(np.diff(key[order]) == 0)
-    same = near[(rows[order[near]] == rows[order[near + 1]]).all(1)]
+    order = np.lexsort(rows.T)
+    same = np.flatnonzero((rows[order[1:]] == rows[order[:-1]]).all(1))
     first_of = dict(zip(order[same + 1].tolist(), order[same].tolist(), strict=True))
     remedy = "remove it, or give one of them twice the weight"
     table.refuse(
@@ -146,9 +143,8 @@ class ErrorFigures:
     @classmethod
     def of(cls, lengths: np.ndarray) -> "ErrorFigures":
         """Returns the figures of lengths (n,), mm."""
-        if not len(lengths):
-            return cls(0, np.nan, np.nan, np.nan)
-        return cls(len(lengths), float(lengths.mean()), rms(lengths), float(lengths.max()))
+        figures = (lengths.mean(), rms(lengths), lengths.max()) if len(lengths) else [np.nan] * 3
+        return cls(len(lengths), *map(float, figures))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

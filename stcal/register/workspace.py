@@ -30,21 +30,15 @@ sytrd, ormqr, pttrf, pttrs = get_lapack_funcs(("sytrd", "ormqr", "pttrf", "pttrs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Systematic residuals b − b_from_a a over the workspace, frame b's axes, at places in frame a.
+    """Systematic residuals b − b_from_a a over the workspace, frame b's axes, at places in frame a."""
 
-    ``length_mm`` : over which they change; ``size_mm`` : RMS length at the points; ``noise_mm`` : σ per axis beside
-    them; ``p_value`` : of such a part by chance; ``rows`` : (m,) of the points used; ``taken_back`` : outliers that
-    follow the field of the others; ``plain_mm``, ``corrected_mm`` : (m,) errors of points by the transform, and by
-    transform and field, each fitted to the others; ``sigma_ratio`` : RMS of the latter over their σ.
-    """
-
-    length_mm: float
-    p_value: float
-    rows: Array
-    taken_back: Array
-    plain_mm: Array
-    corrected_mm: Array
-    sigma_ratio: float
+    length_mm: float  # over which they change
+    p_value: float  # of such a part by chance
+    rows: Array  # (m,) of the points used
+    taken_back: Array  # outliers that follow the field of the others
+    plain_mm: Array  # (m,) errors of points by the transform, fitted to the others
+    corrected_mm: Array  # (m,) by transform and field
+    sigma_ratio: float  # RMS of the latter over their σ
     _problem: Problem
     _transform: Transform
     _ratio: float
@@ -237,11 +231,11 @@ LEAST_POINTS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubes:
-    """``middle`` : (3,) of the cubes, mm, axes of frame a; ``errors[i][j]`` : of the fit in cube i at points in cube j
-    that are not in cube j − 1, held out in turn, or None."""
+    """Errors of fits in cubes about the middle of the points."""
 
-    middle: Array
+    middle: Array  # (3,) mm, frame a, along whose axes the cubes are
     sides_mm: Array
+    # errors[i][j]: of the fit in cube i at points in cube j that are not in cube j − 1, held out in turn, or None
     errors: tuple[tuple[ErrorFigures | None, ...], ...]
 
     def __post_init__(self):

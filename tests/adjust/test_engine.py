@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.adjust import Adjustment, Huber, Vector
-from stcal.adjust.blocks import Components, Equations, component_variances
+from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, by_pose, perspective
 
 SIGMA, IMAGES, POINTS = 0.002, 6, 12
 
@@ -25,21 +25,17 @@ def problem(eliminate: str, rng, loss: Huber | None = None, numerical: bool = Fa
         return (poses.rotation[image] @ points.array[point, :, None])[..., 0] + poses.translation[image]
 
     def seen(poses, points, focal):
-        xyz = at(poses, points)
-        return focal.array * xyz[:, :2] / xyz[:, 2:]
+        return focal.array * perspective(at(poses, points))[0]
 
     truth = seen(poses, Vector(xyz), Vector(np.ones((1, 1))))
     noisy = truth + sigma * rng.standard_normal(truth.shape)
 
     def slopes(poses, points, focal):
         xyz = at(poses, points)
-        ideal = xyz[:, :2] / xyz[:, 2:]
-        plane = np.concatenate([np.tile(np.eye(2), (len(xyz), 1, 1)), -ideal[:, :, None]], axis=2)
-        by_xyz = focal.array[0] / xyz[:, 2, None, None] * plane
-        turned = (poses.rotation[image] @ points.array[point, :, None])[..., 0]
-        cross = np.stack([np.cross(axis, turned) for axis in np.eye(3)], axis=2)
-        by_pose = np.concatenate([by_xyz @ cross, by_xyz], axis=2)
-        return by_pose, by_xyz @ poses.rotation[image], ideal[:, :, None]
+        ideal, by_xyz = perspective(xyz)
+        turned = xyz - poses.translation[image]
+        by_xyz = focal.array[0] * by_xyz
+        return by_pose(by_xyz, turned), by_xyz @ poses.rotation[image], ideal[:, :, None]
 
     a = Adjustment()
     pose = a.block("pose", poses, eliminate=eliminate == "pose")
@@ -124,7 +120,7 @@ def test_without_a_cluster_it_is_as_if_that_had_not_been_there(eliminate):
 
 def test_clusters_with_independent_errors_have_the_sigma_of_independent_errors():
     ratios, squares = [], []
-    for seed in range(40):
+    for seed in range(20):
         solution = problem("pose", np.random.default_rng(seed)).solve()
         focal = next(block for block in solution.problem.blocks if block.name == "focal")
         found = solution.by_clusters(focal)
@@ -132,7 +128,7 @@ def test_clusters_with_independent_errors_have_the_sigma_of_independent_errors()
         squares.append(float((solution.values["focal"].array[0, 0] - 1) ** 2 / found.covariance[0, 0]))
     assert min(ratios) >= 1 - 1e-9
     assert np.mean(ratios) < 1.3  # six clusters: Student's excess
-    assert 0.4 < np.mean(squares) < 1.5  # of 40: 1 ± 0.22, less by the excess
+    assert 0.3 < np.mean(squares) < 1.7  # of 20: 1 ± 0.32, less by the excess
 
 
 def test_a_gross_row_has_no_weight():
@@ -251,14 +247,6 @@ def test_kinds_tell_together_what_all_do():
     at = problem.at({block.name: block.start for block in problem.blocks})
     told = sum(at.equations((kind,)).told(at.reduction.from_kept) for kind in ("error", "between", "none"))
     assert told == pytest.approx(at.normal, rel=1e-9)
-
-
-def test_equations_of_residuals_are_least_squares():
-    design, seen = np.random.default_rng(1).normal(size=(2, 20, 3)) @ np.diag([1, 2, 3.0]), np.arange(20.0)
-    own = Equations.of(seen, -design[0])
-    _, _, step, covariance = Components([own], Equations.nothing(3)).at(np.zeros(1))
-    assert step == pytest.approx(np.linalg.lstsq(design[0], seen, rcond=None)[0])
-    assert covariance == pytest.approx(np.linalg.inv(design[0].T @ design[0]))
 
 
 @pytest.mark.parametrize("bound", [0.0, 3.0])

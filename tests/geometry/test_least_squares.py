@@ -7,7 +7,7 @@ from scipy import stats
 from stcal.design import reference_board
 from stcal.geometry.clusters import by_clusters
 from stcal.geometry.least_squares import NormalEquations, minimise
-from stcal.geometry.normal_equations import constrained_inverse, free_motions, generalised_inverse, reduce
+from stcal.geometry.normal_equations import constrained_inverse, free_motions, generalised_inverse
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.robust import (
     huber_cost,
@@ -33,24 +33,6 @@ def test_a_curved_valley_is_followed_to_its_end():
     assert 5 < found.steps < 100
 
 
-def test_an_exponential_is_fitted_where_its_residuals_are_least():
-    t = np.linspace(0, 2, 40)
-    y = 3 * np.exp(-1.3 * t) + 0.05 * np.sin(40 * t)
-
-    def linearise(p):
-        model = p[0] * np.exp(-p[1] * t)
-        return NormalEquations.of(model - y, np.column_stack([model / p[0], -t * model]))
-
-    found = minimise(np.array([1.0, 0.1]), linearise, np.add).required("fit", "look")
-    gradient = linearise(found.state).gradient
-    assert np.abs(gradient).max() < 1e-6
-    assert (
-        linearise(found.state + np.array([1e-4, 0])).cost
-        > found.linear.cost
-        < linearise(found.state - np.array([1e-4, 0])).cost
-    )
-
-
 def test_what_nothing_determines_stays():
     found = minimise(np.array([5.0, 7.0]), lambda x: NormalEquations.of(x[:1] - 2, np.array([[1.0, 0.0]])), np.add)
     assert found.state == pytest.approx([2, 7], abs=1e-6)
@@ -65,12 +47,9 @@ def test_many_problems_end_where_each_would_alone():
 
     def select(take, new, old):
         if isinstance(new, np.ndarray):
-            return np.where(take[:, None], new, old)
-        return NormalEquations(
-            np.where(take, new.cost, old.cost),
-            np.where(take[:, None, None], new.normal, old.normal),
-            np.where(take[:, None], new.gradient, old.gradient),
-        )
+            return np.where(take.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+        parts = ((getattr(each, k) for each in (new, old)) for k in ("cost", "normal", "gradient"))
+        return NormalEquations(*(select(take, *part) for part in parts))
 
     found = minimise(starts, at_once, np.add, select=select)
     assert found.converged.all()
@@ -95,22 +74,6 @@ def test_an_impossible_state_is_never_taken():
     found = minimise(np.array([3.0]), linearise, np.add)
     assert found.state[0] > 0.5
     assert not found.converged
-
-
-def test_reduced_equations_are_those_of_all_unknowns():
-    rng = np.random.default_rng(3)
-    jacobian, residual = rng.normal(size=(60, 3 * 4 + 5)), rng.normal(size=60)
-    for i in range(3):  # blocks that do not meet
-        jacobian[np.arange(60) % 3 != i, 4 * i : 4 * i + 4] = 0
-    normal, right = jacobian.T @ jacobian, jacobian.T @ residual
-    whole = np.linalg.solve(normal, right)
-    block = np.array([normal[4 * i : 4 * i + 4, 4 * i : 4 * i + 4] for i in range(3)])
-    away = reduce(block, right[:12].reshape(3, 4), normal[:12, 12:].reshape(3, 4, 5))
-    kept = np.linalg.solve(normal[12:, 12:] - away.normal, right[12:] - away.right)
-    assert kept == pytest.approx(whole[12:])
-    assert away.back(kept).ravel() == pytest.approx(whole[:12])
-    reduced_right = right[12:] - away.right
-    assert away.gain + reduced_right @ kept == pytest.approx(right @ whole)
 
 
 @pytest.mark.parametrize("scale", [False, True])
@@ -175,7 +138,7 @@ def test_the_limit_of_lengths_follows_their_tail(freedom, least):
     """Sound lengths beyond the limit are rare, 0.01 in a sample; gross ones do not move it much.
 
     ``least`` : the quantile of Student's distribution, of 0.01 / 200."""
-    rng, count, draws = np.random.default_rng(3), 200, 200
+    rng, count, draws = np.random.default_rng(3), 200, 100
     beyond, limits, spoiled = 0, [], []
     for _ in range(draws):
         shrunk = 1.0 if np.isinf(freedom) else np.sqrt(rng.chisquare(freedom, (count, 1)) / freedom)
@@ -183,7 +146,7 @@ def test_the_limit_of_lengths_follows_their_tail(freedom, least):
         limits.append(tailed_limit(length, 0.01 / count))
         beyond += int((length > limits[-1]).sum())
         spoiled.append(tailed_limit(np.append(length, [60.0, 200.0]), 0.01 / count))
-    assert beyond <= 8  # 2 expected where the tail was known
+    assert beyond <= 5  # 1 expected where the tail was known
     assert np.median(spoiled) < 1.5 * np.median(limits)
     assert least * 0.8 < np.median(limits) < 3 * least
 
@@ -202,13 +165,13 @@ def drawn(rng, n: int, common: float, q: int = 4, rows: int = 30):
 @pytest.mark.parametrize(("common", "formal"), [(0.0, (0.9, 1.1)), (1.0, (5, 30))])
 def test_sigma_by_clusters_hold_with_and_without_common_errors(common, formal):
     rng, squares, plain, larger = np.random.default_rng(1), [], [], []
-    for _ in range(400):
+    for _ in range(200):
         error, found, independent = drawn(rng, 15, common)
         squares.append(error @ np.linalg.solve(found.covariance, error) / 4)
         plain.append(error @ np.linalg.solve(independent, error) / 4)
         larger.append(np.sqrt(np.diag(found.covariance) / np.diag(independent)).mean())
     assert formal[0] < np.mean(plain) < formal[1]
-    # 400 draws of 4 parameters scatter by 4 %, and more where few clusters tell σ.
+    # 200 draws of 4 parameters scatter by 5 %, and more where few clusters tell σ.
     assert 0.75 < np.mean(squares) < 1.25
     if not common:
         assert 1 <= np.mean(larger) < 1.12

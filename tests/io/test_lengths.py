@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from stcal.boards.board_designs import UNIT_SQUARE
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
+from stcal.locate.layout import TargetLayout, layout_toml, load_layout
 from stcal.robot.descriptions import load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
@@ -88,7 +89,7 @@ def test_robots_in_metres_and_one_without_links(tmp_path):
 
 def test_a_layout_of_tiny_tags_comes_back(tmp_path):
     tags = (("DICT_APRILTAG_36h11", 0),)
-    layout = TargetLayout("tiny", tags, square(0.5)[None], np.eye(8) * 1e-8, 0, unusual_size=True)
+    layout = TargetLayout("tiny", tags, 0.5 * UNIT_SQUARE[None], np.eye(8) * 1e-8, 0, unusual_size=True)
     assert load_layout(written(tmp_path, layout_toml(layout))).corners_mm[0, 1, 0] == pytest.approx(0.25)
 
 

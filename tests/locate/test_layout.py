@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_designs import ChessboardDesign, view_of
+from stcal.boards.board_designs import UNIT_SQUARE, ChessboardDesign, view_of
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import LayoutPlan, layout_toml, load_layout, load_plan, square
+from stcal.locate.layout import LayoutPlan, layout_toml, load_layout, load_plan
 from stcal.locate.layout_calibration import CalibratedLayout, ImageCorners, _turned_alike, calibrate
 from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
@@ -30,7 +30,7 @@ def test_obj_lies_in_the_middle_of_the_origin_tag(tmp_path):
     text = HEAD + "origin = 2\n" + PLACED.format(1, 0, 0, 0) + PLACED.format(2, 100, 50, 90)
     layout = load_layout(written(tmp_path, text))
     assert layout.origin == 1
-    assert np.allclose(layout.corners_mm[1], square(20.0), atol=1e-12)
+    assert np.allclose(layout.corners_mm[1], 20.0 * UNIT_SQUARE, atol=1e-12)
     # tag 1 as seen from tag 2, which is turned by a quarter from X to Y
     assert np.allclose(layout.corners_mm[0].mean(0), [-50, 100], atol=1e-12)
 

@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
-from stcal.locate.scenes import find_scenes, locate_image, locate_scene, run
+from stcal.locate.scenes import SceneTags, detect, find_scenes, locate_image, locate_scene, run
 from stcal.synthetic.optics import Light, expose
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.outcome import fails_with, refuses
@@ -25,6 +25,12 @@ TRUTH = tilted(30)
 @pytest.fixture(scope="module")
 def plain():
     return photo(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def seen(plain):
+    """What one photograph shows, to be located by other layouts and cameras."""
+    return SceneTags("plain", (detect(plain, "plain", LAYOUT.dictionaries()),))
 
 
 @pytest.fixture
@@ -68,10 +74,10 @@ def test_an_over_exposed_target_keeps_its_place(located, plain):
     assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
 
 
-def test_tags_of_another_target_are_named(located, plain):
+def test_tags_of_another_target_are_named(seen, plain):
     tags = tuple((dictionary, tag + 20) for dictionary, tag in LAYOUT.tags)
     other = TargetLayout("other", tags, LAYOUT.corners_mm, LAYOUT.covariance_mm2, 0)
-    result = located([plain], other)
+    result = locate_scene(seen, other, MODEL, image_of=lambda _: plain)
     assert "no tag of the layout, but others of its dictionaries" in result.verdict.reasons[0]
 
 
@@ -105,7 +111,7 @@ def test_scenes_of_a_folder(tmp_path, plain):
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path / "far" / "1.png")] == [("1", 1)]
 
 
-@pytest.mark.parametrize("shift", [1.0, 8.0])
+@pytest.mark.parametrize("shift", [1.0, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_a_scene_that_moved(located, plain, shift):
     matrix = np.array([[1.0, 0, shift], [0, 1, 0]])
     turned = cv2.warpAffine(plain, matrix, plain.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
@@ -124,12 +130,11 @@ def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):
     assert result.notes[0].startswith("left out: b.png: truncated")
 
 
-def test_a_camera_file_of_another_camera(located, plain):
+def test_a_camera_file_of_another_camera(seen):
     """A focal length that is half as long again shows in a near, tilted plane."""
     far_off = Camera(1200, 900, 1.5 * CAMERA.focal, CAMERA.centre, np.zeros(8))
     model = CameraModel(far_off.focal, far_off.centre, far_off.distortion, "PINHOLE", 1200, 900, "test")
-    scene = located([plain]).tags
-    assert locate_scene(scene, LAYOUT, model).verdict.decision == "reject"
+    assert locate_scene(seen, LAYOUT, model).verdict.decision == "reject"
 
 
 def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
@@ -154,16 +159,16 @@ def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
         (turned(0, -1), "change the signs of y_mm"),
     ],
 )
-def test_tags_that_are_turned_in_the_layout(located, plain, layout, remedy):
-    result = located([plain], layout)
+def test_tags_that_are_turned_in_the_layout(seen, layout, remedy):
+    result = locate_scene(seen, layout, MODEL)
     assert result.verdict.decision == "reject"
     assert remedy in result.verdict.reasons[-1]
 
 
-def test_one_tag_that_is_wrong_is_left_out_and_nothing_is_made_of_it(located, plain):
+def test_one_tag_that_is_wrong_is_left_out_and_nothing_is_made_of_it(seen):
     corners = LAYOUT.corners_mm.copy()
     corners[1] = np.roll(corners[1], 2, axis=0)
-    result = located([plain], dataclasses.replace(LAYOUT, corners_mm=corners))
+    result = locate_scene(seen, dataclasses.replace(LAYOUT, corners_mm=corners), MODEL)
     assert result.pose.outliers == (1,)
     assert not any("fit if" in reason for reason in result.verdict.reasons)
 

@@ -18,6 +18,7 @@ from tests.support.arms import elastic
 from tests.support.point_pairs import B_FROM_A
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
+WITH_JOINTS = HEAD + "".join(f",q{i}_deg" for i in range(1, 7))
 
 
 def points(n: int = 30, seed: int = 0):
@@ -30,9 +31,9 @@ def rows_of(*columns) -> list[str]:
     return [",".join(f"{v:.6f}" for v in row) for row in np.hstack(columns)]
 
 
-def written(folder, rows: list[str]):
+def written(folder, rows: list[str], head: str = HEAD):
     path = folder / "pairs.csv"
-    path.write_text("\n".join([HEAD, *rows]) + "\n")
+    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
     return path
 
 
@@ -99,9 +100,7 @@ def robot_pairs(tmp_path_factory):
     q = joint_vectors(drawn, 45, rng)
     b = B_FROM_A @ forward(real, q).translation + rng.normal(0, 0.03, (45, 3))
     b[[4, 20, 33]] += [[3.0, 0, 0], [0, -20, 0], [8, 8, 8]]
-    pairs = folder / "pairs.csv"
-    head = HEAD + "".join(f",q{i}_deg" for i in range(1, 7))
-    pairs.write_text("\n".join([head, *rows_of(forward(drawn, q).translation, b, np.degrees(q))]))
+    pairs = written(folder, rows_of(forward(drawn, q).translation, b, np.degrees(q)), WITH_JOINTS)
     (folder / "robot.toml").write_text(robot_toml(drawn))
     return folder, pairs, real
 
@@ -142,9 +141,8 @@ def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
     a = forward(drawn, q, payload_kg=mass).translation
     assert np.abs(a - forward(drawn, q).translation).max() > 0.3
     b = B_FROM_A @ a + rng.normal(0, 0.03, (45, 3))
-    pairs, out = tmp_path / "pairs.csv", tmp_path / "o.json"
-    head = HEAD + "".join(f",q{i}_deg" for i in range(1, 7)) + ",payload_kg"
-    pairs.write_text("\n".join([head, *rows_of(a, b, np.column_stack([np.degrees(q), mass]))]))
+    out = tmp_path / "o.json"
+    pairs = written(tmp_path, rows_of(a, b, np.degrees(q), mass[:, None]), WITH_JOINTS + ",payload_kg")
     (tmp_path / "robot.toml").write_text(robot_toml(drawn))
     code, _, err = run(pairs, "--robot", tmp_path / "robot.toml", "--folds", 2, "--out", out)
     assert (code, err) == (0, "")
@@ -160,11 +158,9 @@ def test_joint_values_are_needed_for_a_robot(run, tmp_path, robot_pairs):
     assert code == 2
     assert "q1_deg" in err
     assert "--robot" in err
-    lines = pairs.read_text().splitlines()
-    lines[6] = ",".join(["", *lines[6].split(",")[1:]])
-    bad_row = tmp_path / "bad.csv"
-    bad_row.write_text("\n".join(lines))
-    code, _, err = run(bad_row, "--robot", folder / "robot.toml")
+    head, *rows = pairs.read_text().splitlines()
+    rows[5] = rows[5][rows[5].index(",") :]
+    code, _, err = run(written(tmp_path, rows, head), "--robot", folder / "robot.toml")
     assert code == 2
     assert "line 7" in err
 
@@ -181,9 +177,9 @@ def test_joint_vectors_of_fewer_pairs_are_refused(robot_pairs):
 def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):
     """Eight points for 27 parameters: the transform is written, and the command says that the rest failed."""
     folder, pairs, _ = robot_pairs
-    few, out = tmp_path / "few.csv", tmp_path / "o.json"
-    few.write_text("\n".join(pairs.read_text().splitlines()[:9]))
-    code, _, err = run(few, "--robot", folder / "robot.toml", "--out", out)
+    head, *rows = pairs.read_text().splitlines()
+    out = tmp_path / "o.json"
+    code, _, err = run(written(tmp_path, rows[:8], head), "--robot", folder / "robot.toml", "--out", out)
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
@@ -193,37 +189,28 @@ ROWS = ["0,0,0,10,20,30", "1,0,0,11,20,30", "0,2,0,10,22,30", "0,0,3.5,10,20,33.
 COV = "cov_x_x,cov_x_y,cov_x_z,cov_y_y,cov_y_z,cov_z_z"
 
 
-@pytest.fixture
-def table(tmp_path):
-    def write(rows, head=HEAD):
-        path = tmp_path / "pairs.csv"
-        path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
-        return path
-
-    return write
-
-
 def with_cells(cells):
     return [f"{row},{cell}" for row, cell in zip(ROWS, cells, strict=True)]
 
 
-def test_points_lines_and_units(table):
-    pairs = register.read_pairs(table([ROWS[0], "# a remark", *ROWS[1:]]))
+def test_points_lines_and_units(tmp_path):
+    pairs = register.read_pairs(written(tmp_path, [ROWS[0], "# a remark", *ROWS[1:]]))
     assert list(pairs.lines) == [2, 4, 5, 6]
     np.testing.assert_array_equal(pairs.xyz_a[3], [0, 0, 3.5])
     np.testing.assert_array_equal(pairs.xyz_b[2], [10, 22, 30])
     assert pairs.weights is None
     assert pairs.covariances is None
-    pairs = register.read_pairs(table(ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in"))
+    pairs = register.read_pairs(written(tmp_path, ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in"))
     np.testing.assert_allclose(pairs.xyz_a[1], [1000, 0, 0])
     np.testing.assert_allclose(pairs.xyz_b[0], np.array([10, 20, 30]) * 25.4)
 
 
-def test_noise_of_three_kinds(table):
-    assert register.read_pairs(table(with_cells([1, 2, 3, 4]), HEAD + ",weight")).weights.tolist() == [1, 2, 3, 4]
-    variances = register.read_pairs(table(with_cells([1, 2, 3, 4]), HEAD + ",sigma_um")).covariances
+def test_noise_of_three_kinds(tmp_path):
+    numbered = with_cells([1, 2, 3, 4])
+    assert register.read_pairs(written(tmp_path, numbered, HEAD + ",weight")).weights.tolist() == [1, 2, 3, 4]
+    variances = register.read_pairs(written(tmp_path, numbered, HEAD + ",sigma_um")).covariances
     np.testing.assert_allclose(variances, np.array([1, 4, 9, 16]) * 1e-6)
-    full = register.read_pairs(table(with_cells(["4,1,0,5,2,6"] * 4), f"{HEAD},{COV}")).covariances
+    full = register.read_pairs(written(tmp_path, with_cells(["4,1,0,5,2,6"] * 4), f"{HEAD},{COV}")).covariances
     np.testing.assert_array_equal(full[2], [[4, 1, 0], [1, 5, 2], [0, 2, 6]])
 
 
@@ -244,6 +231,6 @@ def test_noise_of_three_kinds(table):
         (with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]), f"{HEAD},{COV}", "E-TABLE-COVARIANCE … 5 … 2"),
     ],
 )
-def test_bad_files(table, rows, head, message):
+def test_bad_files(tmp_path, rows, head, message):
     with fails_with(message):
-        register.read_pairs(table(rows, head))
+        register.read_pairs(written(tmp_path, rows, head))

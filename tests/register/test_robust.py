@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import Liu2017Options, register
 from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER
@@ -147,7 +146,7 @@ def test_noise_is_not_called_bent():
 
 def test_the_same_seed_gives_the_same_answer_and_rows_in_any_order_the_same_points():
     s = scene(9, 40, 0.3)
-    found, again = (register(s.xyz_a, s.xyz_b, folds=6) for _ in range(2))
+    found, again = (register(s.xyz_a, s.xyz_b, folds=2) for _ in range(2))
     assert (found.b_from_a.matrix() == again.b_from_a.matrix()).all()
     assert found.samples == again.samples > 0
     assert (found.held_out.error_mm == again.held_out.error_mm).all()
@@ -195,43 +194,37 @@ def test_weights_decide_who_is_far():
     assert not register(s.xyz_a, b, folds=0).inliers[:10].all()
 
 
-class TestThreshold:
-    def test_inliers_are_those_within(self):
-        s = scene(15, 80, 0.3)
-        found = register(s.xyz_a, s.xyz_b, threshold_mm=0.4, folds=0)
-        np.testing.assert_array_equal(found.inliers, np.linalg.norm(found.residuals, axis=1) <= 0.4)
-        assert found.threshold_mm == 0.4
-        assert not (found.inliers & ~s.clean).any()
-        # 0.4 mm is 2.7 σ and cuts off 7 %: without a correction σ would come out 5 % too small
-        assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.15)
-
-    def test_nobody_within(self):
-        rng = np.random.default_rng(0)
-        with fails_with("E-REGISTER-DISAGREE … rigid … within 1e-06 mm"):
-            register(rng.uniform(-1, 1, (30, 3)), rng.uniform(-1, 1, (30, 3)), threshold_mm=1e-6)
+def test_inliers_are_those_within_a_threshold():
+    s = scene(15, 80, 0.3)
+    found = register(s.xyz_a, s.xyz_b, threshold_mm=0.4, folds=0)
+    np.testing.assert_array_equal(found.inliers, np.linalg.norm(found.residuals, axis=1) <= 0.4)
+    assert found.threshold_mm == 0.4
+    assert not (found.inliers & ~s.clean).any()
+    # 0.4 mm is 2.7 σ and cuts off 7 %: without a correction σ would come out 5 % too small
+    assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.15)
 
 
-class TestFewPoints:
-    def test_three_have_nobody_to_judge_by(self):
-        s = scene(17, 3)
-        found = register(s.xyz_a, s.xyz_b)
-        assert found.inliers.all()
-        assert found.redundancy == 3
-        assert found.held_out is None
-        assert any("3 degrees of freedom" in note for note in found.notes)
+def test_three_points_have_nobody_to_judge_by():
+    s = scene(17, 3)
+    found = register(s.xyz_a, s.xyz_b)
+    assert found.inliers.all()
+    assert found.redundancy == 3
+    assert found.held_out is None
+    assert any("3 degrees of freedom" in note for note in found.notes)
 
-    def test_one_wrong_of_four_is_refused(self):
-        s = scene(18, 4)
-        b = s.xyz_b.copy()
-        b[1] += [0, 60, 0]
-        with fails_with("E-REGISTER-DISAGREE … 3 … 4 … rigid … 4"):
-            register(s.xyz_a, b)
 
-    @pytest.mark.parametrize(("model", "n", "needed"), [("rigid", 2, 3), ("similarity", 2, 3), ("affine", 4, 5)])
-    def test_too_few(self, model, n, needed):
-        s = scene(20, n)
-        with pytest.raises(DegenerateError, match=f"{n} point pairs, {needed} needed for the {model} model"):
-            register(s.xyz_a, s.xyz_b, model=model)
+def test_one_wrong_of_four_is_refused_and_so_are_points_of_which_none_is_within():
+    s = scene(18, 4)
+    off = np.array([0, 60, 0]) * (np.arange(4) == 1)[:, None]
+    refuses("E-REGISTER-DISAGREE … 3 … 4 … rigid … 4", register, s.xyz_a, s.xyz_b + off)
+    a, b = np.random.default_rng(0).uniform(-1, 1, (2, 30, 3))
+    refuses("E-REGISTER-DISAGREE … rigid … within 1e-06 mm", register, a, b, threshold_mm=1e-6)
+
+
+@pytest.mark.parametrize(("model", "n", "needed"), [("rigid", 2, 3), ("similarity", 2, 3), ("affine", 4, 5)])
+def test_too_few(model, n, needed):
+    s = scene(20, n)
+    refuses(f"E-POINTS-FEW … {n} point pairs, {needed} needed … {model}", register, s.xyz_a, s.xyz_b, model=model)
 
 
 def test_points_without_correspondence_are_refused():

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.board_designs import UNIT_SQUARE
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.locate.layout import TargetLayout, square
+from stcal.locate.layout import TargetLayout
 
 CAMERA = Camera(1600, 1200, [1350.0, 1350.0], [799.5, 599.5], [-0.1, 0.05, 0, 0, 0, 0, 0, 0])
 PLACES = (
@@ -34,7 +35,7 @@ class CornerNoise:
 
 def example_layout(sigma_mm: float = 0.03, sigma_px: float = 0.0) -> TargetLayout:
     """Six tags of four families and four sizes on 150 × 125 mm."""
-    corners = np.array([square(size) + np.array([x, y]) for _, _, size, x, y in PLACES])
+    corners = np.array([size * UNIT_SQUARE + np.array([x, y]) for _, _, size, x, y in PLACES])
     tags = tuple((dictionary, tag) for dictionary, tag, *_ in PLACES)
     return TargetLayout("example", tags, corners, sigma_mm**2 * np.eye(corners.size), 0, sigma_px)
 
