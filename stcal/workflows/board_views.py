@@ -380,12 +380,9 @@ def calibrate_camera_by_corners(
         views = []
         for name, view in detections.views().items():
             labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
-            rays, shape, covariance = (
-                camera.normalised_from_pixel(view.xy_px),
-                np.zeros((len(view), 2, 2)),
-                covariance_px2(view),
-            )
-            views.append(ImageObservations(name, group[name], labels, view.xy_px, rays, shape, covariance))
+            rays, covariance = camera.normalised_from_pixel(view.xy_px), covariance_px2(view)
+            seen = view.xy_px, rays, np.zeros_like(covariance), covariance
+            views.append(ImageObservations(name, group[name], labels, *seen))
         return views, detections.skipped
 
     return calibrated(find, images, grid, colmap_model, workers, ROUNDS.get(type(board), 1))

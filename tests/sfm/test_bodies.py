@@ -39,6 +39,7 @@ from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, mak
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import FULL, sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
+from tests.support.image_poses import pose_error
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
@@ -169,8 +170,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
     for face, pose in result.target.target_from_face.items():
         if face == result.target.reference_face:
             continue
-        truth = scene.target_from_face[face]
-        off = np.concatenate([(pose @ truth.inverse()).log()[:3], pose.translation - truth.translation])
+        off = pose_error(pose, scene.target_from_face[face])
         normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 
@@ -249,9 +249,7 @@ def size_row(found, board) -> tuple[str, str]:
     return row.origin, row.words
 
 
-@pytest.mark.parametrize(
-    ("target", "images", "seed"), [(tag_cube(60), 20, 0), (tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)]
-)
+@pytest.mark.parametrize(("target", "images", "seed"), [(tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)])
 def test_each_face_is_seen_often_and_squarely(target, images, seed):
     """Five times, and twice within 45° of the normal; at random, a face of a cube is in two to four of 20 images."""
     scene = make_body_scene(target, body_camera(900), BodyOptions(images, 300.0, seed=seed))
@@ -278,9 +276,9 @@ def test_faces_that_are_hardly_seen_are_named():
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
     target, near = tag_cube(60), 145.0
-    options = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    options = PlanOptions(images=4, distance_mm=near, width=900, seed=3, camera=body_camera(900))
     forecast, _, _ = planned_photographs(options, target)
-    simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
+    simulated = make_body_scene(target, body_camera(900), BodyOptions(4, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
     assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())

@@ -203,10 +203,8 @@ def measure(
     if serve or live:
         mode, source = ("--live", "from a camera, as taken") if live else ("--serve", "over HTTP, one answer each")
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--out": out != TABLE}
-        alone |= {
-            "IMAGES": images if serve else None,
-            "--json": json_file if serve or json_file != STANDARD_OUTPUT else 0,
-        }
+        to_file = None if live and json_file == STANDARD_OUTPUT else json_file
+        alone |= {"IMAGES": images if serve else None, "--json": to_file}
         alone |= {"--previous": previous, "--sequence": sequence, "--scheduler": scheduler}
         alone |= {"--send-images": send_images, "--strict": strict, "--workers": workers}
         if conflict := next((name for name, value in alone.items() if value), None):

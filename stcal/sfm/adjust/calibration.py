@@ -17,15 +17,8 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
-from stcal.sfm.adjust.chain import (
-    CalibratedTarget,
-    FaceInGroup,
-    FrameKind,
-    chain_faces,
-    faces_of_group,
-    missing_frame_circles,
-    unlinked_faces,
-)
+from stcal.sfm.adjust import chain
+from stcal.sfm.adjust.chain import CalibratedTarget, FaceInGroup, FrameKind
 from stcal.sfm.adjust.equations import CIRCLES, UNKNOWN_SHAPES
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.refine import Scale, adjust, eccentricity_px, find_scale, free_network
@@ -141,7 +134,7 @@ def calibrate(
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
     faces, notes = _faces(metric, camera, target, options)
-    unlinked = unlinked_faces(faces, options.reference_face)
+    unlinked = chain.unlinked_faces(faces, options.reference_face)
     faces = [face for face in faces if face.face not in unlinked]
     notes += [
         f"face {face_id}: left out, never linked to reference face {options.reference_face}; add a group that shows it "
@@ -149,7 +142,7 @@ def calibrate(
         for face_id in unlinked
     ]
     try:
-        calibrated = chain_faces(faces, target, options.reference_face, published)
+        calibrated = chain.chain_faces(faces, target, options.reference_face, published)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factors = image_sigma_factors(models, camera, target.printed_ids())
@@ -257,7 +250,7 @@ def _faces(
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Returns the frames of the faces in all groups, and notes. Frame circles that a group lacks are placed by the
     others, as other groups or the design have them; the joint adjustment starts from there."""
-    results = [faces_of_group(model, camera, target, options.frame) for model in models]
+    results = [chain.faces_of_group(model, camera, target, options.frame) for model in models]
     places: dict[str, dict[str, list[np.ndarray]]] = {}
     for face in (face for group_faces, _ in results for face in group_faces):
         for label, xyz in zip(face.labels, face.xyz_face, strict=True):
@@ -267,12 +260,12 @@ def _faces(
     }
     if any(notes for _, notes in results):
         known = {face.id: circles_by_face.get(face.id) for face in target.faces}
-        results = [faces_of_group(model, camera, target, options.frame, known) for model in models]
+        results = [chain.faces_of_group(model, camera, target, options.frame, known) for model in models]
     notes = [note for _, group_notes in results for note in group_notes]
     mapped = {label for m in models for label in m.labels}
     for face_id in sorted({face.face for group_faces, _ in results for face in group_faces} - circles_by_face.keys()):
         face = target.face(face_id)
-        unseen = missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
+        unseen = chain.missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
         if unseen:
             notes.append(
                 f"face {face_id}: frame circle {', '.join(f'{face_id}:{c}' for c in unseen)} not mapped; it stands "

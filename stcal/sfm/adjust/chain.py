@@ -189,8 +189,7 @@ def faces_of_group(
 
 
 MAX_CHAINS = 12
-Way = tuple[tuple[str, ...], tuple[str, ...]]
-"""The faces from the first to the last, and the groups that link them."""
+Way = tuple[tuple[str, ...], tuple[str, ...]]  # the faces from the first to the last, and the groups that link them
 
 
 @dataclass(frozen=True, slots=True, eq=False)

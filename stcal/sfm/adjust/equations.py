@@ -20,7 +20,7 @@ from stcal.geometry.rigid import Poses, Rigid, align_rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.refine import known_points, placed, projection_jacobians, reproject
-from stcal.sfm.data.group_model import GroupModel, MetricModel, rows_of
+from stcal.sfm.data.group_model import GroupModel, MetricModel, rows_by
 
 CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
 """Names of blocks; those of a group end with its name. The first three are kinds of rows, too."""
@@ -386,7 +386,7 @@ def planes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
     if not np.isfinite(setting.flatness_mm):
         return
     known = {face.id for face in faces_of_known_shape(setting.board)}
-    for face, members in rows_of(label.face for label in setting.labels).items():
+    for face, members in rows_by(label.face for label in setting.labels).items():
         if face in known or len(members) <= 3:
             continue
         own = xyz[members]

@@ -32,7 +32,7 @@ from stcal.io.json import (
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.calibration import AdjustOptions, Solve
 from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
-from stcal.sfm.data.group_model import rows_of
+from stcal.sfm.data.group_model import rows_by
 
 
 class FacePoses(Part):
@@ -212,7 +212,7 @@ class TargetCircles(Brief):
         if not (np.isfinite(self.sigma_factor) and self.sigma_factor > 0):
             raise InputError("E-OPTION-RANGE", f"σ factor {self.sigma_factor}: a positive number needed")
         normal, planes = np.zeros((c, 3)), {}
-        for face_id, rows in rows_of(label.face for label in self.labels).items():
+        for face_id, rows in rows_by(label.face for label in self.labels).items():
             if len(rows) < 3:
                 continue  # such a face has no plane and is not measured
             try:

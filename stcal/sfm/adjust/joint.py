@@ -21,23 +21,8 @@ from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust.equations import (
-    CAMERA,
-    CIRCLES,
-    DOTS,
-    FREE_DIRECTIONS,
-    SHAPE,
-    UNKNOWN_SHAPES,
-    Group,
-    RowsOfView,
-    Setting,
-    ShapeFactors,
-    bars,
-    coordinates,
-    normalised,
-    planes,
-    shapes,
-)
+from stcal.sfm.adjust import equations
+from stcal.sfm.adjust.equations import CIRCLES, Group, Setting, ShapeFactors
 from stcal.sfm.adjust.refine import EXACTLY, MIN_DOTS
 from stcal.sfm.data.group_model import MetricModel
 
@@ -49,8 +34,7 @@ MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
 """Largest move of a projection, in px, at which a result is returned. Contradictory observations make the last steps
 slow; below this limit the result is good enough for the checks."""
-DAMPING = 1e-12
-"""Relative damping, below the information of every direction that the datum does not leave open."""
+DAMPING = 1e-12  # relative damping, below the information of every direction that the datum does not leave open
 SETTLED_PX = 1e-6
 """Largest move of a projection in a settled result, in px: four orders of magnitude below the σ of a centre. The share
 ``EXACTLY`` of a χ² of 1e5 is a step of 1e-5 σ. Results between the two limits are returned, and marked."""
@@ -125,16 +109,18 @@ class Adjusted:
         the residuals if None."""
         setting, solution, values = self.setting, self.solution, self.solution.values
         groups, xyz = setting.groups, values[CIRCLES].array
-        flat = sum(len(members) - 3 for members, *_ in planes(xyz, setting)) + sum(1 for _ in bars(xyz, setting))
-        for shape in shapes(xyz, setting):
+        flat = sum(len(members) - 3 for members, *_ in equations.planes(xyz, setting)) + sum(
+            1 for _ in equations.bars(xyz, setting)
+        )
+        for shape in equations.shapes(xyz, setting):
             flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
         observations = sum(2 * len(g.model.image_index) + 3 * len(g.dots) for g in groups) + flat
         unknowns = xyz.size + sum(6 * len(g.model.images) + 3 * len(g.dots) + 6 * bool(len(g.dots)) for g in groups)
-        redundancy = observations - unknowns + FREE_DIRECTIONS
+        redundancy = observations - unknowns + equations.FREE_DIRECTIONS
         if sigma0 is None:
             sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
         covariance = max(1.0, sigma0) ** 2 * solution.inverse
-        intrinsics = solution.parts[0].places[CAMERA]
+        intrinsics = solution.parts[0].places[equations.CAMERA]
         return JointResult(
             tuple(self.models),
             {g.model.group: g.board_at(values) for g in groups},
@@ -156,12 +142,12 @@ class Adjusted:
         points, to_circles, c = {}, {}, solution.values[CIRCLES].array.size
         for group, part in zip(setting.groups, solution.whole, strict=True):
             blocks = {block.name: block for block in part.problem.blocks}
-            dots = blocks.get(group.name(DOTS))
+            dots = blocks.get(group.name(equations.DOTS))
             together = part.together(dots) if dots else part.inverse
             place = np.empty((len(group.model.labels), 3), int)
             place[group.circles] = 3 * group.circle_place[:, None] + np.arange(3)
             place[group.dots] = part.kept + np.arange(3 * len(group.dots)).reshape(-1, 3)
-            row = np.concatenate([place.ravel(), np.arange(part.kept)[part.places[CAMERA]]])
+            row = np.concatenate([place.ravel(), np.arange(part.kept)[part.places[equations.CAMERA]]])
             points[group.model.group] = together[np.ix_(row, row)]
             to_circles[group.model.group] = together[row, :c]
         return Extensible(self.camera, setting.basis, solution.inverse[:c, :c], points, to_circles)
@@ -176,7 +162,7 @@ def adjusted(
     start: Camera | None = None,  # of the intrinsics
     # share of the board's variance common to all groups; no residual is then down-weighted
     common: float | None = None,
-    factors: ShapeFactors = UNKNOWN_SHAPES,  # of an earlier result
+    factors: ShapeFactors = equations.UNKNOWN_SHAPES,  # of an earlier result
     settled: float = EXACTLY,  # largest predicted decrease of the last step, as a share of χ²
 ) -> Adjusted:
     """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
@@ -203,8 +189,7 @@ def adjust_part(
     return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
 
 
-PRIOR_FREEDOM = 4.0
-"""Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
+PRIOR_FREEDOM = 4.0  # degrees of freedom that the stated σ of such faces are worth, in addition to their deviations
 LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but is never exact
 
 
@@ -223,8 +208,8 @@ def _shape_factors(setting: Setting, solution: JoinedSolution) -> ShapeFactors:
     """Returns print and bend factor, variance components (Förstner 1979) with the stated σ as a weak prior, and the
     amplitude of the prints' smooth deviations."""
     square, freedom, prints = np.zeros(2), np.zeros(2), []
-    for shape in shapes(solution.values[CIRCLES].array, setting):
-        place = coordinates(shape.members)
+    for shape in equations.shapes(solution.values[CIRCLES].array, setting):
+        place = equations.coordinates(shape.members)
         own = solution.inverse[np.ix_(place, place)]
         left = np.where(shape.weight > 0, 1 - shape.leverage(own), 0.0)
         normalised_square = shape.weight * shape.off_mm**2
@@ -263,7 +248,7 @@ class Extensible:
     def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
         """Returns by how much one more view lowers the variances of f functions of the circles, (f,) (Woodbury 1950).
         ``to_functions``: (3p + q, f) covariance between points and intrinsics, and the functions."""
-        rows = RowsOfView.of(view, self.camera, self.basis)
+        rows = equations.RowsOfView.of(view, self.camera, self.basis)
         inner = np.eye(len(rows.pose)) + rows.square(self.points[view.group])
         half = solve_triangular(np.linalg.cholesky(inner), rows.along(to_functions), lower=True)
         return (half**2).sum(0)
@@ -296,7 +281,7 @@ def _start(
 def _with_common(setting: Setting, values: Values, common: float) -> tuple[Setting, Values]:
     """Returns setting and state with a shape of the board that all groups have in common, if ``common`` is not 0."""
     setting = replace(setting, common=common)
-    return setting, values | {SHAPE: Vector(np.zeros((len(setting.cells()), 3)))} if common else values
+    return setting, values | {equations.SHAPE: Vector(np.zeros((len(setting.cells()), 3)))} if common else values
 
 
 def _minimise(setting: Setting, values: Values, settled: float) -> Adjusted:
@@ -359,7 +344,9 @@ def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
 
 def _robust_sigma(setting: Setting, values: Values) -> float:
     camera = setting.camera(values)
-    length = np.concatenate([np.linalg.norm(normalised(g.at(values), camera), axis=1) for g in setting.groups])
+    length = np.concatenate(
+        [np.linalg.norm(equations.normalised(g.at(values), camera), axis=1) for g in setting.groups]
+    )
     return max(robust_sigma(length, 2), 1e-6)
 
 

@@ -26,8 +26,8 @@ from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free
 from stcal.geometry.plane import circle_image_offset, fit_plane
 from stcal.geometry.rigid import Poses, Rigid, Similarity, align_rigid, align_similarity, by_pose
 from stcal.geometry.robust import robust_sigma
-from stcal.labels import CircleLabel, Label, dot_cells
-from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, M, Outlier, WorldModel, rows_of
+from stcal.labels import Label, dot_cells
+from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, M, Outlier, WorldModel, rows_by
 
 MIN_DOTS = 4
 EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share
@@ -156,11 +156,8 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
     and camera make all tags look larger or smaller alike, which no residual shows."""
     if not isinstance(board, ScaleReference) or not any(face.of_tags for face in board.faces):
         return board
-    sides: dict[CircleLabel, CircleLabel] = {}
-    for face in board.faces:
-        labels = face.labels()
-        if face.of_tags:
-            sides |= {labels[k]: labels[k + 1] for k in range(0, len(labels), 4)}
+    labels = [label for face in board.faces if face.of_tags for label in face.labels()]
+    sides = dict(zip(labels[::4], labels[1::4], strict=True))
     lengths: dict[str, list[float]] = {}
     for image in observations:
         place = dict(zip(image.labels, image.centre_px, strict=True))
@@ -179,12 +176,11 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
 
 def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[FaceDesign, np.ndarray]]:
     """Returns the faces of known shape with three points or more among ``labels``, and the indices of these."""
-    faces, members = {face.id: face for face in faces_of_known_shape(board)}, rows_of(label.plane for label in labels)
+    faces, members = {face.id: face for face in faces_of_known_shape(board)}, rows_by(label.plane for label in labels)
     return [(faces[face], rows) for face, rows in members.items() if face in faces and len(rows) >= MIN_CORNERS]
 
 
-EXACTLY = 1e-15
-"""Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
+EXACTLY = 1e-15  # largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen
 MAX_STEPS = 50
 DAMPING = 1e-10  # relative damping, which holds the seven free directions of the world
 NO_PARAMETERS = np.zeros((len(PARAMETER_NAMES), 0))

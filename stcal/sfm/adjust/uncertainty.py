@@ -1,5 +1,6 @@
 """Covariances of faces and circles, and what each kind of observation contributes to them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -9,27 +10,9 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.sfm.adjust.chain import (
-    CalibratedTarget,
-    FrameKind,
-    face_frames,
-    missing_frame_circles,
-    placement_sigma_mm,
-    with_unmapped,
-)
-from stcal.sfm.adjust.equations import (
-    BOARD,
-    CAMERA,
-    CIRCLES,
-    DOTS,
-    RowsOfView,
-    bars,
-    coordinates,
-    normalised,
-    planes,
-    robust_weights,
-    shapes,
-)
+from stcal.sfm.adjust import chain, equations
+from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
+from stcal.sfm.adjust.equations import BOARD, CIRCLES, DOTS
 from stcal.sfm.adjust.joint import Adjusted, JointResult
 
 STEP_MM = 1e-3  # step of the central differences, in mm
@@ -121,39 +104,41 @@ def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
 
 def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
     """Computes the derivatives of poses and circles in the target frame by all circles, by central differences."""
-    designs = [face for face in target.faces if face.id in start.target_from_face]
-    faces = [_MovedFace.of(face, result, start.target_from_face[face.id].rotation[:, 2], kind) for face in designs]
-    poses = {moved.face.id: moved.frames(np.zeros((1, len(moved.rows), 3)))[0] for moved in faces}
+    faces = {
+        face.id: _moved_face(face, result, start.target_from_face[face.id].rotation[:, 2], kind)
+        for face in target.faces
+        if face.id in start.target_from_face
+    }
+    poses = {moved: frames(np.zeros((1, len(rows), 3)))[0] for moved, (rows, _, frames) in faces.items()}
     target_from_model = poses[start.reference_face].inverse()
     mapped, c = 3 * len(result.labels), len(result.labels)  # after the circles come the placed ones, by two coordinates
-    width = mapped + 2 * sum(len(moved.placed) for moved in faces)
+    width = mapped + 2 * sum(p for _, p, _ in faces.values())
     by_face, circles, at = {face_id: np.zeros((6, width)) for face_id in poses}, np.zeros((c, 3, width)), mapped
-    for moved in faces:
-        m, p = 3 * len(moved.rows), len(moved.placed)
-        columns = np.append(coordinates(moved.rows), at + np.arange(2 * p))
+    for moved, (rows, p, frames) in faces.items():
+        m, columns = 3 * len(rows), np.append(equations.coordinates(rows), at + np.arange(2 * p))
         at += 2 * p
-        moves = np.eye(m + 2 * p, m).reshape(-1, len(moved.rows), 3)
+        moves = np.eye(m + 2 * p, m).reshape(-1, len(rows), 3)
         shifts = np.zeros((m + 2 * p, p, 3))  # in the plane of the face, where the design gives their places
-        shifts[m:] = np.einsum("pq,ja->pjqa", np.eye(p), poses[moved.face.id].rotation[:, :2].T).reshape(2 * p, p, 3)
-        ahead, behind = (moved.frames(sign * STEP_MM * moves, sign * STEP_MM * shifts) for sign in (1, -1))
-        if moved.face.id != start.reference_face:
+        shifts[m:] = np.einsum("pq,ja->pjqa", np.eye(p), poses[moved].rotation[:, :2].T).reshape(2 * p, p, 3)
+        ahead, behind = (frames(sign * STEP_MM * moves, sign * STEP_MM * shifts) for sign in (1, -1))
+        if moved != start.reference_face:
             twist = (target_from_model @ ahead).difference(target_from_model @ behind)
-            by_face[moved.face.id][:, columns] = twist.T / (2 * STEP_MM)
+            by_face[moved][:, columns] = twist.T / (2 * STEP_MM)
             rotated = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
-            circles[np.ix_(moved.rows, np.arange(3), columns)] = rotated
+            circles[np.ix_(rows, np.arange(3), columns)] = rotated
             continue
         ahead, behind = ahead.inverse(), behind.inverse()
         for face_id, pose in poses.items():
-            if face_id != moved.face.id:
+            if face_id != moved:
                 by_face[face_id][:, columns] = (ahead @ pose).difference(behind @ pose).T / (2 * STEP_MM)
         for sign, target_from_moved in ((1, ahead), (-1, behind)):
             xyz = np.tile(result.xyz_model, (len(moves), 1, 1))
-            xyz[:, moved.rows] += sign * STEP_MM * moves
+            xyz[:, rows] += sign * STEP_MM * moves
             placed = xyz @ np.swapaxes(target_from_moved.rotation, 1, 2) + target_from_moved.translation[:, None]
             circles[:, :, columns] += sign * np.transpose(placed, (1, 2, 0)) / (2 * STEP_MM)
     sigma = 0.0
     if width > mapped:
-        sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
+        sigma = chain.placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
     return Derivatives(
         {face_id: target_from_model @ pose for face_id, pose in poses.items()},
         target_from_model @ result.xyz_model,
@@ -166,36 +151,24 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _MovedFace:
-    """A face with its m circles, which its frame follows when they move."""
+def _moved_face(
+    face: FaceDesign, result: JointResult, towards: np.ndarray, kind: FrameKind
+) -> tuple[np.ndarray, int, Callable[..., Poses]]:
+    """Returns the places (m,) of the face's circles among all, the number of frame circles that were not mapped, and
+    the function of model_from_face after k sets of moves (k, m, 3), and of shifts (k, p, 3) of those, mm."""
+    rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
+    circles = tuple(result.labels[i].circle for i in rows)
+    placed = chain.missing_frame_circles(face, circles)
 
-    face: FaceDesign
-    rows: np.ndarray  # (m,) places of the circles among all
-    circles: tuple[str, ...]
-    xyz: np.ndarray
-    placed: tuple[str, ...]  # frame circles that were not mapped
-    kind: FrameKind
-    towards: np.ndarray
+    def frames(moves: np.ndarray, shifts: np.ndarray | float = 0.0) -> Poses:
+        xyz, names = result.xyz_model[rows] + moves, circles
+        if placed:
+            sets = [chain.with_unmapped(face, dict(zip(circles, centres, strict=True))) for centres in xyz]
+            xyz, names = np.array([list(centres.values()) for centres in sets]), tuple(sets[0])
+            xyz[:, [names.index(circle) for circle in placed]] += shifts
+        return chain.face_frames(face, names, xyz, kind, towards)
 
-    @classmethod
-    def of(cls, face: FaceDesign, result: JointResult, towards: np.ndarray, kind: FrameKind) -> "_MovedFace":
-        rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
-        circles = tuple(result.labels[i].circle for i in rows)
-        placed = missing_frame_circles(face, circles)
-        return cls(face, rows, circles, result.xyz_model[rows], placed, kind, towards)
-
-    def frames(self, moves: np.ndarray, shifts: np.ndarray | None = None) -> Poses:
-        """Returns model_from_face after k sets of moves (k, m, 3), and of shifts (k, p, 3) of placed circles, mm."""
-        xyz = self.xyz + moves
-        if not self.placed:
-            return face_frames(self.face, self.circles, xyz, self.kind, self.towards)
-        sets = [with_unmapped(self.face, dict(zip(self.circles, centres, strict=True))) for centres in xyz]
-        completed = np.array([list(centres.values()) for centres in sets])
-        names = tuple(sets[0])
-        if shifts is not None:
-            completed[:, [names.index(circle) for circle in self.placed]] += shifts
-        return face_frames(self.face, names, completed, self.kind, self.towards)
+    return rows, len(placed), frames
 
 
 FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES = "flatness", "intrinsics", "print", "sizes", "distances"
@@ -268,14 +241,14 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
                 lens = seen.whiten(seen.by_parameters(camera)) * np.sqrt(rows.weight[batch])[:, None, None]
                 by_intrinsics += flat.T @ lens.reshape(len(flat), -1)
     inverse = solution.inverse[:, : xyz.size] if quantities is None else solution.inverse[:, : xyz.size] @ quantities
-    intrinsics = inverse[solution.parts[0].places[CAMERA]]
+    intrinsics = inverse[solution.parts[0].places[equations.CAMERA]]
     covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
-    for kind, known in ((FLATNESS, planes), (DISTANCES, bars)):
+    for kind, known in ((FLATNESS, equations.planes), (DISTANCES, equations.bars)):
         for members, slope, _, sigma in known(xyz, setting):
-            rows = slope @ inverse[coordinates(members)] / sigma
+            rows = slope @ inverse[equations.coordinates(members)] / sigma
             covariance[kind] += rows.T @ rows
-    for shape in shapes(xyz, setting):
-        rows = inverse[coordinates(shape.members)]
+    for shape in equations.shapes(xyz, setting):
+        rows = inverse[equations.coordinates(shape.members)]
         by_size = rows.T @ shape.by_size()
         covariance[SIZES] += np.outer(by_size, by_size)
         covariance[PRINT] += rows.T @ shape.normal() @ rows - np.outer(by_size, by_size)
@@ -309,10 +282,10 @@ def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign,
         points, to_faces = extensible.points[model.group], extensible.to_circles[model.group] @ faces.T
         for rows in model.rows_by_image():
             view = model.observed(rows)
-            root = np.repeat(np.sqrt(robust_weights(view, camera, state.setting.huber)), 2)
-            rows_of = RowsOfView.of(view, camera, basis, root)
+            root = np.repeat(np.sqrt(equations.robust_weights(view, camera, state.setting.huber)), 2)
+            rows_of = equations.RowsOfView.of(view, camera, basis, root)
             expected = rows_of.along(to_faces).T
-            residual = rows_of.free(root * normalised(view, camera).ravel())
+            residual = rows_of.free(root * equations.normalised(view, camera).ravel())
             pull = expected @ released(residual, rows_of.square(points))
             scatter += np.outer(pull, pull)
             told += expected @ expected.T

@@ -20,20 +20,8 @@ from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, Label, unseen_lines
 from stcal.parallel import Progress, counted, one_thread, run_in_order, scratch_folder
 from stcal.sfm.adjust.refine import eccentricity_px, placed
-from stcal.sfm.camera.intrinsics import (
-    Intrinsics,
-    ProjectionSigma,
-    adjust_intrinsics,
-    board_views,
-    closed_form,
-    image_grid,
-    model_of_views,
-    model_parameters,
-    of_some_views,
-    projection_jacobian,
-    projection_sigma,
-    start_camera,
-)
+from stcal.sfm.camera import intrinsics
+from stcal.sfm.camera.intrinsics import Intrinsics, ProjectionSigma, adjust_intrinsics, model_parameters
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
 from stcal.sfm.detect.candidates import EllipseOptions
@@ -154,7 +142,7 @@ def held_out(
     residuals_of_view: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     factors = []
     for fold in range(folds):
-        without = of_some_views(result, [view for i, view in enumerate(views) if i % folds != fold], board)
+        without = intrinsics.of_some_views(result, [view for i, view in enumerate(views) if i % folds != fold], board)
         factors.append(without.factors.centres)
         residuals_of_view |= {view.name: prediction_errors(view, board, without) for view in views[fold::folds]}
     residuals_px, in_sigma = zip(*(residuals_of_view[view.name] for view in views), strict=True)
@@ -205,7 +193,7 @@ def choose_model(
 def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics:
     start = known.with_parameters(intrinsic_basis(model) @ model_parameters(known, model))
     if known.fisheye != (FISHEYE in model):
-        start = closed_form(views, board, start_camera(known.width, known.height, model))
+        start = intrinsics.closed_form(views, board, intrinsics.start_camera(known.width, known.height, model))
     return adjust_intrinsics(views, board, start, model)
 
 
@@ -219,7 +207,7 @@ def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
 def prediction_errors(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
     camera, factor = result.camera, result.factors.centres
-    model = model_of_views([view], board, camera)
+    model = intrinsics.model_of_views([view], board, camera)
     known = [own for own in result.models if own.group == view.group]
     places = {label: xyz for own in known for label, xyz in zip(own.labels, own.xyz_model, strict=True)}
     points = Vector(np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)]))
@@ -378,7 +366,7 @@ def calibrated(
             f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
         )
     files, not_images = find_images(images)
-    camera = start_camera(*require_common_size(files)[0], colmap_model)
+    camera = intrinsics.start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
     settled, of_perspective, warnings = False, False, []
     for number in range(1, (rounds or MAX_ROUNDS) + 1):
@@ -388,7 +376,7 @@ def calibrated(
             views, skipped = find(files, lens, camera, number, before is None)
             skipped = (*not_images, *skipped)
             require_views(views, files, skipped)
-            start = closed_form(views, board, camera) if before is None else camera
+            start = intrinsics.closed_form(views, board, camera) if before is None else camera
             result = adjust_intrinsics(views, board, start, colmap_model)
             if not rounds:
                 require_determined(result, views, board)
@@ -419,7 +407,7 @@ def calibrated(
 def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera, first: bool) -> Found:
     """Returns the views of the board in detected images, sharp but in the ``first`` round, in which depths are
     unknown, and what was skipped."""
-    views = board_views(detection.images, board, camera)
+    views = intrinsics.board_views(detection.images, board, camera)
     if not first:
         views, _ = correct_defocus(views, camera, pattern_of_board(board))
     shown, repeated = {view.name for view in views}, "the board is in view more than once"
@@ -437,7 +425,7 @@ def camera_of_dots(
     """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``."""
     views, skipped = views_of_dots(detection, board, start, first=True)
     require_views(views, files, skipped)
-    result = adjust_intrinsics(views, board, closed_form(views, board, start), colmap_model)
+    result = adjust_intrinsics(views, board, intrinsics.closed_form(views, board, start), colmap_model)
     require_determined(result, views, board)
     return result
 
@@ -451,7 +439,7 @@ def camera_of_labelled(
     views = [image.select(own) for image, own in zip(images, dots, strict=True) if len(own) >= MIN_DOTS]
     require_views(views, (), ())
     model = camera.colmap_model
-    start = closed_form(views, board, start_camera(camera.width, camera.height, model))
+    start = intrinsics.closed_form(views, board, intrinsics.start_camera(camera.width, camera.height, model))
     found = adjust_intrinsics(views, board, start, model)
     require_determined(found, views, board)
     return found, adjust_intrinsics(views, board, camera, model, held=True)
@@ -482,7 +470,7 @@ def judged(
     board: BoardDesign,
 ) -> CameraCalibration:
     """Returns a calibration with its checks and warnings; ``settled``: whether the detection rounds converged."""
-    projection = projection_sigma(result)
+    projection = intrinsics.projection_sigma(result)
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
     moving = f"the camera still moves after {MAX_ROUNDS} rounds of detection; add views, or choose a simpler --model"
     changing = "the σ of centres and dots still change when the rounds end; look at the outliers"
@@ -551,9 +539,9 @@ def weighted_rms_px(result: Intrinsics) -> float:
 def _next_move(before: Intrinsics, after: Intrinsics) -> float:
     """Returns the predicted largest move of a parameter by another round, in σ, as projections' moves decrease."""
     moved = model_parameters(after.camera, after.colmap_model) - model_parameters(before.camera, before.colmap_model)
-    ideal = before.camera.normalised_from_pixel(image_grid(before.camera))
+    ideal = before.camera.normalised_from_pixel(intrinsics.image_grid(before.camera))
     bent_px = np.abs((before.camera.distort(ideal) - ideal) * before.camera.focal).max()
-    moved_px = np.abs(projection_jacobian(before.camera, before.colmap_model) @ moved).max()
+    moved_px = np.abs(intrinsics.projection_jacobian(before.camera, before.colmap_model) @ moved).max()
     return float(np.abs(moved / after.sigma()).max() * min(1.0, moved_px / max(bent_px, 1e-9)))
 
 

@@ -15,15 +15,8 @@ from stcal.report.camera_figures import field_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
-from stcal.sfm.camera.calibrate import (
-    CELLS,
-    CORNERS,
-    OUTLIER_WEIGHT,
-    CameraCalibration,
-    TriedModel,
-    mean_residuals,
-    residual_rms_px,
-)
+from stcal.sfm.camera import calibrate
+from stcal.sfm.camera.calibrate import CameraCalibration, residual_rms_px
 from stcal.sfm.camera.intrinsics import GRID, Intrinsics, model_parameters
 
 ByCorner = Annotated[str, "corner"]
@@ -68,7 +61,7 @@ class CalibrationFile(ResultFile):
     held_out_rms_px: float | None = Field(
         description="per coordinate, each view foretold by a calibration without it; null with fewer than four views"
     )
-    models: tuple[TriedModel, ...] = Field(
+    models: tuple[calibrate.TriedModel, ...] = Field(
         description="with `--model auto`: `model`, `parameters` it has, `rms_px` of held-out views, `worse` than the "
         "best by so much in the mean square (σ²) and its standard error `worse_sigma`; `why` it could not be tried",
     )
@@ -101,7 +94,7 @@ def calibration_file(calibration: CameraCalibration) -> CalibrationFile:
         redundancy=result.redundancy,
         rounds=calibration.rounds,
         projection_sigma_px=float(np.median(projection.sigma_px)),
-        corners=_rows(CORNERS, reached),
+        corners=_rows(calibrate.CORNERS, reached),
         held_out_rms_px=held_out and held_out.rms_px(),
         models=calibration.candidates,
         images=list(_views(result)),
@@ -126,7 +119,7 @@ def _views(result: Intrinsics) -> Iterator[dict[str, Any]]:
 def _outliers(result: Intrinsics) -> Iterator[dict[str, Any]]:
     for model, weights in zip(result.models, result.weights(), strict=True):
         length = np.linalg.norm(model.residuals_px(result.camera), axis=1)
-        for i in np.flatnonzero(weights < OUTLIER_WEIGHT):
+        for i in np.flatnonzero(weights < calibrate.OUTLIER_WEIGHT):
             image, label = model.images[model.image_index[i]], model.labels[model.point_index[i]]
             yield {"image": image, "label": label, "residual_px": float(length[i]), "weight": float(weights[i])}
 
@@ -226,11 +219,11 @@ def residual_map(result: CameraCalibration) -> Drawing:
     """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
     camera = result.intrinsics.camera
     axes = _image_axes(camera)
-    mean, weight = mean_residuals(result.intrinsics)
-    size, count = np.array([camera.width, camera.height]) / CELLS, weight.sum(0)
+    mean, weight = calibrate.mean_residuals(result.intrinsics)
+    size, count = np.array([camera.width, camera.height]) / calibrate.CELLS, weight.sum(0)
     enough = count >= 3
     mean = (weight[..., None] * mean).sum(0)[enough] / count[enough, None]
-    middle = (np.stack(np.divmod(np.flatnonzero(enough), CELLS[1]), axis=1) + 0.5) * size
+    middle = (np.stack(np.divmod(np.flatnonzero(enough), calibrate.CELLS[1]), axis=1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
     times = round_below(0.7 * size.min() / longest) if longest else 1.0  # within the cells
     axes.arrows(middle, times * mean, 1.2, INK)

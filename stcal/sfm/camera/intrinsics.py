@@ -35,14 +35,6 @@ START_DAMPING = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Board:
-    """The board of one folder as drawn: ``places`` (n, 3) of its dots, mm, and how its print may deviate."""
-
-    places: np.ndarray
-    modes: PrintModes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """Camera, board poses and dots at a state of their adjustment, and what is known of them."""
 
@@ -51,7 +43,8 @@ class Fit:
     start: Camera
     basis: np.ndarray  # (16, q)
     weight: np.ndarray  # (q, q) of the vague prior about ``start``
-    boards: dict[str, Board]
+    places: dict[str, np.ndarray]  # by folder, (n, 3) of the dots of its board as drawn, mm
+    modes: dict[str, PrintModes]  # by folder, how the print of its board may deviate
     sigma_mm: float
     huber: float = np.inf
 
@@ -96,7 +89,7 @@ class Fit:
         away = np.linalg.pinv(self.basis) @ (self.camera.parameters() - self.start.parameters())
         values: dict[str, Any] = {"lens": Vector(away[None])}
         for model in self.models:
-            a, board = Adjustment(), self.boards[model.group]
+            a = Adjustment()
             values[POSES + model.group] = Poses.of(model.camera_from_model)
             values[DOTS_OF + model.group] = Vector(model.xyz_model)
             lens = a.block("lens", values["lens"])
@@ -104,7 +97,7 @@ class Fit:
             poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
             cluster, loss = first + model.image_index, Huber(self.huber)
             reproject(a, model, (dots, poses, lens), self.camera_at, self.basis, cluster=cluster, loss=loss)
-            a.prior(dots, board.places, board.modes.weight(self.sigma_mm))
+            a.prior(dots, self.places[model.group], self.modes[model.group].weight(self.sigma_mm))
             if not parts:
                 a.prior(lens, np.zeros((1, len(self.weight))), self.weight)
             parts.append(a)
@@ -161,17 +154,16 @@ class LinearFit(JoinedSolution):
         moves = (b.residuals_px(after.camera) - a.residuals_px(before.camera) for a, b in pairs)
         return max(float(np.abs(move).max()) for move in moves)
 
-    def with_found_prints(self) -> tuple[float, dict[str, Board]]:
-        """Returns the redundancy of the dots by themselves, and the boards with the amplitudes of their prints."""
-        boards, left, sigma_mm = {}, 0.0, self.begin.sigma_mm
+    def with_found_prints(self) -> tuple[float, dict[str, PrintModes]]:
+        """Returns the redundancy of the dots by themselves, and the prints of the boards with their amplitudes."""
+        prints, left, sigma_mm = {}, 0.0, self.begin.sigma_mm
         for model, part in zip(self.fit.models, self.whole, strict=True):
-            board, covariance = self.begin.boards[model.group], part.covariance(part.problem.blocks[DOTS])
-            modes = board.modes.modes
-            of_modes = modes.T @ covariance @ modes
+            print_modes, covariance = self.begin.modes[model.group], part.covariance(part.problem.blocks[DOTS])
+            of_modes = print_modes.modes.T @ covariance @ print_modes.modes
             left += len(covariance) - len(of_modes) - float(np.trace(covariance) - np.trace(of_modes)) / sigma_mm**2
-            found = board.modes.as_found(model.xyz_model - board.places, of_modes, sigma_mm)
-            boards[model.group] = replace(board, modes=found)
-        return left, boards
+            away = model.xyz_model - self.begin.places[model.group]
+            prints[model.group] = print_modes.as_found(away, of_modes, sigma_mm)
+        return left, prints
 
 
 POSES, DOTS_OF = "poses of ", "dots of "
@@ -349,8 +341,8 @@ class Intrinsics:
 
     def prints(self) -> dict[str, tuple[float, float]]:
         """Returns by how much more the board of each folder is stretched along its rows than across, and its shear."""
-        boards = self.fit.boards
-        return {m.group: boards[m.group].modes.stretch(m.xyz_model - boards[m.group].places) for m in self.models}
+        modes, places = self.fit.modes, self.fit.places
+        return {m.group: modes[m.group].stretch(m.xyz_model - places[m.group]) for m in self.models}
 
     def weights(self) -> list[np.ndarray]:
         return [robust_weights(model, self.camera, self.huber) for model in self.models]
@@ -390,7 +382,8 @@ def adjust_intrinsics(
         start=start,
         basis=basis,
         weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
-        boards={m.group: Board(m.xyz_model, PrintModes.of(m.xyz_model[:, :2])) for m in models},
+        places={m.group: m.xyz_model for m in models},
+        modes={m.group: PrintModes.of(m.xyz_model[:, :2]) for m in models},
         sigma_mm=board.sigma_mm,
     )
     try:
@@ -455,11 +448,10 @@ def _adjusted(fit: Fit, board: BoardDesign, colmap_model: str) -> Intrinsics:
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(fit.models, before.models, strict=True))
         fit = fit.robust_minimum()
         last = fit.linear()
-        updated, boards = _updated_factors(last, factors)
-        changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
-            boards[folder].modes.amplitude / old.modes.amplitude for folder, old in fit.boards.items()
-        ]
-        factors, fit = updated, replace(fit, boards=boards)
+        updated, modes = _updated_factors(last, factors)
+        changes = [updated.centres / factors.centres, updated.dots / factors.dots]
+        changes += [modes[folder].amplitude / old.amplitude for folder, old in fit.modes.items()]
+        factors, fit = updated, replace(fit, modes=modes)
         change = float(np.abs(np.log(changes)).max())
         settled = bool(round_index >= 2 and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
@@ -493,15 +485,15 @@ def _weighted(fit: Fit, own: list[np.ndarray], factors: BoardSigmaFactors, board
     return replace(fit, models=tuple(models))
 
 
-def _updated_factors(last: LinearFit, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
-    """Returns variance components of centres and dots (Förstner 1979), and the boards with their amplitudes."""
-    fit, (dots_left, boards) = last.fit, last.with_found_prints()
+def _updated_factors(last: LinearFit, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, PrintModes]]:
+    """Returns variance components of centres and dots (Förstner 1979), and the prints with their amplitudes."""
+    fit, (dots_left, modes) = last.fit, last.with_found_prints()
     dots, image_redundancy = factors.dots, fit.redundancy() - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:  # by the χ² of the places of dots by themselves, without the modes of prints
-        off = [(fit.boards[model.group], model.xyz_model) for model in fit.models]
-        square = float(sum(own.modes.costs(xyz - own.places, fit.sigma_mm)[0] for own, xyz in off))
+        off = {model.group: model.xyz_model - fit.places[model.group] for model in fit.models}
+        square = float(sum(fit.modes[folder].costs(away, fit.sigma_mm)[0] for folder, away in off.items()))
         dots = max(LEAST_DOTS, dots * sigma_factor(square, dots_left))
-    return BoardSigmaFactors(factors.centres * sigma_factor(fit.cost(), image_redundancy), dots), boards
+    return BoardSigmaFactors(factors.centres * sigma_factor(fit.cost(), image_redundancy), dots), modes
 
 
 GRID = (13, 9)

@@ -17,12 +17,10 @@ from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
 from stcal.sfm.checks.significance import MICRO, Evidence, Trial, assess
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
-EDGE_BIAS_PX = 0.05
-"""σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
+EDGE_BIAS_PX = 0.05  # σ of the bias that light, lens and threshold add to all radii alike; it moves no centre
 RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
-MIN_PEERS = 5
-"""Smallest number of circles of one design radius that are compared with each other."""
+MIN_PEERS = 5  # smallest number of circles of one design radius that are compared with each other
 
 
 def radius_checks(evidence: Evidence) -> list[Check]:
@@ -61,8 +59,7 @@ def radius_checks(evidence: Evidence) -> list[Check]:
     return [assess("radius", single, "circles", remedy), assess("radius-design", whole, "kinds of circle", of_kind)]
 
 
-RIM_SIGMAS = 4.0
-"""Height of a rim, in its σ, that is taken as seen: by chance in one of 16 000 kinds of circle."""
+RIM_SIGMAS = 4.0  # height of a rim, in its σ, that is taken as seen: by chance in one of 16 000 kinds of circle
 KINDS = {"circles": ("circles of the faces", "the faces lie"), "dots": ("dots of the board", "the board lies")}
 """Name of each kind of circle, and what lies where its circles do."""
 

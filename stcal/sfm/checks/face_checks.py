@@ -23,8 +23,7 @@ from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
-MIN_HALF = 2
-"""Smallest number of images of a group in each half."""
+MIN_HALF = 2  # smallest number of images of a group in each half
 EXPLAINED = 0.05
 """Smallest share of the variance that a group must add in a tested direction; below it, rounding would be tested."""
 

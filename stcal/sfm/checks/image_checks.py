@@ -15,44 +15,27 @@ from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import Network, ScoreTest, adjust, solve_score
-from stcal.sfm.checks.significance import (
-    FREE,
-    MICRO,
-    MOST,
-    MOST_SIGMAS,
-    NO_ELLIPSES,
-    SHOWN,
-    Evidence,
-    Guilt,
-    Trial,
-    assess,
-    by_eccentricity,
-    by_motion,
-    culprits_by_score,
-    on_face,
-)
+from stcal.sfm.checks import significance
+from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess
 from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_CIRCLES = 3
 """Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
-SIGMA_LIMITS = (2.0, MOST_SIGMAS)
+SIGMA_LIMITS = (2.0, significance.MOST_SIGMAS)
 """Limits of residuals over the centres' own σ: light and lens may add a factor of two."""
 DULL = 1.5
 """Ratio of an image's σ of centres to that of its group at which the image has lost more than half of its weight."""
 MAD_EFFICIENCY = 0.37
 """Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
-UNEVEN_BY_CHANCE = 0.01
-"""Share of even circles that noise or a compressed file may make look uneven."""
+UNEVEN_BY_CHANCE = 0.01  # share of even circles that noise or a compressed file may make look uneven
 FIELD_DEGREE = 3
 FIELD_FLOOR_PX = 0.002
 """σ of a field that any centring leaves: pixel raster, JPEG blocks and light from one side do not average out."""
-NEARLY_ALL = 0.7
-"""Share of the images beyond which a check that names them names none."""
+NEARLY_ALL = 0.7  # share of the images beyond which a check that names them names none
 EXCHANGED = 0.1
 """Largest deviation of exchanged labels: each centre lies at the place of the other to within this share of their
 distance."""
-MANY = 5
-"""Number of centres left out of one image at which they are no longer single hidden or dirty circles."""
+MANY = 5  # number of centres left out of one image at which they are no longer single hidden or dirty circles
 
 
 def camera_check(evidence: Evidence) -> Check:
@@ -137,7 +120,7 @@ def sigma_check(evidence: Evidence) -> Check:
     (low, high), factor = SIGMA_LIMITS, evidence.calibration.sigma_factors.all
     redundancy = sum(n.redundancy.sum() for n in evidence.networks)
     if redundancy < 1:
-        return impossible("centres", FREE, "add images")
+        return impossible("centres", significance.FREE, "add images")
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
@@ -223,10 +206,10 @@ def moved_check(evidence: Evidence) -> Check:
     trials: list[Trial] = []
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in evidence.networks:
-        model, of_faces = network.model, on_face(network.model)
+        model, of_faces = network.model, significance.on_face(network.model)
         if of_faces.all() or not of_faces.any():
             continue
-        columns = by_motion(network, model.xyz_model[of_faces].mean(0))
+        columns = significance.by_motion(network, model.xyz_model[of_faces].mean(0))
         normal, right = network.score_by_image(columns)
         redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
         suspects = []
@@ -246,7 +229,7 @@ def moved_check(evidence: Evidence) -> Check:
     if not check.names or _nearly_all(check):
         return _take_out(check, "")
     guilt = [
-        culprits_by_score(network, columns, suspects, check.tested, f"group {group}")
+        significance.culprits_by_score(network, columns, suspects, check.tested, f"group {group}")
         for group, (network, columns, suspects) in tested_by_group.items()
         if any(network.model.images[i] in check.names for i in suspects)
     ]
@@ -311,7 +294,7 @@ def labels_check(evidence: Evidence) -> Check:
     if swapped:
         verdict, reason = "failed", f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
-    shown, names = (*measured, *check.measured)[:SHOWN], (*swapped, *lost, *named, *check.names)
+    shown, names = (*measured, *check.measured)[: significance.SHOWN], (*swapped, *lost, *named, *check.names)
     return replace(check, verdict=verdict, reason=reason, measured=shown, names=names, remedy=remedy)
 
 
@@ -324,7 +307,7 @@ def _images_of_outliers(evidence: Evidence) -> list[Guilt]:
         names = dict.fromkeys([*network.model.images, *(n for n in count if n.rpartition("/")[0] == group)])
         many = sorted((name for name in names if count[name] >= MANY), key=lambda name: -count[name])
         if many:
-            found.append(Guilt(f"group {group}", tuple(many) if len(many) < MOST * len(names) else ()))
+            found.append(Guilt(f"group {group}", tuple(many) if len(many) < significance.MOST * len(names) else ()))
     return found
 
 
@@ -359,12 +342,12 @@ def control_check(evidence: Evidence) -> Check:
         return impossible("control", "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible("control", "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, by_eccentricity))
+    test = solve_score(*summed(networks, significance.by_eccentricity))
     if not test.freedom:
         return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy, share = sum(n.redundancy.sum() for n in networks), float(test.estimate[0])
     trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
-    check = assess("control", [trial], "corrections", NO_ELLIPSES)
+    check = assess("control", [trial], "corrections", significance.NO_ELLIPSES)
     try:
         whole = evidence.calibration.target.target_from_face
         message, measured = _control(evidence) if whole else ("no face that it could move", ())

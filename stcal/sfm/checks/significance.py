@@ -25,17 +25,13 @@ from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.data.group_model import GroupModel, ImageObservations, Outlier, WorldModel
 from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 
-KNOWN = 1e9
-"""Degrees of freedom of a σ that is stated, not estimated."""
+KNOWN = 1e9  # degrees of freedom of a σ that is stated, not estimated
 MOST_ENLARGED = 3.0
 """Factor on σ up to which contradictions of parts of the photographs are errors that σ can cover, as differences
 between laboratories are (Birge 1932, Phys. Rev. 40); beyond it something is wrong."""
-MOST_SIGMAS = 4.0
-"""Residuals over the centres' own σ from which the model does not describe the images."""
-FREE = "free poses and points explain the images, whatever they show"
-"""Why too few images test nothing."""
-SHOWN = 8
-"""Number of measurements that a check lists, the worst first."""
+MOST_SIGMAS = 4.0  # residuals over the centres' own σ from which the model does not describe the images
+FREE = "free poses and points explain the images, whatever they show"  # why too few images test nothing
+SHOWN = 8  # number of measurements that a check lists, the worst first
 MICRO = 1e3
 
 
@@ -214,8 +210,7 @@ def assess(key: str, trials: Sequence[Trial], what: str, remedy: str, *more: Ver
     return judge(key, CHECKS[key][0], trials, what, remedy, *more, covered=covered)
 
 
-MOST = 0.5
-"""Share of the suspects from which they are no culprits: either part may be the wrong one."""
+MOST = 0.5  # share of the suspects from which they are no culprits: either part may be the wrong one
 MIN_REDUNDANCY = 30.0
 """Smallest redundancy of the circles of the faces, and of the dots, whose residuals tell whether they agree."""
 MOVED = "the target moved relative to the board"

@@ -20,16 +20,8 @@ from stcal.labels import CircleLabel
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.refine import Network, ScoreTest, solve_score
-from stcal.sfm.checks import board_checks, face_checks, image_checks
-from stcal.sfm.checks.significance import (
-    MOVED,
-    MOVED_REMEDY,
-    NO_ELLIPSES,
-    Evidence,
-    apart,
-    by_eccentricity,
-    by_motion,
-)
+from stcal.sfm.checks import board_checks, face_checks, image_checks, significance
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, NO_ELLIPSES, Evidence
 from stcal.sfm.data.group_model import FAR_DEG, turned_faces
 from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, TestedValue, impossible
 
@@ -109,13 +101,11 @@ FIXED_WITHIN = 0.2
 """Largest deviation from 1 of the share of a change that is as a whole or not at all, such as a distortion removed."""
 FILE_WITHIN = 0.02
 """That deviation where the true camera is known: what two good calibrations of a distortion differ by."""
-FEW = 0.25
-"""Share of the images that may not explain alone what is taken for a cause of the whole set."""
+FEW = 0.25  # share of the images that may not explain alone what is taken for a cause of the whole set
 ALONE = 0.93
 """Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
 0.87."""
-LEAST_SHIFT_PX = 3.0
-"""Smallest change of the principal point that reveals photographs turned by 180°."""
+LEAST_SHIFT_PX = 3.0  # smallest change of the principal point that reveals photographs turned by 180°
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +128,7 @@ class Hypothesis:
         """Returns the score equations of the parameters of a group, or of separate ones for each image."""
         by, model = self.by, network.model
         columns = by(network) if callable(by) else model.whiten(model.by_parameters(camera) @ by)
-        return network.score(apart(network, columns) if self.scope == "image" else columns)
+        return network.score(significance.apart(network, columns) if self.scope == "image" else columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,8 +353,7 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
     return most
 
 
-Size = Callable[[np.ndarray, np.ndarray], str]
-"""Words on the size of a cause, from its parameters (q,) and their σ."""
+Size = Callable[[np.ndarray, np.ndarray], str]  # words on the size of a cause, from its parameters (q,) and their σ
 
 
 def _percent(what: str) -> Size:
@@ -423,7 +412,7 @@ def _hypotheses(camera: Camera) -> list[Hypothesis]:
         Hypothesis("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, "
                    "or stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
         Hypothesis("the centres are not those of ellipses (eccentricity)", NO_ELLIPSES, lambda value, sigma:
-                   f"{1 + value[0]:.3f} ± {sigma[0]:.2g} of the eccentricity found", by_eccentricity),
+                   f"{1 + value[0]:.3f} ± {sigma[0]:.2g} of the eccentricity found", significance.by_eccentricity),
         Hypothesis(MOVED, MOVED_REMEDY, lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
@@ -472,4 +461,4 @@ def _by_row(network: Network) -> np.ndarray:
 
 def _by_motion(network: Network) -> np.ndarray:
     """Returns the columns of a motion of all faces against the board, about the middle of all points."""
-    return by_motion(network, network.model.xyz_model.mean(0))
+    return significance.by_motion(network, network.model.xyz_model.mean(0))

@@ -100,7 +100,7 @@ class ImageObservations(Measured):
         return replace(self, labels=tuple(self.labels[i] for i in keep), **arrays)
 
 
-def rows_of(keys: Iterable[K]) -> dict[K, np.ndarray]:
+def rows_by(keys: Iterable[K]) -> dict[K, np.ndarray]:
     """Returns the indices of each key, in order of appearance."""
     rows: dict[K, list[int]] = {}
     for i, key in enumerate(keys):
@@ -110,7 +110,7 @@ def rows_of(keys: Iterable[K]) -> dict[K, np.ndarray]:
 
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
     """Returns the observations by group, in order."""
-    groups = rows_of(image.group for image in observations)
+    groups = rows_by(image.group for image in observations)
     return {group: [observations[i] for i in rows] for group, rows in groups.items()}
 
 
@@ -160,8 +160,7 @@ class Centres(CircleRows, Measured):
 
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
-MIN_POINTS = 6
-"""Smallest number of labelled points that an image must observe. COLMAP's defaults expect thousands."""
+MIN_POINTS = 6  # smallest number of labelled points that an image must observe. COLMAP's defaults expect thousands.
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +258,7 @@ class GroupModel(Measured):
 
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Returns the indices of the points by face; the points of the board have the key ``board``."""
-        return rows_of(label.plane for label in self.labels)
+        return rows_by(label.plane for label in self.labels)
 
     def normals(self) -> np.ndarray:
         """Returns the normal of each point's face or board, (p, 3); zero where the model has too few points of it."""
@@ -353,13 +352,10 @@ def assemble(
     )
 
 
-NOT_AS_DRAWN = "not-as-drawn"
-"""Faces are not where the design, or the names of groups, have them."""
+NOT_AS_DRAWN = "not-as-drawn"  # faces are not where the design, or the names of groups, have them
 GROUP_LEFT_OUT = "group-left-out"
-BOARD_LEFT_OUT = "board-left-out"
-"""A whole board in an image, not single dots."""
-ELSEWHERE = "face-elsewhere"
-"""Faces that were read in an image and left out: not where others see them."""
+BOARD_LEFT_OUT = "board-left-out"  # A whole board in an image, not single dots
+ELSEWHERE = "face-elsewhere"  # faces that were read in an image and left out: not where others see them
 BEGINNINGS = {NOT_AS_DRAWN: "not as drawn: ", GROUP_LEFT_OUT: "left out whole: "}
 
 
@@ -400,10 +396,8 @@ def lost_groups(notes) -> list[str]:
 MOST_TURNED_DEG = 25.0
 """Largest angle of a face to its rough pose. A rough pose is good to a few degrees; a face on the wrong side of the
 body, or drawn turned, is off by far more."""
-FAR_DEG = 45.0
-"""Angle from which a face is not the one that was drawn: half of that between two sides of a box."""
-LIKE_DRAWN = 1.3
-"""Largest factor between distances of faces and those of their rough poses."""
+FAR_DEG = 45.0  # angle from which a face is not the one that was drawn: half of that between two sides of a box
+LIKE_DRAWN = 1.3  # largest factor between distances of faces and those of their rough poses
 SHOWN, RARELY = 2, 3
 """Number of images that must show a face before its group counts as one of it, and how many times as many must show it
 as a face that the group is named after."""

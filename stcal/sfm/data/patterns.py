@@ -106,8 +106,7 @@ def planar_pose(xy_mm: np.ndarray, xy: np.ndarray) -> Rigid | None:
         return None
 
 
-NEAREST_MM = 1e-6
-"""Lower bound of the depth. Behind the camera the numbers only have to be finite."""
+NEAREST_MM = 1e-6  # lower bound of the depth. Behind the camera the numbers only have to be finite.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,5 +149,4 @@ def project_circles(
     return CircleImages(image, depth, by_pose, by_centre @ rotation[:, None])
 
 
-MIN_DOTS = 9
-"""Smallest number of dots in an image that is used."""
+MIN_DOTS = 9  # smallest number of dots in an image that is used

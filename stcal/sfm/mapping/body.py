@@ -22,15 +22,8 @@ from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
 from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel, assemble
-from stcal.sfm.mapping.incremental import (
-    MAX_REPROJECTION_PX,
-    MIN_RAY_ANGLE_RAD,
-    Mapping,
-    complete,
-    left_out,
-    rays_of,
-    widest_angle_rad,
-)
+from stcal.sfm.mapping import incremental
+from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD, Mapping, rays_of, widest_angle_rad
 
 BY_FACES = "faces of known shape, placed together"
 SHOW_MORE = "show two faces of it at once, or one by more corners"
@@ -589,7 +582,7 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
     xyz = {label: designed[label] for label, (_, ray) in rays.items() if widest_angle_rad(ray) > MIN_RAY_ANGLE_RAD}
     poses = [body.camera_from_body[image.name] for image in placed]
     model = assemble(WorldModel, group[0].group, placed, poses, xyz)
-    return complete(model, list(group), camera, MAX_REPROJECTION_PX)
+    return incremental.complete(model, list(group), camera, incremental.MAX_REPROJECTION_PX)
 
 
 def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> Mapping:
@@ -598,5 +591,5 @@ def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camer
     gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
     seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
     is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
-    missing = left_out(group, model, SHOW_MORE)
+    missing = incremental.left_out(group, model, SHOW_MORE)
     return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)

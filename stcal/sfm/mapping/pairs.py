@@ -18,7 +18,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Rigid, best_rotations
 from stcal.labels import DotLabel
-from stcal.sfm.data.group_model import ImageObservations, WorldModel, rows_of
+from stcal.sfm.data.group_model import ImageObservations, WorldModel, rows_by
 from stcal.sfm.data.patterns import planar_pose
 from stcal.sfm.mapping.database import match_labels
 
@@ -228,7 +228,7 @@ def image_graph(
     kind = kind or ("sparse" if len(observations) > SPARSE_FROM else "all")
     sees = incidence(observations)
     shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)
-    members = rows_of(image.group for image in observations)
+    members = rows_by(image.group for image in observations)
     if kind == "all":
         return ImageGraph(kind, np.argwhere(np.triu(shared, 1) >= MIN_SHARED), members)
     skeleton, pairs = {}, set()

@@ -32,13 +32,6 @@ from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
-from stcal.sfm.detect.predict import (
-    CONTRADICTED,
-    MISSED,
-    contradictions,
-    measure_predicted,
-    notes_by_plane,
-)
 from stcal.sfm.measurement.pose import (
     FAILED,
     MIN_CIRCLES,
@@ -196,13 +189,14 @@ class Tracker:
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
-        wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
-        seen = seen.without(wrong, notes_by_plane(wrong, CONTRADICTED))
+        near = self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD)
+        wrong = predict.contradictions(near, seen.observations, camera)
+        seen = seen.without(wrong, predict.notes_by_plane(wrong, predict.CONTRADICTED))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
-        measured = measure_predicted(image, camera, predicted, self.ellipses)
-        missed = notes_by_plane(measured.missed, MISSED)
+        measured = predict.measure_predicted(image, camera, predicted, self.ellipses)
+        missed = predict.notes_by_plane(measured.missed, predict.MISSED)
         if not measured.labels:
             return replace(seen, notes=(*seen.notes, *missed))
         return seen.plus(measured.labels, measured.centres, missed)

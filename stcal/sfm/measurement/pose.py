@@ -31,7 +31,7 @@ from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.adjust.equations import coordinates
 from stcal.sfm.adjust.faces_file import TargetCircles
-from stcal.sfm.data.group_model import ImageObservations, Outlier, rows_of
+from stcal.sfm.data.group_model import ImageObservations, Outlier, rows_by
 from stcal.sfm.data.patterns import CircleImages, project_circles
 
 SETTLED = 1e-4
@@ -114,7 +114,7 @@ MIN_BREADTH = 0.05  # ratio to the length of the visible circles: a row leaves t
 
 def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[Poses, Rigid]:
     """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
-    faces = rows_of(label.face for label in problem.labels)
+    faces = rows_by(label.face for label in problem.labels)
     by_size = sorted((face for face in faces if face in target.target_from_plane), key=lambda face: -len(faces[face]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
@@ -319,11 +319,6 @@ def pose_from_circles(
     problem = _problem(parse_labels(labels), centre_px, covariance_px2, target, camera, options, prior, where)
     start, plane = start_pose(problem, target, where)
     minima, problem = minima_without_outliers(problem, start, plane, where)
-    if len(problem.labels) < MIN_CIRCLES:
-        raise DegenerateError(
-            "E-MEASURE-FEW-CIRCLES",
-            f"{where}: {len(problem.labels)} circles left, {MIN_CIRCLES} needed; show more of a face",
-        )
     residual = problem.in_px(problem.seen(minima.poses[[0]])[0][0])
     rms_px, limit_px = rms(residual), MISFIT * float(np.ptp(problem.in_px(problem.centre), axis=0).max())
     if not rms_px <= limit_px:  # no covariance describes a pose of which most circles are elsewhere

@@ -20,6 +20,7 @@ from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import with_a_field
+from tests.support.image_poses import pose_error
 
 NOISE_PX = 0.005
 
@@ -33,13 +34,8 @@ def scenes():
 
 def pose_errors(scene, target):
     """Rotation (rad) and translation (mm) errors by face but the reference, in the target frame."""
-    errors = {}
-    for face_id, pose in target.target_from_face.items():
-        true = scene.target_from_face[face_id]
-        turn = Rigid(pose.rotation @ true.rotation.T).log()[:3]
-        errors[face_id] = np.concatenate([turn, pose.translation - true.translation])
-    del errors[target.reference_face]
-    return errors
+    poses = {face: pose for face, pose in target.target_from_face.items() if face != target.reference_face}
+    return {face: pose_error(pose, scene.target_from_face[face]) for face, pose in poses.items()}
 
 
 def test_refinement_from_scratch_finds_the_eccentricity(scene, labels_only):
@@ -186,8 +182,7 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
     given = Camera.of(camera, scene.camera.colmap_model)
     options = RunOptions(refine_camera=refine_camera).adjustment(scene.target)
     result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given))
-    poses = result.target.target_from_face
-    off = [p.translation - scene.target_from_face[f].translation for f, p in poses.items() if f != "1"]
+    off = [error[3:] for error in pose_errors(scene, result.target).values()]
     return 1e3 * float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
 
 

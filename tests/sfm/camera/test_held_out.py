@@ -10,17 +10,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.labels import DotLabel, unseen_lines
 from stcal.sfm.camera import calibrate as calibration
-from stcal.sfm.camera.calibrate import (
-    MAX_RESIDUAL_PX,
-    choose_model,
-    held_out,
-    judged,
-    of_chosen_model,
-    of_lens_model,
-    require_determined,
-    residual_rms_px,
-    without_gross_errors,
-)
+from stcal.sfm.camera.calibrate import judged, of_chosen_model
 from stcal.sfm.camera.camera_report import calibration_file, calibration_report
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
 from tests.levels import sampled
@@ -41,9 +31,9 @@ def test_gross_errors_are_left_out_and_other_points_stay():
     spoiled = [*views]
     spoiled[3] = moved(views[3], [0, 1, 2], [40.0, -25.0])
     result = calibrated(spoiled)
-    assert residual_rms_px(result) > MAX_RESIDUAL_PX
-    require_determined(result, spoiled, BOARD)  # a few do not refuse all
-    kept, skipped, (warning,) = without_gross_errors(spoiled, BOARD, result)
+    assert calibration.residual_rms_px(result) > calibration.MAX_RESIDUAL_PX
+    calibration.require_determined(result, spoiled, BOARD)  # a few do not refuse all
+    kept, skipped, (warning,) = calibration.without_gross_errors(spoiled, BOARD, result)
     assert skipped == []
     assert kept[3].labels == views[3].labels[3:]
     assert [len(view) for view in kept] == [len(view) - 3 * (i == 3) for i, view in enumerate(views)]
@@ -55,7 +45,7 @@ def test_a_view_of_gross_errors_is_skipped_and_views_without_stay_as_they_are():
     views, rng = views_of(np.random.default_rng(5), count=10), np.random.default_rng(6)
     wrong = np.arange(len(views[7]))[: int(0.8 * len(views[7]))]
     spoiled = [*views[:7], moved(views[7], wrong, rng.uniform(-60, 60, (len(wrong), 2))), *views[8:]]
-    kept, skipped, _ = without_gross_errors(spoiled, BOARD, calibrated(spoiled))
+    kept, skipped, _ = calibration.without_gross_errors(spoiled, BOARD, calibrated(spoiled))
     assert [each.name for each in skipped] == [views[7].name]
     assert all(a is b for a, b in zip(kept, [*views[:7], *views[8:]], strict=True))
 
@@ -85,7 +75,7 @@ def test_held_out_residuals_are_those_of_noise():
     below 3 %; 2900 coordinates scatter by 1.3 %."""
     views = views_of(np.random.default_rng(0), count=24)
     dots = np.mean([len(view) for view in views])
-    found = held_out(calibrated(views), views, BOARD)
+    found = calibration.held_out(calibrated(views), views, BOARD)
     assert 0.96 < found.rms_px() / (0.02 * np.sqrt(1 - 3 / dots)) < 1.07
     assert abs(found.factor - 1) < 0.1
     assert len(found.in_sigma) == 24
@@ -98,7 +88,7 @@ def test_each_view_is_foretold_without_itself():
     views = views_of(rng, count=15)
     bent = replace(TRUE, distortion=[0.1, *[0] * 7])
     views[4] = replace(views_of(rng, count=1, camera=bent)[0], name=views[4].name)
-    squares = held_out(calibrated(views), views, BOARD).squares(1.0)
+    squares = calibration.held_out(calibrated(views), views, BOARD).squares(1.0)
     assert squares.argmax() == 4
 
 
@@ -106,7 +96,7 @@ def test_each_view_is_foretold_without_itself():
 def test_a_dot_that_is_wrong_does_not_count():
     views = views_of(np.random.default_rng(2), count=12)
     spoiled = [*views[:3], moved(views[3], [5], 4.0), *views[4:]]
-    before, after = (held_out(calibrated(each), each, BOARD).rms_px() for each in (views, spoiled))
+    before, after = (calibration.held_out(calibrated(each), each, BOARD).rms_px() for each in (views, spoiled))
     assert after < 1.05 * before
 
 
@@ -132,7 +122,7 @@ def known_of(views, truth):
 )
 def test_the_model_of_the_lens_is_chosen(truth, wanted):
     views = views_of(np.random.default_rng(4), count=16, camera=truth)
-    chosen, rows = choose_model(views, BOARD, known_of(views, truth), 2)
+    chosen, rows = calibration.choose_model(views, BOARD, known_of(views, truth), 2)
     assert chosen in wanted
     assert [row.model for row in rows] == list(calibration.CANDIDATES)
     assert min(row.worse for row in rows if row.worse is not None) == 0
@@ -155,7 +145,7 @@ def test_a_model_that_fails_says_why(monkeypatch):
         return own(views, board, start, model, *more)
 
     monkeypatch.setattr(calibration, "adjust_intrinsics", failing)
-    chosen, rows = choose_model(views, BOARD, known_of(views, TRUE), 1)
+    chosen, rows = calibration.choose_model(views, BOARD, known_of(views, TRUE), 1)
     assert chosen == "OPENCV"
     assert (rows[0].why, rows[0].rms_px) == ("no minimum", None)
 
@@ -165,9 +155,9 @@ def test_of_too_few_views_none_is_held_out_and_no_model_chosen(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(3), count=3)
     known = known_of(views, TRUE)
-    assert held_out(known, views, BOARD) is None
+    assert calibration.held_out(known, views, BOARD) is None
     with fails_with("E-CALIBRATE-FEW-VIEWS … --model … 3 … 4 … --model"):
-        choose_model(views, BOARD, known, 1)
+        calibration.choose_model(views, BOARD, known, 1)
 
 
 @pytest.mark.slow
@@ -222,8 +212,8 @@ def test_text_page_and_file_have_all_models(result):
 def test_a_lens_model_too_small_is_named_and_no_larger_one_for_other_errors():
     bent = Camera(2592, 1728, TRUE.focal, TRUE.centre, [-0.06, 0.045, 0, 0, 0.3, 0, 0, 0])
     views = views_of(np.random.default_rng(9), count=12, camera=bent)
-    (warning,) = of_lens_model(calibrated(views), views, BOARD)
+    (warning,) = calibration.of_lens_model(calibrated(views), views, BOARD)
     assert "OPENCV is too small; use --model FULL_OPENCV" in warning
     rng = np.random.default_rng(10)
     for other in (views_of(rng, 12), with_a_field(views_of(rng, 12), rng, 0.04)):
-        assert of_lens_model(calibrated(other), other, BOARD) == []
+        assert calibration.of_lens_model(calibrated(other), other, BOARD) == []

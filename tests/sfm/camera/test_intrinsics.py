@@ -20,15 +20,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera import intrinsics
 from stcal.sfm.camera.calibrate import require_determined
-from stcal.sfm.camera.intrinsics import (
-    adjust_intrinsics,
-    board_views,
-    closed_form,
-    image_grid,
-    model_parameters,
-    projection_sigma,
-    start_camera,
-)
+from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, model_parameters, projection_sigma
 from stcal.sfm.data.group_model import Centres, ImageObservations
 from stcal.sfm.detect.candidates import BoardSighting, ImageDetection
 from tests.outcome import fails_with
@@ -65,7 +57,7 @@ def views_of(rng, count=12, noise_px=0.02, tilt_deg=35.0, camera=TRUE, made=None
 
 
 def calibrated(views, model="OPENCV"):
-    start = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height, "OPENCV"))
+    start = closed_form(views, BOARD, intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV"))
     return adjust_intrinsics(views, BOARD, start, model)
 
 
@@ -127,7 +119,7 @@ def test_rational_model_knows_projections_though_not_its_coefficients():
     result = calibrated(views_of(np.random.default_rng(8)), "FULL_OPENCV")
     sigma = projection_sigma(result)
     moved = np.abs(result.camera.project(RAYS) - TRUE.project(RAYS)).max()
-    middle = np.linalg.norm(image_grid(result.camera) - [1296, 864], axis=1) < 900
+    middle = np.linalg.norm(intrinsics.image_grid(result.camera) - [1296, 864], axis=1) < 900
     assert result.sigma()[4] > 0.1
     assert sigma.sigma_px[middle].max() < 0.1
     assert 0.001 < moved < 0.5
@@ -148,26 +140,28 @@ def test_intrinsics_that_are_held_stay_and_the_poses_follow():
 def test_closed_form_finds_the_focal_length():
     # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
     pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
-    start = start_camera(TRUE.width, TRUE.height, "OPENCV")
+    start = intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")
     for camera, tolerance in ((pinhole, 5e-3), (TRUE, 0.05)):
         found = closed_form(views_of(np.random.default_rng(9), noise_px=1e-3, camera=camera), BOARD, start).focal
         assert found == pytest.approx([2790, 2790], rel=tolerance)
         assert (found != start.focal).all()
 
 
-@pytest.mark.slow
-def test_boards_of_one_direction_are_refused():
-    views = views_of(np.random.default_rng(1), count=6, tilt_deg=0.02)
-    with fails_with("E-CALIBRATE-UNDETERMINED … 6 … 2 %"):
-        require_determined(calibrated(views), views, BOARD)
+BENT = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
 
 
 @pytest.mark.slow
-def test_a_model_that_does_not_fit_is_refused():
-    bent = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
-    views = views_of(np.random.default_rng(2), camera=bent)
-    with fails_with("E-CALIBRATE-MISFIT … PINHOLE puts them … use --model OPENCV"):
-        require_determined(calibrated(views, "PINHOLE"), views, BOARD)
+@pytest.mark.parametrize(
+    ("shown", "model", "refusal"),
+    [
+        ({"count": 6, "tilt_deg": 0.02}, "OPENCV", "E-CALIBRATE-UNDETERMINED … 6 … 2 %"),
+        ({"camera": BENT}, "PINHOLE", "E-CALIBRATE-MISFIT … PINHOLE puts them … use --model OPENCV"),
+    ],
+)
+def test_boards_of_one_direction_and_a_model_that_does_not_fit_are_refused(shown, model, refusal):
+    views = views_of(np.random.default_rng(2), **shown)
+    with fails_with(refusal):
+        require_determined(calibrated(views, model), views, BOARD)
 
 
 @pytest.mark.slow
@@ -233,7 +227,7 @@ def test_a_board_upside_down_is_numbered_like_the_others():
         detection = ImageDetection(centres, (), (seen,))
         images.append(SimpleNamespace(file=SimpleNamespace(name=view.name, group="."), detection=detection))
         truth.append(view.labels)
-    found = [view.labels for view in board_views(images, BOARD, TRUE)]
+    found = [view.labels for view in intrinsics.board_views(images, BOARD, TRUE)]
     agree = [a == b for a, b in zip(found, truth, strict=True)]
     assert all(agree) or not any(agree)  # which way up is by convention
 
@@ -317,7 +311,7 @@ def test_where_the_closed_form_gives_no_focal_length_several_are_tried(monkeypat
     """The nearest of a row with steps of √2 is within a factor of 2^¼."""
     monkeypatch.setattr("stcal.sfm.camera.intrinsics.FOCAL_LIMITS", (60.0, 60.0))
     views = views_of(np.random.default_rng(1), count=6)
-    found = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height, "OPENCV")).focal[0]
+    found = closed_form(views, BOARD, intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")).focal[0]
     assert 2**-0.3 < found / TRUE.focal[0] < 2**0.3
 
 

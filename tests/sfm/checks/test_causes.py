@@ -9,7 +9,6 @@ import pytest
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.plane import circle_image_offset
-from stcal.labels import CircleLabel
 from stcal.sfm.checks import suite
 from stcal.sfm.checks.significance import moved_apart
 from stcal.sfm.checks.suite import _turned, cause_of_file, whole_set_cause
@@ -19,7 +18,7 @@ from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import Groups, GroupSolution, refine_or_explain
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
-from tests.sfm.checks.test_checks import Lab, seen_circles
+from tests.sfm.checks.test_checks import Lab, on_face, seen_circles
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +136,7 @@ def test_the_size_of_the_cause_is_said_and_a_check_that_would_name_nearly_all_im
 
 
 def shifted(image):
-    on_face = np.array([isinstance(label, CircleLabel) for label in image.labels])
-    return replace(image, centre_px=image.centre_px + on_face[:, None] * [0.4, 0])
+    return replace(image, centre_px=image.centre_px + on_face(image)[:, None] * [0.4, 0])
 
 
 def test_what_one_image_has_is_no_cause_of_the_whole_set(few, lab):
@@ -227,10 +225,8 @@ def test_a_file_that_is_far_off_is_compared_with_the_true_camera(few, name):
 def elsewhere(image, scene, shift_mm):
     """The image with all faces ``shift_mm`` off their place, board and camera where they were."""
     xyz, normal, radius, _ = seen_circles(scene, image)
-    on_face = np.array([isinstance(label, CircleLabel) for label in image.labels])
-    before, after = (
-        scene.camera.project(circle_image_offset(at, normal, radius)) for at in (xyz, xyz + on_face[:, None] * shift_mm)
-    )
+    there = xyz + on_face(image)[:, None] * shift_mm
+    before, after = (scene.camera.project(circle_image_offset(at, normal, radius)) for at in (xyz, there))
     return replace(image, centre_px=image.centre_px + after - before)
 
 

@@ -14,6 +14,7 @@ from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.support.film import filmed
+from tests.support.image_poses import pose_error
 
 pytestmark = pytest.mark.slow
 IMAGES = 6
@@ -56,9 +57,7 @@ def model(film, frames, tmp_path_factory):
 
 def off_sigmas(pose, other):
     """By how many σ two poses differ at most."""
-    step = (other.camera_from_target @ pose.camera_from_target.inverse()).log()
-    sigma = np.sqrt(np.diag(pose.covariance))
-    return np.abs(np.r_[step[:3], other.camera_from_target.translation - pose.camera_from_target.translation] / sigma)
+    return np.abs(pose_error(other.camera_from_target, pose.camera_from_target)) / np.sqrt(np.diag(pose.covariance))
 
 
 def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
@@ -69,9 +68,7 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         assert follower.searched == (i == 0)
         assert set(other.labels) <= set(own.labels)
         assert off_sigmas(own, other).max() < OTHER_BAND
-        truth = film.groups["12"].camera_from_target[i]
-        step = (truth @ own.camera_from_target.inverse()).log()
-        error = np.r_[step[:3], truth.translation - own.camera_from_target.translation]
+        error = pose_error(own.camera_from_target, film.groups["12"].camera_from_target[i])
         assert error @ np.linalg.solve(own.covariance, error) < 28  # χ² of 6, one in 10 000
 
 
