@@ -187,7 +187,7 @@ def test_a_folder_of_detections_only(small_set, stcal_sfm):
 
 
 @pytest.mark.parametrize("name", [".stcal/run.json", "report.json", "faces.json"])
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b'"text"'])
+@pytest.mark.parametrize("content", [b"", b"[1]", b"\xff\xfe", b"[" * 100_000])
 def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
     (own_run / name).write_bytes(content)
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, str(own_run / name), "run it again")
