@@ -143,11 +143,8 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         poses.append(stand.pose(np.array([ahead * x, y, ahead * right]) @ stand.axes, stand.axes[1], roll))
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
-    board, middle = (
-        -scene.groups[model.group].target_from_board.rotation[:, 2],
-        scene.board_outline(model.group).mean(0),
-    )
-    planes = {BOARD: (board, middle)}  # outward normal, and middle
+    board = group.target_from_board.rotation
+    planes = {BOARD: (-board[:, 2], scene.board_outline(model.group).mean(0))}  # outward normal, and middle
     for face in (face.id for face in scene.target.faces):
         planes[face] = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
     normals = np.array([planes.get(label.plane, planes[BOARD])[0] for label in model.labels])

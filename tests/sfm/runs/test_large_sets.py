@@ -50,14 +50,9 @@ def solve(scene, observations, kind, out):
     labelled = tuple(LabelledImage(image, ()) for image in observations)
     groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
     solved, _ = solve_groups(groups, scene.target, out / "scratch", out / ".stcal/cache", lambda *_: None)
-    solutions = list(solved.values())
-    return (
-        graph,
-        solutions,
-        calibrate(
-            [s.model for s in solutions], scene.camera, scene.target, scene.board, options.adjustment(scene.target)
-        ),
-    )
+    models = [solution.model for solution in solved.values()]
+    calibration = calibrate(models, scene.camera, scene.target, scene.board, options.adjustment(scene.target))
+    return list(solved.values()), calibration
 
 
 def parts_of_tracks(pairs, seen) -> list[list[int]]:
@@ -139,8 +134,8 @@ def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
 def test_sparse_gives_the_same_faces_as_all_pairs(crowd, tmp_path):
     """Both end in the minimum of the same adjustment: the difference is what stopping leaves, 1e-8 px in 2592."""
     scene, observations = crowd
-    _, mapped_all, every = solve(scene, observations, "all", tmp_path / "all")
-    _, mapped_sparse, sparse = solve(scene, observations, "sparse", tmp_path / "sparse")
+    mapped_all, every = solve(scene, observations, "all", tmp_path / "all")
+    mapped_sparse, sparse = solve(scene, observations, "sparse", tmp_path / "sparse")
     assert sum(len(s.model.images) for s in mapped_all) == sum(len(s.model.images) for s in mapped_sparse) == 100
     for face_id, pose in every.target.target_from_face.items():
         other = sparse.target.target_from_face[face_id]
