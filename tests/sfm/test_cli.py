@@ -43,12 +43,16 @@ def test_init_writes_the_reference_design_and_overwrites_nothing(command, tmp_pa
     assert load_board(tmp_path / "mine" / "board.toml").corner is not None
 
 
-@pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "Part: ")])
-def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(command, small_set, no_page, faces, word):
-    """Face 3 is not in the photographs."""
+@pytest.mark.parametrize(("solve", "faces", "word"), [("joint", "1,2,4", "Yes"), ("chain", "1,3", "Part, with care: ")])
+def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(
+    command, small_set, no_page, solve, faces, word
+):
+    """Face 3 is not in the photographs; a chain is faster, and never a plain yes."""
     small = small_set("12", "14")
     files = ["--target", small.folder / "target.toml", "--board", small.folder / "board.toml"]
-    code, out, err = command(*small.arguments(*files, "--expect-faces", faces, "--no-strict", "--quiet"))
+    code, out, err = command(
+        *small.arguments(*files, "--solve", solve, "--expect-faces", faces, "--no-strict", "--quiet")
+    )
     assert (code, out) == (0, "")
     assert err.startswith(f"warning: may I use it? {word}") if word != "Yes" else not err
     assert err.count("\n") == (word != "Yes")

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -83,8 +84,6 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_pa
     own = own_copy(result.out / "colmap/database.db", tmp_path)  # pycolmap changes what it opens
     mapping = map_group(own, tmp_path / "scratch", group, list(ids), ids, pairs, result.camera)
     ours = next(s.model for s in result.solutions if s.model.group == "12")
-    from dataclasses import replace
-
     with pycolmap.Database.open(str(own)) as database:
         keypoints = {o.name: from_colmap_px(database.read_keypoints(ids[o.name])[:, :2]) for o in group}
     model = mapping.model

@@ -34,13 +34,11 @@ from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_mo
 from stcal.sfm.report.judgement import with_judgement
 from stcal.sfm.runs.comparisons import (
     CameraDifference,
+    Compared,
     Crosscheck,
     FaceDifference,
-    FacesCompared,
     ImagesRegistered,
-    MappingCompared,
     ResidualRms,
-    ResultCompared,
     Tolerances,
     allowed_text,
 )
@@ -301,7 +299,9 @@ def crosscheck(
                 "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
             )
         check = _compared(saved, colmap, tolerances, timeout_s, progress)
-        write_report(stage, with_judgement(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
+        write_report(
+            stage, with_judgement(saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}), saved.folder
+        )
     return check
 
 
@@ -351,7 +351,7 @@ def _compared(
     )
     ours = of_pycolmap.target
     between = _targets(of_native.target, ours.target_from_face, ours.circles, run)
-    mapping = MappingCompared(**dict(between), cameras=_cameras(of_native, of_pycolmap, run))
+    mapping = between.model_copy(update={"cameras": _cameras(of_native, of_pycolmap, run)})
     result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
     if not run.faces.target_from_face_covariance:
         tolerances = tolerances.without_sigma()
@@ -368,7 +368,7 @@ def _compared(
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
         mapping=mapping,
         result=result,
-        plain=FacesCompared(faces=face_differences(of_native.target, run)),
+        plain=Compared(faces=face_differences(of_native.target, run)),
         notes=list(of_native.notes),
         differences=_differences(images, mapping, result, tolerances),
     )
@@ -429,11 +429,11 @@ def _off(difference: np.ndarray) -> tuple[float, float]:
     return MICRO * shift, MICRO * turn
 
 
-def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultCompared:
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> Compared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    return ResultCompared(
+    return Compared(
         faces=face_differences(target, run, faces),
         circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
         circles_sigmas={
@@ -521,9 +521,7 @@ def comparison_text(check: Crosscheck) -> str:
     return "\n".join([*check.notes, *lines])
 
 
-def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
-) -> list[str]:
+def _differences(images: ImagesRegistered, mapping: Compared, result: Compared, limits: Tolerances) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:

@@ -452,9 +452,6 @@ def _ball() -> tuple[np.ndarray, np.ndarray]:
     return points, ConvexHull(points).simplices
 
 
-ROOT = "target"  # default name of the target frame
-
-
 @dataclass(frozen=True, slots=True)
 class Form:
     """A form of export."""
@@ -489,7 +486,7 @@ class ExportedRun:
 
 
 @require_arguments
-def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
+def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target") -> ExportedRun:
     """Writes faces and circles to a new file, with σ and cameras if the form holds them, and returns the content.
 
     Parameters

@@ -41,14 +41,6 @@ class Schema:
     tables: dict[str, str]  # declaration by name
     indices: dict[str, str]  # table and columns of unique indices by name
 
-    def statements(self) -> list[str]:
-        """Returns the SQL statements that make an empty database."""
-        return [
-            *(f"CREATE TABLE {table} ({declaration})" for table, declaration in self.tables.items()),
-            *(f"CREATE UNIQUE INDEX {index} ON {columns}" for index, columns in self.indices.items()),
-            f"PRAGMA user_version = {self.user_version}",
-        ]
-
 
 _MATRIX = "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
 _IMAGE_KEY = "image_id INTEGER NOT NULL PRIMARY KEY"
@@ -202,8 +194,11 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
     write_database(own, run.camera, run.observations, pairs, run.corrected_px)
     try:
         with closing(sqlite3.connect(path)) as copy, copy:
-            for statement in wanted.statements():
-                copy.execute(statement)
+            for table, declaration in wanted.tables.items():
+                copy.execute(f"CREATE TABLE {table} ({declaration})")
+            for index, columns in wanted.indices.items():
+                copy.execute(f"CREATE UNIQUE INDEX {index} ON {columns}")
+            copy.execute(f"PRAGMA user_version = {wanted.user_version}")
             copy.commit()
             copy.execute("ATTACH ? AS own", (str(own),))
             for table in wanted.tables:

@@ -143,14 +143,15 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         poses.append(stand.pose(np.array([ahead * x, y, ahead * right]) @ stand.axes, stand.axes[1], roll))
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
-    board, middle = (
-        -scene.groups[model.group].target_from_board.rotation[:, 2],
-        scene.board_outline(model.group).mean(0),
-    )
-    planes = {BOARD: (board, middle)}  # outward normal, and middle
+    board = group.target_from_board.rotation
+    planes = {BOARD: (-board[:, 2], scene.board_outline(model.group).mean(0))}  # outward normal, and middle
     for face in (face.id for face in scene.target.faces):
         planes[face] = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
-    limit = _largest_tilt(planes, model)
+    normals = np.array([planes.get(label.plane, planes[BOARD])[0] for label in model.labels])
+    centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
+    ray = centres - model.xyz_model[model.point_index]
+    measured = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)  # cosines of tilts
+    limit = min(float(np.arccos(np.clip(measured.min(), -1, 1))), MAX_FOUND_TILT_RAD)
     members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     views = []
     for i, place in enumerate(places):
@@ -164,15 +165,6 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
             nearest = model.images[stand.middle], model.images[int(cosine.argmax())], angle_deg(cosine.max())
             views.append(PlannedView(model.group, own, *place, stand.distance_mm, tilts, *nearest))
     return views
-
-
-def _largest_tilt(planes: dict[str, tuple[np.ndarray, np.ndarray]], model: MetricModel) -> float:
-    """Returns the largest tilt of the circles that the run measured in the group, rad, up to ``MAX_FOUND_TILT_RAD``."""
-    normals = np.array([planes.get(label.plane, planes[BOARD])[0] for label in model.labels])
-    centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
-    ray = centres - model.xyz_model[model.point_index]
-    cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
-    return min(float(np.arccos(np.clip(cosine.min(), -1, 1))), MAX_FOUND_TILT_RAD)
 
 
 def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]:

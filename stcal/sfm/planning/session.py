@@ -26,6 +26,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
+from stcal.io.images import TOP_GROUP
 from stcal.io.json import ResultFile
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, circle_labels
 from stcal.parallel import one_thread
@@ -53,7 +54,6 @@ from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.body_scene import BodyOptions, BodyScene, body_camera, make_body_scene
 from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene
 
-GROUP = "."
 DISTANCE_SIGMA_MM = 0.02  # σ of a distance that is measured with a caliper, as a remedy
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)  # tried from the largest down, as tilts often forbid wide ones
 NEARER = 0.8  # distance of the remedy of nearer cameras, relative to the plan's
@@ -349,14 +349,14 @@ def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[Bod
     run = options.run.adjustment(target)
     images, place = corners_seen(scene, options.noise.corner_px)
     xyz: dict[Label, np.ndarray] = {**place}
-    model = assemble(MetricModel, GROUP, images, list(scene.camera_from_target), xyz)
+    model = assemble(MetricModel, TOP_GROUP, images, list(scene.camera_from_target), xyz)
     faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
     if unseen := [face.id for face in target.faces if face.id not in faces]:
         raise InputError(
             "E-PLAN-UNLINKED",
             f"plan: {options.images} images of which fewer than two show face {unseen[0]}; plan more images",
         )
-    start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {GROUP: Rigid()})
+    start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {TOP_GROUP: Rigid()})
     prior = camera_prior(unknown_lens(camera)) if file is None else None
     if file is not None and run.refine_camera:
         prior = camera_prior(refinable(camera))
@@ -377,7 +377,7 @@ def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservati
             own |= dict(zip(face.labels(), xyz, strict=True))
         xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
         covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
-        images.append(ImageObservations(f"{i:04d}", GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
+        images.append(ImageObservations(f"{i:04d}", TOP_GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
         place |= own
     return images, place
 

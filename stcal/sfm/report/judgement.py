@@ -107,11 +107,17 @@ def judgement_of(report: dict) -> Judgement:
     keys = ("translation_sigma_um", "rotation_sigma_mdeg")
     position, rotation = (None if verdict == "no" else run.largest(key) for key in keys)
     invalid = invalidated(check.key for check in run.every if check.verdict == "failed")
+    if verdict == "no" and run.faces:  # no number, and what does not hold
+        biased = "That is unknown: biased faces have no valid σ." if run.control() else "That is unknown."
+        broken = f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
+        quality = broken if invalid else biased
+    else:
+        quality = run.quality(position, rotation)
     return Judgement(
         verdict=verdict,
         reserved=reserved,
         use=use,
-        quality=run.unknown(invalid) if verdict == "no" and run.faces else run.quality(position, rotation),
+        quality=quality,
         limit=limit,
         next=" ".join([*filter(None, [remedy]), *run.further(verdict)]),
         position_sigma_um=position and position[0],
@@ -183,7 +189,7 @@ class _Run:
         """Returns verdict and reason by what is in the result."""
         if not self.faces:
             return "no", "there is no face in it, only λ and residuals of the board"
-        if self._control():
+        if self.control():
             return "no", "it was made for comparison, and its faces are biased by tens of µm"
         failed, suspicious, passed = (
             sum(c.verdict == v for c in self.checks) for v in ("failed", "suspicious", "passed")
@@ -244,12 +250,6 @@ class _Run:
             words.append(f"one image alone shows {_faces(single)}")
         return words + [f"group {note['place']} was left out completely" for note in self.lost]
 
-    def unknown(self, invalid: list[str]) -> str:
-        """Returns the answer of a result that must not be used: no number, and what does not hold."""
-        if invalid:
-            return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
-        return "That is unknown: biased faces have no valid σ." if self._control() else "That is unknown."
-
     def quality(self, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
         if not self.faces:
             worst = max((group["scale"]["board_rms_um"] for group in self.report["groups"]), default=0.0)
@@ -282,7 +282,7 @@ class _Run:
         """Returns what limits a result, and the remedy."""
         worst, lost = self.every[0].verdict if self.every else "passed", _noted(self.lost, "Left out")
         return (
-            self._control()
+            self.control()
             or (None if worst == "failed" else lost)  # what is only suspicious comes after groups that were lost
             or self._by_checks(worst)
             or self._by_gaps()
@@ -292,7 +292,7 @@ class _Run:
             or self._by_sigma()
         )
 
-    def _control(self) -> Cause | None:
+    def control(self) -> Cause | None:
         """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
         if not self.faces:
             return (

@@ -231,17 +231,13 @@ class CameraDifference(Part):
     sigmas: float
 
 
-class FacesCompared(Part):
+class Compared(Part):
+    """Differences of two results; the keys that were not given are not in the file."""
+
     faces: dict[ByFace, FaceDifference | None]
-
-
-class ResultCompared(FacesCompared):
-    circles_um: dict[ByLabel, float]
+    circles_um: dict[ByLabel, float] = Field({})
     circles_sigmas: dict[ByLabel, float] = Field({})
-
-
-class MappingCompared(ResultCompared):
-    cameras: list[CameraDifference]
+    cameras: list[CameraDifference] = Field([])
 
 
 class Crosscheck(Part):
@@ -261,18 +257,18 @@ class Crosscheck(Part):
     residual_rms_px: ResidualRms = Field(
         description="per coordinate, of the `native` model, of `pycolmap`'s, and of the `run`'s final one"
     )
-    mapping: MappingCompared = Field(
+    mapping: Compared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
         "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
         "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
         "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
         "with that of the camera in its group, circles held together"
     )
-    result: ResultCompared = Field(
+    result: Compared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
         "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
-    plain: FacesCompared = Field(
+    plain: Compared = Field(
         description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
         "`sigmas`; no tolerance applies"
     )

@@ -22,12 +22,11 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_colmap import SCHEMAS, export_database, export_model
 from stcal.sfm.mapping.incremental import pipeline_options
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.shared import own_copy, unsealed_copy
 
 export = import_module("stcal.sfm.interop.export_colmap")
@@ -181,31 +180,18 @@ def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
         assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
-@pytest.fixture
-def refused(saved, tmp_path):
-    """The one line of a refused export, after which nothing new lies beside the output."""
-
-    def message(schema="3.8", out="out.db") -> str:
-        beside = state_of(tmp_path)
-        with pytest.raises(InputError) as refusal:
-            export_database(saved, tmp_path / out, schema)
-        assert state_of(tmp_path) == beside
-        assert "\n" not in str(refusal.value)
-        return str(refusal.value)
-
-    return message
-
-
-def test_an_unknown_schema_and_a_folder_that_is_not_there(refused):
-    assert refused(schema="3.7") == "schema 3.7: unknown; give one of 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.1, 4.2"
-    assert re.search(r"out\.db: no folder .*/none; make it", refused(out="none/out.db"))
-
-
-def test_nothing_is_overwritten(refused, tmp_path):
-    (tmp_path / "out.db").write_text("mine")
-    assert "out.db: exists, and nothing is overwritten" in refused()
+def test_a_refused_export_writes_and_overwrites_nothing(saved, tmp_path):
+    (tmp_path / "mine.db").write_text("mine")
     (tmp_path / "link.db").symlink_to(tmp_path / "nowhere")
-    assert "link.db: exists" in refused(out="link.db")
+    before = state_of(tmp_path)
+    for schema, out, error in (
+        ("3.7", "out.db", "E-OPTION-VALUE … 3.7 … 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.1, 4.2"),
+        ("3.8", "none/out.db", "E-OUTPUT-FOLDER … out.db … /none"),
+        ("3.8", "mine.db", "E-OUTPUT-EXISTS … mine.db"),
+        ("3.8", "link.db", "E-OUTPUT-EXISTS … link.db"),
+    ):
+        refuses(error, export_database, saved, tmp_path / out, schema)
+    assert state_of(tmp_path) == before
 
 
 def test_a_file_that_appears_meanwhile_is_not_overwritten(saved, tmp_path, monkeypatch):
@@ -483,49 +469,43 @@ def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(own, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["nvm", "bundler"])  # a file, and a folder
-def test_no_model_is_overwritten(small_run, stcal_sfm, tmp_path, kind):
+def test_no_model_is_overwritten(small_run, tmp_path, kind):
     (tmp_path / "file").write_text("mine", encoding="utf-8")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine", encoding="utf-8")
     for name in ("file", "full"):
-        code, out, error = stcal_sfm("export-model", small_run, tmp_path / name, "--format", kind)
-        assert (code, out, error.count("\n")) == (2, "", 1)
-        assert "exists, and nothing is overwritten" in error
+        refuses(f"E-OUTPUT-EXISTS … {name}", export_model, small_run, tmp_path / name, kind)
     assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "file", "full"]
 
 
-def test_errors(own, small_run, stcal_sfm, tmp_path):
-    def refused(run, out, kind="nvm"):
-        code, printed, error = stcal_sfm("export-model", run, out, "--format", kind)
-        assert (code, printed, error.count("\n")) == (2, "", 1)
+def test_errors(own, small_run, tmp_path):
+    def refused(error, run, kind="nvm"):
+        refuses(error, export_model, run, out, kind)
         assert not out.exists()
-        return error
 
     out = tmp_path / "a file" / "m"
     (tmp_path / "a file").write_text("mine", encoding="utf-8")
-    assert f"{tmp_path / 'a file'} is a file; give another place" in refused(small_run, out)
+    refused(f"E-OUTPUT-FOLDER … {tmp_path / 'a file'}", small_run)
     (tmp_path / "a file").unlink()
     out.parent.mkdir()
-    assert "format obj: unknown; give one of colmap-bin" in refused(small_run, out, "obj")
-    assert "not a run's folder" in refused(tmp_path, out)
+    refused("E-OPTION-FORM … obj … colmap-bin", small_run, "obj")
+    refused("E-RUN-FOLDER", tmp_path)
     model = own / "colmap/target_model"
     labels = (own / "labels.csv").read_text(encoding="utf-8")
-    head, *rows = labels.splitlines(keepends=True)
-    assert ",2:1," in rows[0]
-    assert ",2:2," in rows[1]
-    swapped = [rows[0].replace(",2:1,", ",2:2,"), rows[1].replace(",2:2,", ",2:1,")]
-    (own / "labels.csv").write_text("".join([head, *swapped, *rows[2:]]), encoding="utf-8")
-    assert "is of 2 labels, 1 needed" in refused(own, out)
+    (own / "labels.csv").write_text(
+        labels.replace(",2:1,", ",x,", 1).replace(",2:2,", ",2:1,", 1).replace(",x,", ",2:2,"), encoding="utf-8"
+    )  # of the first two rows
+    refused("E-MODEL-NOT-OF-RUN … 2 labels, 1 needed", own)
     (own / "labels.csv").write_text(labels, encoding="utf-8")
     other = pycolmap.Reconstruction(str(model))
     other.image(1).name = "12/other.jpg"
     other.write_binary(str(model))
-    assert "image 12/other.jpg is not as in the run's labels.csv" in refused(own, out)
+    refused("E-MODEL-NOT-OF-RUN … 12/other.jpg … labels.csv", own)
     points = (model / "points3D.bin").read_bytes()
     (model / "points3D.bin").write_bytes(points[: len(points) // 2])
     for kind in FORMATS:
-        assert "damaged or incomplete" in refused(own, out, kind)
+        refused("E-MODEL-UNREADABLE", own, kind)
     shutil.rmtree(model)
-    assert "no colmap/target_model; run it again" in refused(own, out)
+    refused("E-RUN-VERSION … colmap/target_model", own)
     assert list(out.parent.iterdir()) == []

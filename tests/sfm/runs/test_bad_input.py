@@ -172,20 +172,6 @@ def test_a_group_without_the_board(small_set, small_scene, stcal_sfm):
     assert_left_out(small, stcal_sfm, *parts)
 
 
-def test_a_camera_that_did_not_move(small_set, stcal_sfm):
-    """The first photograph twice, with noise of its own. One that only turned: tests/sfm/mapping/test_pairs.py."""
-    small = small_set("12")
-    for i in (2, 3):
-        small.image(i).unlink()
-    first = pixels(small.image())
-    noisy = np.clip(first + np.random.default_rng(0).integers(-1, 2, first.shape), 0, 255).astype(np.uint8)
-    small.image().write_bytes(encoded(".jpg", first))
-    small.image(1).write_bytes(encoded(".jpg", noisy))
-    parts = ("group 12: no initial pair", "the camera did not move", "take the photographs from different places")
-    assert_error(stcal_sfm(*small.arguments()), COMPUTATION, "E-MAPPING-NO-PAIR", *parts)
-    assert results_in(small.out) == []
-
-
 @pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize(("board", "what"), [(False, "face 1"), pytest.param(True, "board", marks=pytest.mark.slow)])
 def test_two_of_them_in_view(small_set, small_scene, stcal_sfm, board, what):

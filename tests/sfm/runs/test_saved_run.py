@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_target
+from stcal.errors import InputError
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run, uncertainty_budget
 from stcal.sfm.adjust.faces_file import read_target
@@ -155,21 +156,14 @@ def edit(path, change) -> None:
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def faces_of(own_run) -> tuple:
-    return "faces", own_run / "colmap/models", "--run", own_run
-
-
 NEEDED = [CAMERA, TARGET, BOARD, "labels.csv", DATABASE, "report.json", "faces.json"]
 
 
 @pytest.mark.parametrize("name", NEEDED)
-def test_a_file_is_missing(own_run, stcal_sfm, name):
+def test_a_file_is_missing(own_run, name):
     (own_run / name).unlink()
-    outcome = stcal_sfm(*faces_of(own_run))
-    if name == "faces.json":
-        assert_error(outcome, INPUT, "E-RUN-NO-FACES", f"{own_run}", "faces.json")
-    else:
-        assert_error(outcome, INPUT, "E-RUN-UNFINISHED", f"{own_run}", f"{name}")
+    code = "E-RUN-NO-FACES" if name == "faces.json" else "E-RUN-UNFINISHED"
+    refuses(f"{code} … {own_run} … {name}", load_run, own_run)
 
 
 def test_not_a_run(own_run, tmp_path, stcal_sfm):
@@ -187,10 +181,12 @@ def test_a_folder_of_detections_only(small_set, stcal_sfm):
 
 
 @pytest.mark.parametrize("name", [".stcal/run.json", "report.json", "faces.json"])
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b'"text"'])
-def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
+@pytest.mark.parametrize(
+    ("content", "code"), [(b"", "INVALID"), (b"[1]", "CONTENT"), (b"\xff\xfe", "INVALID"), (b"[" * 100_000, "INVALID")]
+)
+def test_a_file_that_is_no_json_object(own_run, name, content, code):
     (own_run / name).write_bytes(content)
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, str(own_run / name), "run it again")
+    refuses(f"E-JSON-{code} … {own_run / name} … run it again", load_run, own_run)
 
 
 WRONG = {
@@ -227,11 +223,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_value_that_no_run_writes(own_run, stcal_sfm, case):
+def test_a_value_that_no_run_writes(own_run, case):
     name, change, part = WRONG[case]
     edit(own_run / name, change)
-    parts = (f"{own_run / name}: damaged, or of another version", part, "run it again")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
+    refuses(f"E-RUN-DAMAGED … {own_run / name}: damaged, or of another version … {part}", load_run, own_run)
 
 
 def rows(change):
@@ -272,11 +267,10 @@ LABELS = {
 
 
 @pytest.mark.parametrize("case", LABELS)
-def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
+def test_labels_that_are_not_the_database_s(own_run, case):
     spoil, part = LABELS[case]
     spoil(own_run / "labels.csv")
-    parts = (f"{own_run / 'labels.csv'}: damaged, or of another version (", part, "run it again")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
+    refuses(f"E-RUN-DAMAGED … {own_run / 'labels.csv'}: damaged, or of another version ( … {part}", load_run, own_run)
 
 
 @pytest.mark.parametrize(
@@ -287,9 +281,10 @@ def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
         (BOARD, "rows", "not valid TOML"),
     ],
 )
-def test_a_damaged_copy_of_what_the_run_was_given(own_run, stcal_sfm, name, content, part):
+def test_a_damaged_copy_of_what_the_run_was_given(own_run, name, content, part):
     (own_run / name).write_text(content, encoding="utf-8")
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, f"file {own_run / name}: ", part)
+    with pytest.raises(InputError, match=f"file {own_run / name}: .*{part}"):
+        load_run(own_run)
 
 
 def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
@@ -308,9 +303,9 @@ def nudge(path):
 
 
 @pytest.mark.parametrize("name", ["labels.csv", "faces.json", "report.json", CAMERA, TARGET, ".stcal/run.json"])
-def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
+def test_a_file_with_another_digit_is_refused(own_run, name):
     nudge(own_run / name)
-    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-CHANGED", str(own_run / name), "run it again")
+    refuses(f"E-RUN-CHANGED … {own_run / name} … run it again", load_run, own_run)
     if name == "faces.json":  # also what reads it alone
         refuses("E-RUN-CHANGED", read_target, own_run / name, own_run / TARGET)
 

@@ -13,6 +13,7 @@ from stcal.labels import DotLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.joint import adjusted
+from stcal.sfm.adjust.refine import eccentricity_px, refine
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
@@ -102,8 +103,6 @@ def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
 
 def test_the_redundancy_of_a_free_network(scene, labels_only):
     """Residuals with the stated σ give a factor of 1 within the spread of χ² (about 900 degrees of freedom a group)."""
-    from stcal.sfm.adjust.refine import refine
-
     observed = labels_only.observations(scene, 0.005, np.random.default_rng(5))
     models = [refine(m, scene.camera, scene.target, scene.board).model for m in labels_only.models(scene, observed)]
     assert image_sigma_factors(models, scene.camera).all == pytest.approx(1.0, abs=0.05)
@@ -129,17 +128,14 @@ def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only)
     observed = labels_only.observations(scene, 0.005, np.random.default_rng(6))
     chained, _ = labels_only.calibrate(scene, 0.005, 6, "chain")
     radius = scene.target.radius_of() | scene.board.radius_of()
-    from stcal.sfm.adjust.refine import eccentricity_px
-
     results = []
     for factor in (0.5, 0.25):
         board = replace(scene.board, sigma_mm=factor * scene.board.sigma_mm)
-        models = [
-            with_sigma(
-                replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)), SigmaFactors(factor, factor, factor)
-            )
+        shifted = [
+            replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0))
             for m in labels_only.models(scene, observed)
         ]
+        models = [with_sigma(m, SigmaFactors(factor, factor, factor)) for m in shifted]
         joint = adjusted(models, board, scene.camera).result()
         results.append((joint.sigma0, calibrated_target(joint, chained, scene.target, "plane").face_covariance["3"]))
         # Six free directions, and no more: the rank of the datum of smallest trace.
