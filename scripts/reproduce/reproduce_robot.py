@@ -16,7 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import head, options_of, row
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
@@ -300,9 +300,8 @@ def verified(targets: Targets, reached: dict[str, tuple[np.ndarray, np.ndarray]]
     rows = np.concatenate([rows for rows, _ in reached.values()])
     sets = tuple(name for name, (own, _) in reached.items() for _ in own)
     xyz = np.concatenate([xyz for _, xyz in reached.values()])
-    data = MeasuredPoses(
-        "commanded", range(len(rows)), sets, tuple(map(str, rows)), targets.poses.translation[rows], xyz
-    )
+    wanted = tuple(map(str, rows)), targets.poses.translation[rows]
+    data = MeasuredPoses("commanded", range(len(rows)), sets, *wanted, xyz)
     return {each.name: each for each in verify(data).sets}
 
 
@@ -313,8 +312,8 @@ def figures(draws: list[Draw], kind: str, model: str) -> np.ndarray:
 
 def print_table(draws: list[Draw]) -> None:
     """Markdown; beside the published figures ours, means over the draws."""
-    print("| 51 positions | model | mean, mm | std, mm | max, mm | mean reduced by | worst arm | max by |")
-    print("|---|---|---|---|---|---|---|---|")
+    reduced = "mean reduced by", "worst arm", "max by"
+    head("51 positions", "model", "mean, mm", "std, mm", "max, mm", *reduced)
     cells = [f"{before:.4f} → {after:.4f}" for before, after in PUBLISHED.values()]
     mean, most = (f"{100 * (1 - PUBLISHED[key][1] / PUBLISHED[key][0]):.0f} %" for key in ("mean", "max"))
     print(f"| published, by laser tracker | {CMMK} | {' | '.join(cells)} | {mean} | | {most} |")
@@ -324,8 +323,8 @@ def print_table(draws: list[Draw]) -> None:
             after = figures(draws, kind, model)
             cells = [f"{b:.4f} → {a:.4f}" for b, a in zip(before.mean(0), after.mean(0), strict=True)]
             gain = 100 * (1 - after / before)
-            spread = f"{gain[:, 0].mean():.1f} ± {gain[:, 0].std(ddof=1):.1f} % | {gain[:, 0].min():.1f} %"
-            print(f"| {kind} | {model} | {' | '.join(cells)} | {spread} | {gain[:, 2].mean():.1f} % |")
+            reduced = f"{gain[:, 0].mean():.1f} ± {gain[:, 0].std(ddof=1):.1f} %", f"{gain[:, 0].min():.1f} %"
+            row(kind, model, *cells, *reduced, f"{gain[:, 2].mean():.1f} %")
 
 
 @one_thread()

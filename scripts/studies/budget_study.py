@@ -107,10 +107,10 @@ def single_inputs(seed: int, count: int) -> np.ndarray:
 
 
 def drawn(
-    case: Case, which: str, single: np.ndarray, rng: np.random.Generator
+    case: Case, which: str, single: np.ndarray, rng: np.random.Generator, common: float = ONE_PLATE
 ) -> tuple[list[MetricModel], dict[CircleLabel, np.ndarray]]:
     """Models as photographed in a simulated calibration, with their true circles (at the reference temperature) by
-    label; ``single`` : of :func:`single_inputs`."""
+    label; ``single`` : of :func:`single_inputs`; ``common`` : share of the board's variance that all groups have."""
     on = set(ALONE) if which == ALL else {which}
     unit = dict(zip(SINGLE, single, strict=False))
     off = {key: unit[key] if key in on else 0.0 for key in SINGLE}
@@ -130,7 +130,7 @@ def drawn(
             normal = case.scene.target_from_face[label.face].rotation[:, 2]
             circles[label] = circles[label] + case.flatness_mm * rng.standard_normal() * normal
     dots = case.scene.board.labels()
-    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - ONE_PLATE, ONE_PLATE))
+    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - common, common))
     plate = plate * rng.standard_normal((len(dots), 3))
     radius = case.scene.target.radius_of() | case.scene.board.radius_of()
     models = []
@@ -182,10 +182,12 @@ def stated_by(case: Case) -> Stated:
     return Stated(factors, found.joint.board_common, rows)
 
 
-def errors(case: Case, stated: Stated, which: str, single: np.ndarray, seed: int) -> list[np.ndarray]:
+def errors(
+    case: Case, stated: Stated, which: str, single: np.ndarray, seed: int, common: float = ONE_PLATE
+) -> list[np.ndarray]:
     """Error (r,) of each measurand of the budget in one simulated calibration, mm and rad; arguments as of
     :func:`drawn`."""
-    models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]))
+    models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]), common)
     if which == ALL:
         joint = whole(case, models)[0]
     else:
@@ -195,7 +197,7 @@ def errors(case: Case, stated: Stated, which: str, single: np.ndarray, seed: int
     true = np.array([circles[label] for label in joint.labels])
     xyz = joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction)
     away = align_rigid(true, xyz) @ xyz - true  # moved as one: derivatives are for small moves
-    return [row.measurand.jacobian @ away.ravel() for row in stated.budget.rows]
+    return [each.measurand.jacobian @ away.ravel() for each in stated.budget.rows]
 
 
 def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float, float], float, float]:
@@ -204,13 +206,13 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
     stated, inputs = stated_by(case), list(single_inputs(1, count))
     rows = list(pool(errors, [case] * count, [stated] * count, [which] * count, inputs, range(count)))
     shares, inside = [], []
-    for k, row in enumerate(stated.budget.rows):
+    for k, own in enumerate(stated.budget.rows):
         length = np.array([np.linalg.norm(each[k]) for each in rows])
-        predicted = row.standard if which == ALL else row.contributions[which]
-        inside.append((length <= row.expanded).mean())
-        if predicted > LEAST * row.standard:
+        predicted = own.standard if which == ALL else own.contributions[which]
+        inside.append((length <= own.expanded).mean())
+        if predicted > LEAST * own.standard:
             shares.append((length**2).mean() / predicted**2)
-    expected = np.mean([row.coverage for row in stated.budget.rows])
+    expected = np.mean([own.coverage for own in stated.budget.rows])
     single = 1 / np.sqrt(shares)
     return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import head, row
 from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import fit_lens
@@ -91,11 +92,8 @@ def held(form: str, folder: Path) -> list[str]:
             lost.update(made.lost)
         if (read.width, read.height) != (WIDTH, HEIGHT):
             lost.add("the image's size")
-    return [
-        "all" if back == list(LENSES) else "; ".join(back),
-        "; ".join(refused) or "–",
-        "; ".join(sorted(lost)) or "–",
-    ]
+    exactly = "all" if back == list(LENSES) else "; ".join(back)
+    return [exactly, "; ".join(refused) or "–", "; ".join(sorted(lost)) or "–"]
 
 
 def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
@@ -111,36 +109,33 @@ def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
 
 def main() -> None:
     warnings.simplefilter("ignore", InputNote)
-    print("| `--form` | read back exactly | refused | lost |")
-    print("|---|---|---|---|")
+    head("`--form`", "read back exactly", "refused", "lost")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         for form in WRITERS:
-            print(f"| `{form}` | {' | '.join(held(form, folder))} |")
-        print("\n| program | lens | fitted | px RMS | px at most | turned |")
-        print("|---|---|---|---|---|---|")
+            row(f"`{form}`", *held(form, folder))
+        print()
+        head("program", "lens", "fitted", "px RMS", "px at most", "turned")
         for (program, name), text in TRIED.items():
             (folder / "camera").write_text(text.format(WIDTH, HEIGHT))
             lens = read_lens(folder / "camera")
             assert isinstance(lens, ForeignLens)
             found = fit_lens(lens, WIDTH, HEIGHT)
             turn = np.degrees(found.camera_from_lens.angle_rad())
-            figures = f"{found.rms_px:.4f} | {found.most_px:.3f} | {f'{turn:.2f}°' if turn else '–'}"
-            print(f"| {program} | {name} | {found.camera.colmap_model} | {figures} |")
-        print("\n| written by | read as | px off at most |")
-        print("|---|---|---|")
+            figures = f"{found.rms_px:.4f}", f"{found.most_px:.3f}", f"{turn:.2f}°" if turn else "–"
+            row(program, name, found.camera.colmap_model, *figures)
+        print()
+        head("written by", "read as", "px off at most")
         for program, (text, wanted) in camera_files.FILES.items():
             (folder / "camera").write_text(text)
-            print(f"| {program} | {read_as(folder / 'camera', '', camera_files.RAYS, wanted)} |")
+            row(program, read_as(folder / "camera", "", camera_files.RAYS, wanted))
     if len(sys.argv) < 2:
         return
-    print("\n| reported file | read as | px off at most |")
-    print("|---|---|---|")
+    print()
+    head("reported file", "read as", "px off at most")
     for (place, name), wanted in reported_cameras.CASES.items():
-        chosen = f" {name}" if name else ""
-        print(f"| {place}{chosen} | {read_as(Path(sys.argv[1]) / place, name, reported_cameras.RAYS, wanted())} |")
-    for (place, _), why in reported_cameras.REFUSED.items():
-        print(f"| {place} | refused: {why.split(' … ')[0]} | – |")
+        own = read_as(Path(sys.argv[1]) / place, name, reported_cameras.RAYS, wanted())
+        row(f"{place} {name}".strip(), own)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ already are not run again: a study that was stopped goes on. The seed and the ca
 `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
 
-import argparse
 import json
 import os
 import signal
@@ -42,7 +41,7 @@ SHOWN = 600
 """Characters of a failure."""
 
 
-def names_of(arguments: argparse.Namespace) -> list[str]:
+def names_of(arguments) -> list[str]:
     """Cases: each call on good data, mistakes, every option with every odd value, and those that are drawn."""
     if arguments.only:
         return [arguments.only]
@@ -93,19 +92,10 @@ def summary(found: list[Judged], seed: int) -> str:
 
 def main() -> None:
     """Run; print."""
-    arguments = options_of(
-        __doc__,
-        count=1000,
-        seed=1,
-        kills=20,
-        kept=60,
-        closed=20,
-        drawn_only=False,
-        json=Path,
-        only="",
-        no_mistakes=False,
-        workers=os.cpu_count() or 1,
-    )
+    counts = {"count": 1000, "kills": 20, "kept": 60, "closed": 20}
+    switches = {"drawn_only": False, "no_mistakes": False}
+    workers = os.cpu_count() or 1
+    arguments = options_of(__doc__, **counts, **switches, seed=1, json=Path, only="", workers=workers)
     missing = set(COMMANDS) - {call.command for call in CALLS}
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
-from scripts.runner import options_of
+from scripts.runner import head, options_of, row
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
@@ -61,12 +61,11 @@ def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> t
 def print_cameras(pool, trials: int, only: str) -> None:
     """The table of camera files that are off."""
     print(f"\n{POSES_OFF} poses, σ estimated:\n")
-    print("| method | setup | noise | camera off | calibration | RMS error, mm |\n|---|---|---|---|---|---|")
+    head("method", "setup", "noise", "camera off", "calibration", "RMS error, mm")
     for case in product([name for name in CAMERAS if name.startswith(only)], SETUPS, NOISES, OFF):
         found = np.array(list(pool.map(partial(camera_trial, *case), range(trials), chunksize=10)))
         ratio, rms = np.sqrt(found.mean(0) / [6, 1])
-        method, setup, noise, off = case
-        print(f"| {method} | {setup} | {noise} | {off:g} σ | {ratio:.3f} | {rms:.3g} |", flush=True)
+        row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")
 
 
 @one_thread()
