@@ -1,7 +1,9 @@
 """What studies share: options, each stated by its default, tables, the shared data, and errors of faces."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +43,19 @@ def options_of(doc: str | None, places: Mapping[str, object] | None = None, **de
             kind |= {"default": default} | ({"nargs": "?"} if name in places else {})
         parser.add_argument(*words, **kind)
     return parser.parse_args()
+
+
+@contextmanager
+def executor_of(scheduler: str | None = None) -> Iterator[Executor]:
+    """Yields the workers of the Dask cluster at an address, or processes of this machine, one per core."""
+    if scheduler is None:
+        with ProcessPoolExecutor() as pool:
+            yield pool
+        return
+    from stcal.workflows.cluster import connected
+
+    with connected(scheduler) as client:
+        yield client.get_executor(pure=False)
 
 
 def head(*names: str) -> None:

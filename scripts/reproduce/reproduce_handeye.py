@@ -16,7 +16,7 @@ without and with polishing; what λ = 1 means with lengths in m, cm and mm; the 
 
 import numpy as np
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
@@ -24,7 +24,6 @@ from stcal.handeye.data.pose_pairs import Loop, Motions
 from stcal.handeye.handeye_problem import UNIT_MM, HandEyeProblem
 from stcal.handeye.methods.closed_form import Bounds, EvolutionOptions, Objective, evolve, polish
 from stcal.parallel import one_thread
-from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views
 
 POSES, FITTED = 25, 18

@@ -16,7 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
@@ -35,7 +35,6 @@ from stcal.robot.use.evaluation import MeasuredPoses, SetResult, verify
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 from tests.support.image_poses import KnownTarget, known_target, pose_error, see
 
 PUBLISHED = {"mean": (0.6493, 0.4742), "std": (0.5596, 0.2967), "max": (2.1259, 1.3311)}

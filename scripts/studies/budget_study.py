@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import norm
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
@@ -38,7 +38,6 @@ from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 GROUPS = ("1", "2"), ("1", "4"), ("1", "5")
 NOISE_PX = 0.02

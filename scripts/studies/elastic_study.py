@@ -24,7 +24,7 @@ from functools import partial
 
 import numpy as np
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
@@ -34,7 +34,6 @@ from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, elastic, two_arms
 
 NEW_POSES = 50

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
@@ -22,7 +22,6 @@ from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.parallel import one_thread
-from stcal.workflows.cluster import executor_of
 from tests.support.handeye import CAMERA, simulated_views
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, options_of
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
@@ -26,7 +26,6 @@ from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, two_arms
 
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4

@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from scripts.runner import face_errors, options_of, row
+from scripts.runner import executor_of, face_errors, options_of, row
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
@@ -23,7 +23,6 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import face_errors, normalised, options_of
+from scripts.runner import executor_of, face_errors, normalised, options_of
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
@@ -22,7 +22,6 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 NOISE_PX = 0.02
 CAMERA_SIGMA = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])

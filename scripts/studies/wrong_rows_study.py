@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, options_of, row
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, observed, residuals, tips
@@ -22,7 +22,6 @@ from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 
 NEW_POSES = 50
 MIXED = (1.0, 50.0)

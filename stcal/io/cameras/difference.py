@@ -208,23 +208,21 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
     """Return the supported camera model that is nearest to a lens over an image of this size, px."""
     rays, pixels, share = _rays(lens, width, height)
-    straight = _best(lens, rays, pixels, share, (width, height), False)
+
+    def best(turn: bool) -> FittedLens:
+        fits = []
+        for model in CANDIDATES:
+            camera, from_lens = _fitted(model, rays, pixels, lens, (width, height), turn)
+            off = np.linalg.norm(camera.project(from_lens @ rays) - pixels, axis=1)
+            if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
+                fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, from_lens))
+        return fits[-1]
+
+    straight = best(turn=False)
     if straight.most_px <= GOOD_PX:
         return straight
-    turned = _best(lens, rays, pixels, share, (width, height), True)
+    turned = best(turn=True)
     return turned if turned.rms_px < TURN_HELPS * straight.rms_px else straight
-
-
-def _best(
-    lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
-) -> FittedLens:
-    fits = []
-    for model in CANDIDATES:
-        camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)
-        off = np.linalg.norm(camera.project(camera_from_lens @ rays) - pixels, axis=1)
-        if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
-            fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, camera_from_lens))
-    return fits[-1]
 
 
 def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, float]:
