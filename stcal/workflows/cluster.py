@@ -57,10 +57,7 @@ def connected(address: str) -> Iterator[Any]:
         except OSError as error:
             none = f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
             raise InputError("E-CLUSTER-WORKERS", none) from error
-        for worker, theirs in client.run(versions).items():  # type: ignore[arg-type]
-            if theirs != versions():
-                differ = f"worker {worker} has {theirs}, here {versions()}; results would differ"
-                raise InputError("E-CLUSTER-VERSIONS", f"--scheduler {address}: {differ}; install the same versions")
+        _require_same(client.run(versions), address)  # type: ignore[arg-type]
         client.register_worker_callbacks(_limit_threads)
         yield client
 
@@ -94,6 +91,13 @@ def versions() -> str:
         except metadata.PackageNotFoundError:
             found.append(f"{name} none")
     return ", ".join(found)
+
+
+def _require_same(found: dict[str, str], address: str) -> None:
+    for worker, theirs in found.items():
+        if theirs != versions():
+            differ = f"worker {worker} has {theirs}, here {versions()}; results would differ"
+            raise InputError("E-CLUSTER-VERSIONS", f"--scheduler {address}: {differ}; install the same versions")
 
 
 def _limit_threads() -> None:
