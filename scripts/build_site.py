@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from scripts.runner import ROOT, options_of
+from scripts.runner import ROOT, script
 
 try:
     from sphinx.cmd.build import build_main
@@ -177,9 +177,6 @@ def build(out: Path, say: Callable[[str], None] = print) -> None:
     say(f"{len(list(out.rglob('*.html')))} pages: {out / 'index.html'}")
 
 
-def main() -> None:
-    build(options_of(__doc__, out=ROOT / "build" / "site").out.resolve())
-
-
-if __name__ == "__main__":
-    main()
+@script(out=ROOT / "build" / "site")
+def main(given) -> None:
+    build(given.out.resolve())

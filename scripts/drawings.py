@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import ROOT, face_errors, options_of
+from scripts.runner import ROOT, face_errors, script
 from stcal.design import reference_board, reference_target
 from stcal.geometry.plane import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
@@ -183,14 +183,9 @@ def folders() -> Drawing:
 DRAWINGS: dict[str, Callable] = {d.__name__: d for d in (eccentricity, residuals, chain, folders)}
 
 
-def main() -> None:
-    """Draw those that are named, or all."""
-    arguments = options_of(__doc__, {"names": list(DRAWINGS)}, out=ROOT / "docs" / "pictures")
+@script({"names": list(DRAWINGS)}, out=ROOT / "docs" / "pictures")
+def main(arguments) -> None:
     for name in arguments.names:
         path = arguments.out / f"{name}.svg"
         save(DRAWINGS[name](), path)
         print(path)
-
-
-if __name__ == "__main__":
-    main()

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from scripts.runner import ROOT, SAMPLE, options_of
+from scripts.runner import ROOT, SAMPLE, script
 from stcal.sfm import run
 
 FOUND_IN = "12/IMG_1001.jpg"
@@ -126,8 +126,8 @@ def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> N
 PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report, "box": box, "cube": cube}
 
 
-def main() -> None:
-    arguments = options_of(__doc__, {"names": list(PICTURES)}, out=ROOT / "docs" / "pictures")
+@script({"names": list(PICTURES)}, out=ROOT / "docs" / "pictures")
+def main(arguments) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result"
@@ -135,7 +135,3 @@ def main() -> None:
             run(SAMPLE / "images", SAMPLE / "cameras.txt", result)
         for name in arguments.names:
             PICTURES[name](result, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,8 @@
-"""What studies share: options, each stated by its default, tables, the shared data, and errors of faces."""
+"""What scripts share: options, each stated by its default, tables, the shared data, and errors of faces."""
 
 import argparse
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,6 +44,18 @@ def options_of(doc: str | None, places: Mapping[str, object] | None = None, **de
             kind |= {"default": default} | ({"nargs": "?"} if name in places else {})
         parser.add_argument(*words, **kind)
     return parser.parse_args()
+
+
+def script(places: Mapping[str, object] | None = None, **defaults) -> Callable[[Callable], Callable]:
+    """Decorates the main function, which is the last of its file: where this is run, calls it with its options, those
+    of :func:`options_of`."""
+
+    def decorated(main: Callable) -> Callable:
+        if main.__module__ == "__main__":
+            main(options_of(sys.modules["__main__"].__doc__, places, **defaults))
+        return main
+
+    return decorated
 
 
 @contextmanager

@@ -16,7 +16,7 @@ without and with polishing; what λ = 1 means with lengths in m, cm and mm; the 
 
 import numpy as np
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
@@ -123,15 +123,10 @@ def median_worst(values: np.ndarray) -> str:
     return f"{np.median(values):.3f} ({values.max():.3g})"
 
 
+@script(seeds=100, scheduler=str)
 @one_thread()
-def main() -> None:
-    """Run the seeds; print."""
-    arguments = options_of(__doc__, seeds=100, scheduler=str)
+def main(arguments) -> None:
     with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))
     print(f"{arguments.seeds} seeds, simulated; {FITTED} motions to solve with, {POSES - 1 - FITTED} held out")
     print_tables(trials)
-
-
-if __name__ == "__main__":
-    main()

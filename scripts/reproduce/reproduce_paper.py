@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import face_errors, head, options_of, row
+from scripts.runner import face_errors, head, row, script
 from stcal.errors import StcalError
 from stcal.geometry.rigid import align_rigid
 from stcal.labels import dot_cells
@@ -129,10 +129,9 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
         row(face, f"{um:.2f} ({goal_um:g})", f"{sigma:.2f}", f"{mdeg:.2f} ({goal_mdeg or '–'})")
 
 
+@script(trials=5, width=5184, keep=Path)
 @one_thread()
-def main() -> None:
-    """Run the trials; print."""
-    arguments = options_of(__doc__, trials=5, width=5184, keep=Path)
+def main(arguments) -> None:
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(1, arguments.trials + 1):
@@ -142,7 +141,3 @@ def main() -> None:
             print(f"trial {seed} of {arguments.trials} done", flush=True)
     print(f"\nSimulated photographs, {arguments.width} px wide, 10 a group, board σ 5 µm")
     print_tables(trials)
-
-
-if __name__ == "__main__":
-    main()

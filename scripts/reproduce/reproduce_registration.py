@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import comb
 
-from scripts.runner import options_of, row
+from scripts.runner import row, script
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
@@ -183,15 +183,10 @@ def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
         print(f"{comb(good, 3, exact=True) / comb(POINTS, 3, exact=True):.2g}")
 
 
+@script(trials=6)
 @one_thread()
-def main() -> None:
-    """Run the trials; print."""
-    arguments = options_of(__doc__, trials=6)
+def main(arguments) -> None:
     robots = f"{arguments.trials} robots as made, wrong points off by {OFF_MM[0]:g} to {OFF_MM[1]:g} mm"
     print(f"Simulated: {POINTS} points in a cube of {SMALL:.0f} mm, {SIGMA_MM} mm noise, {robots}")
     trials = {case: [trial(seed, case) for seed in range(arguments.trials)] for case in CASES}
     print_table(trials)
-
-
-if __name__ == "__main__":
-    main()

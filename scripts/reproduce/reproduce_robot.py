@@ -16,7 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
@@ -326,10 +326,9 @@ def print_table(draws: list[Draw]) -> None:
             row(kind, model, *cells, *reduced, f"{gain[:, 2].mean():.1f} %")
 
 
+@script(draws=100, seed=0, gears=0.0, scheduler=str)
 @one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, draws=100, seed=0, gears=0.0, scheduler=str)
+def main(given) -> None:
     start = time.perf_counter()
     sweeps()  # once, before the processes part
     for kind in (FAR, NEAR):
@@ -353,7 +352,3 @@ def main() -> None:
         f"with the poses taken as independent {untold:.1f}."
     )
     print(f"\n{time.perf_counter() - start:.0f} s")
-
-
-if __name__ == "__main__":
-    main()

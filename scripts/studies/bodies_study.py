@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import head, options_of, row
+from scripts.runner import head, row, script
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
@@ -70,9 +70,8 @@ def draw(name: str, seed: int) -> list[FaceErrors] | str:
             return str(error)
 
 
-def main() -> None:
-    """Print the table."""
-    arguments = options_of(__doc__, draws=10, body="")
+@script(draws=10, body="")
+def main(arguments) -> None:
     head("body", "draws", "faces found", "error of a position, µm RMS", "of a rotation, mdeg RMS", "NEES")
     names = [name for name in BODIES if arguments.body in f"{name}, {BODIES[name][0].name}"]
     seeds = range(arguments.draws)
@@ -95,7 +94,3 @@ def main() -> None:
         counts = f"{arguments.draws - lost} of {arguments.draws}", len(faces), len(BODIES[name][0].faces)
         found = f"{counts[1]} of {counts[2] * arguments.draws}"
         row(name, counts[0], found, f"{position:.0f}", f"{rotation:.0f}", f"{sigmas**2:.2f}")
-
-
-if __name__ == "__main__":
-    main()

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import norm
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
@@ -216,10 +216,9 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
     return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 
 
+@script(runs=200, only="", scheduler=str)
 @one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, runs=200, only="", scheduler=str)
+def main(given) -> None:
     fixed, refined = case_of(False), case_of(True)
     said = f"3 groups of 6 images, 2592×1728 px, {NOISE_PX} px (simulated centres)"
     print(f"{given.runs} simulated calibrations a row, {said}\n")
@@ -232,7 +231,3 @@ def main() -> None:
                 ratio, *covered = study(case, which, given.runs, pool.map)
                 covered = [f"{100 * share:.1f}" if which == ALL else "–" for share in covered]
                 row(title, *(f"{each:.3f}" for each in ratio), *covered)
-
-
-if __name__ == "__main__":
-    main()

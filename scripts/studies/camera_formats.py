@@ -4,14 +4,13 @@ fitted, and their files compared with OpenCV's projection, or the programs' form
 .venv/bin/python scripts/studies/camera_formats.py [../shared/cases]
 """
 
-import sys
 import tempfile
 import warnings
 from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import head, row
+from scripts.runner import head, row, script
 from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import fit_lens
@@ -107,7 +106,8 @@ def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
     return f"{called} | {f'{off:.2g}' if off > EXACT_PX else 'less than 1e-9'}"
 
 
-def main() -> None:
+@script({"cases": ""})
+def main(given) -> None:
     warnings.simplefilter("ignore", InputNote)
     head("`--form`", "read back exactly", "refused", "lost")
     with tempfile.TemporaryDirectory() as scratch:
@@ -129,14 +129,10 @@ def main() -> None:
         for program, (text, wanted) in camera_files.FILES.items():
             (folder / "camera").write_text(text)
             row(program, read_as(folder / "camera", "", camera_files.RAYS, wanted))
-    if len(sys.argv) < 2:
+    if not given.cases:
         return
     print()
     head("reported file", "read as", "px off at most")
     for (place, name), wanted in reported_cameras.CASES.items():
-        own = read_as(Path(sys.argv[1]) / place, name, reported_cameras.RAYS, wanted())
+        own = read_as(Path(given.cases) / place, name, reported_cameras.RAYS, wanted())
         row(f"{place} {name}".strip(), own)
-
-
-if __name__ == "__main__":
-    main()

@@ -25,7 +25,7 @@ import pycolmap
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import DATA, head, options_of
+from scripts.runner import DATA, head, script
 from scripts.runner import row as print_row
 from stcal.boards.board_file import board_of
 from stcal.boards.target_file import target_of
@@ -228,9 +228,8 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> None:
     print_row(name, len(trials), *cells)
 
 
-def main() -> None:
-    """Simulate, calibrate, print."""
-    options = options_of(__doc__, trials=60)
+@script(trials=60)
+def main(options) -> None:
     head("px RMS over the image (where dots are)", "trials", *COLUMNS)
     peers = WAYS | {FREE: by_free_mrcal}
     for name, (board, sigma_mm, bow_mm) in boards().items():
@@ -251,7 +250,3 @@ def main() -> None:
         ways |= {"stcal": own, TARGET: with_the_target(folder, own, (target_file, board_file))}
         trial = {way: errors(camera, truth, found.views) for way, camera in ways.items()}
         row(f"rendered {name}, {len(found.views)} views", [trial])
-
-
-if __name__ == "__main__":
-    main()

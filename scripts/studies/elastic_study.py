@@ -24,7 +24,7 @@ from functools import partial
 
 import numpy as np
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
@@ -194,10 +194,14 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
 
+def nees(each: np.ndarray) -> str:
+    """Of draws (d,)."""
+    return f"{each.mean():.2f} ± {each.std() / np.sqrt(len(each)):.2f}"
+
+
+@script(draws=200, only="", scheduler=str, payload=False, trees=False, approach=False)
 @one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    arguments = options_of(__doc__, draws=200, only="", scheduler=str, payload=False, trees=False, approach=False)
+def main(arguments) -> None:
     print(f"{arguments.draws} draws each, simulated\n")
     if arguments.payload:
         head("observed", "rows", "payloads, kg", "unknown, mm", "known, mm", "bound", "NEES", "axis")
@@ -213,12 +217,3 @@ def main() -> None:
             figures = (f"{value:.3f}" for value in rms[:-1])
             squared = np.transpose(np.reshape(normal, (arguments.draws, -1)))
             row(case.title(), *map(sum, taken), *figures, f"{rms[1] / rms[-1]:.2f}", *map(nees, squared))
-
-
-def nees(each: np.ndarray) -> str:
-    """Of draws (d,)."""
-    return f"{each.mean():.2f} ± {each.std() / np.sqrt(len(each)):.2f}"
-
-
-if __name__ == "__main__":
-    main()

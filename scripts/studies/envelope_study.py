@@ -29,7 +29,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scripts.runner import SAMPLE, face_errors, normalised, options_of
+from scripts.runner import SAMPLE, face_errors, normalised, script
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
@@ -597,8 +597,8 @@ def line_of(row: dict) -> str:
     return text + ("  SILENT" if silent(row) else "")
 
 
-def main() -> None:
-    given = options_of(__doc__, sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+@script(sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+def main(given) -> None:
     done = json.loads(given.json.read_text()) if given.json and given.json.exists() else []
     known = {(r["set"], r["kind"], r["strength"]): r for r in done}
     print(f"{'':40}{'circ %':>6} {'dots %':>6} {'wrong':>5} face {'µm':>7} {'σ':>6} {'bad':>4}", flush=True)
@@ -621,7 +621,3 @@ def main() -> None:
     print(f"{len(ended)} runs ended, {len(inside)} of them within the goals (*: beyond them)")
     print(f"faces lost in {sum(r['faces'] < r['of'] for r in rows if 'error' not in r)} runs")
     print(f"{share(rows, 'found', 'must')} % of circles, {share(rows, 'dots', 'must_dots')} % of dots found")
-
-
-if __name__ == "__main__":
-    main()

@@ -21,7 +21,7 @@ from real_bodies import pycamset_cube
 from same_results import CHARUCO, prepare, robot_table
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import DATA, head, options_of
+from scripts.runner import DATA, head, script
 from scripts.runner import row as print_row
 from stcal.boards.board_designs import ChessboardDesign
 from stcal.boards.board_file import load_flat_board
@@ -260,9 +260,8 @@ def of_simulated(draws: int) -> None:
         row(kind, table, f"{np.mean(larger):.2f}")
 
 
-def main() -> None:
-    """Print the tables."""
-    arguments = options_of(__doc__, part="all", draws=20)
+@script(part="all", draws=20)
+def main(arguments) -> None:
     for part, needed, print_part in (
         ("cameras", ".", of_cameras),
         ("bodies", "real/pycamset_cube", of_bodies),
@@ -271,7 +270,3 @@ def main() -> None:
     ):
         if arguments.part in ("all", part) and (DATA / needed).is_dir():
             print_part(arguments.draws)
-
-
-if __name__ == "__main__":
-    main()

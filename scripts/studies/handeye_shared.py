@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, head, options_of, row
+from scripts.runner import DATA, head, row, script
 from scripts.studies.same_results import CHARUCO, DOTS, robot_table
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
@@ -95,9 +95,9 @@ def _compare(found: dict) -> None:
     print(f"  {found['method']} worse than park-martin on {(ours >= park).sum()} of {len(ours)} splits")
 
 
-def main() -> None:
-    """Both data sets."""
-    data = options_of(__doc__, {"data": DATA}).data
+@script({"data": DATA})
+def main(given) -> None:
+    data = given.data
     for name in ("charuco_handeye", "dotgrid_handeye"):
         if not (data / name).is_dir():
             sys.exit(f"error: {data / name} is missing; give the folder that holds it")
@@ -117,7 +117,3 @@ def main() -> None:
         board = found["board"]
         sigma = board["scale_sigma"] * board["pitch_mm"] / board["scale"]
         print(f"pitch found: {board['pitch_mm']:.2f} ± {sigma:.2f} mm; 20 mm on the label, 25.4 mm in target.yaml")
-
-
-if __name__ == "__main__":
-    main()

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
@@ -67,15 +67,10 @@ def print_cameras(pool, trials: int, only: str) -> None:
         row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")
 
 
+@script(trials=500, only="", scheduler=str)
 @one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    given = options_of(__doc__, trials=500, only="", scheduler=str)
+def main(given) -> None:
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * given.trials) / (6 * given.trials))
     print(f"{given.trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")
     with executor_of(given.scheduler) as pool:
         print_cameras(pool, given.trials, given.only)
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scripts.runner import executor_of, options_of
+from scripts.runner import executor_of, script
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
@@ -176,9 +176,9 @@ def without_noise(case: Case, true: Robot, count: int, rng: np.random.Generator,
     return observed(replace(data, positions=None, rotations=None, distances=apart, from_row=start))
 
 
+@script(draws=200, only="", scheduler=str)
 @one_thread()
-def main() -> None:
-    given = options_of(__doc__, draws=200, only="", scheduler=str)
+def main(given) -> None:
     draws = given.draws
     began = time.perf_counter()
     print(f"simulated arms, {draws} draws: eᵀC⁻¹e over its degrees of freedom, expected 1")
@@ -191,7 +191,3 @@ def main() -> None:
             )
             print(f"{case.title():<28}{case.rows:>6}  {case.sigma:<12}{cells}", flush=True)
     print(f"{time.perf_counter() - began:.0f} s")
-
-
-if __name__ == "__main__":
-    main()

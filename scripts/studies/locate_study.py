@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import DATA, head, options_of, row
+from scripts.runner import DATA, head, row, script
 from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 from stcal.geometry.camera import Camera
@@ -158,14 +158,10 @@ def _drawn_sheet() -> tuple[np.ndarray, np.ndarray]:
     return sheet, np.array([[scale, 0, -scale * first[0] - half], [0, scale, -scale * first[1] - half], [0, 0, 1]])
 
 
+@script(part="", only="", most=int)
 @one_thread()
-def main() -> None:
-    given = options_of(__doc__, part="", only="", most=int)
+def main(given) -> None:
     if given.part in ("", "subsets"):
         subsets(charuco_images(FOLDER), given.only, given.most)
     if given.part in ("", "edges"):
         edges(given.most or 160)
-
-
-if __name__ == "__main__":
-    main()

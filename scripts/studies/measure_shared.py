@@ -10,17 +10,17 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scripts.runner import DATA, options_of
+from scripts.runner import DATA, script
 from stcal.sfm import RunOptions, run
 from stcal.sfm.interop.crosscheck import comparison_text, crosscheck
 from stcal.sfm.report.compare import compare, comparison_table
 from stcal.sfm.runs.saved import load_run
 
 
-def main() -> None:
-    root = options_of(__doc__, {"root": DATA / "stereo_target"}).root
+@script({"root": DATA / "stereo_target"})
+def main(given) -> None:
     for name in ("clean", "clutter"):
-        folder = root / name
+        folder = given.root / name
         if not folder.is_dir():
             sys.exit(f"error: {folder} is missing; give the folder that holds clean/ and clutter/")
         for title, options in (
@@ -38,7 +38,3 @@ def main() -> None:
                 if options == RunOptions() and shutil.which("colmap"):
                     print(f"\n{name}, cross-check with the native COLMAP:")
                     print(comparison_text(crosscheck(load_run(out))))
-
-
-if __name__ == "__main__":
-    main()

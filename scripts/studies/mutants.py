@@ -29,7 +29,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from scripts.runner import ROOT, options_of
+from scripts.runner import ROOT, script
 
 PACKAGE = ROOT / "stcal"
 OPERATORS = ("ReplaceComparisonOperator_", "ReplaceBinaryOperator_", "ReplaceUnaryOperator_")
@@ -197,9 +197,11 @@ def run(file: Path, seconds: float, marked: str, workers: int) -> list[dict]:
     return faults
 
 
-def main() -> None:
-    numbers = {"count": 150, "seed": 1, "seconds": 60.0, "workers": os.cpu_count() or 1}
-    given = options_of(__doc__, {"what": str, "file": Path}, marked="not full", **numbers)
+NUMBERS = {"count": 150, "seed": 1, "seconds": 60.0, "workers": os.cpu_count() or 1}
+
+
+@script({"what": str, "file": Path}, marked="not full", **NUMBERS)
+def main(given) -> None:
     if given.what == "draw":
         faults = draw(given.count, given.seed)
         given.file.write_text(json.dumps(faults, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -211,7 +213,3 @@ def main() -> None:
     for fault in faults:
         if fault["outcome"] != "killed":
             print(f"{fault['path']}:{fault['line']}\n    {fault['before'].strip()}\n    {fault['after'].strip()}")
-
-
-if __name__ == "__main__":
-    main()

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, options_of
+from scripts.runner import DATA, script
 from stcal.geometry.normal_equations import free_motions
 from stcal.report.text import text_table
 
@@ -91,9 +91,8 @@ def row_of(name: str, images: Path, folder: Path, run: Path, options: list[str])
     ]
 
 
-def main() -> None:
-    """The table of all sets."""
-    args = options_of(__doc__, {"sets": list(SETS)}, data=DATA / "stereo_target", runs=Path, rim=False)
+@script({"sets": list(SETS)}, data=DATA / "stereo_target", runs=Path, rim=False)
+def main(args) -> None:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         runs = args.runs or Path(scratch)
@@ -105,7 +104,3 @@ def main() -> None:
     heads = ["<set", "faces µm", "expected", "chance %", "mdeg", "worst σ", "χ²/dof", "defocus px", "wrong"]
     heads += [*(["rim mm"] if args.rim else []), "<verdict"]
     print("\n".join(text_table([heads, *rows])))
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import head, row
+from scripts.runner import head, row, script
 from stcal.design import reference_board, reference_target
 from stcal.sfm.planning import forecast
 from stcal.sfm.planning.forecast import nominal_poses
@@ -77,8 +77,8 @@ def blur_px(f_number: float) -> tuple[float, float, float]:
     return defocus, diffraction, float(np.linalg.norm([defocus, diffraction, forecast.BLUR_PX]))
 
 
-def main() -> None:
-    """Print both tables."""
+@script()
+def main(_) -> None:
     print("| | | worst face | σ of its position, µm | largest σ of an orientation, mdeg | σ of a centre, px |")
     print("|---|---|---|---|---|---|")
     row("base", "", forecast_of(BASE))
@@ -93,7 +93,3 @@ def main() -> None:
         blurs = blur_px(f_number)
         found = forecast_of(replace(BASE, noise=centre_noise(blur=blurs[-1])))
         row(f"f/{f_number:g}", *(f"{each:.2f}" for each in blurs), found)
-
-
-if __name__ == "__main__":
-    main()

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scripts.runner import DATA, head, options_of, row
+from scripts.runner import DATA, head, row, script
 from stcal.boards.board_designs import CharucoDesign, ChessboardDesign
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of
@@ -153,14 +153,9 @@ def rows(name: str) -> None:
             print(f"| {name}: {count} images | {way} | 0 | | | | |", flush=True)
 
 
-def main() -> None:
-    """Print the table."""
-    names = options_of(__doc__, sets=list(SETS)).sets
+@script(sets=list(SETS))
+def main(given) -> None:
     head("photographs", "way", "views", "points", "RMS px", "held out px", "focal length px")
-    for name in names:
+    for name in given.sets:
         if (DATA / "real" / name).is_dir():
             rows(name)
-
-
-if __name__ == "__main__":
-    main()

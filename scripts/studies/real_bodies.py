@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, head
+from scripts.runner import DATA, head, script
 from scripts.runner import row as print_row
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
@@ -59,15 +59,11 @@ def row(name: str, result: RunResult) -> None:
     )
 
 
-def main() -> None:
-    """Print the table."""
+@script()
+def main(_) -> None:
     neighbours, sigmas = "neighbours off 90°, mean and worst, °", ("σ of a position, µm", "of a rotation, mdeg")
     head("set", "images", "faces", "residuals, px", "focal length, px", neighbours, *sigmas)
     for name, (folder, design) in SETS.items():
         if (images := DATA / "real" / name / folder).is_dir():
             with tempfile.TemporaryDirectory() as scratch:
                 row(name, pipeline.run(images, None, Path(scratch) / "run", design()))
-
-
-if __name__ == "__main__":
-    main()

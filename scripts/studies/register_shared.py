@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import DATA, head, options_of, row
+from scripts.runner import DATA, head, row, script
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
@@ -200,9 +200,8 @@ def write(folder: Path, found: dict[str, Station], robot: Robot) -> None:
         )
 
 
-def main() -> None:
-    """Print, and write where asked."""
-    arguments = options_of(__doc__, {"root": DATA / "hilti_stationing"}, write=Path)
+@script({"root": DATA / "hilti_stationing"}, write=Path)
+def main(arguments) -> None:
     if not arguments.root.is_dir():
         sys.exit(f"error: {arguments.root} is missing; give the folder of the data sets")
     found, robot = stations(arguments.root), robot_of(arguments.root / "data" / "trailblazer.urdf")
@@ -210,7 +209,3 @@ def main() -> None:
         write(arguments.write, found, robot)
     else:
         print_tables(found, robot)
-
-
-if __name__ == "__main__":
-    main()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import face_errors, head, options_of, row
+from scripts.runner import face_errors, head, row, script
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.checks.significance import Evidence
@@ -120,10 +120,9 @@ def measure(count: int, kind: str) -> dict:
     }
 
 
+@script(sizes=list(SIZES), one=["none", "all"])
 @one_thread()
-def main() -> None:
-    """Print the table."""
-    arguments = options_of(__doc__, sizes=list(SIZES), one=["none", "all"])
+def main(arguments) -> None:
     if arguments.one[0] != "none":
         print(json.dumps(measure(int(arguments.one[0]), arguments.one[1])))
         return
@@ -140,7 +139,3 @@ def main() -> None:
             parts = " + ".join(f"{s:.2f}" for s in answer["seconds"].values())
             sizes = f"{answer['memory_mib']:.0f}", f"{answer['database_mib']:.1f}", f"{answer['worst_face_um']:.2f}"
             row(*counts, parts, f"{sum(answer['seconds'].values()):.1f}", *sizes)
-
-
-if __name__ == "__main__":
-    main()

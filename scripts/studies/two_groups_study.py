@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import script
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.parallel import one_thread
@@ -127,13 +127,9 @@ def clean(trials: int) -> None:
         one_line(name, trials, draw)
 
 
+@script(trials=300, clean=500, only=["shifts", "issue", "clean"])
 @one_thread()
-def main() -> None:
-    given = options_of(__doc__, trials=300, clean=500, only=["shifts", "issue", "clean"])
+def main(given) -> None:
     print(f"{'':<34}{'trials':>7}{'refused':>9}{'told':>7}{'wrong':>7}{'silent':>8}{'clear':>8}")
     for name in given.only:
         {"shifts": shifts, "issue": issue, "clean": clean}[name](given.clean if name == "clean" else given.trials)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import executor_of, face_errors, normalised, options_of
+from scripts.runner import executor_of, face_errors, normalised, script
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
@@ -53,10 +53,9 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     return list(zip(shares, normalised(result.target, errors), strict=True))
 
 
+@script(runs=200, scheduler=str)
 @one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, runs=200, scheduler=str)
+def main(given) -> None:
     count = given.runs
     print(f"{count} runs each, {NOISE_PX} px noise, 4 groups of 6 images, 2592×1728 px (simulated labels)")
     print(f"{'':28} error / bound   normalised squared error")
@@ -71,7 +70,3 @@ def main() -> None:
         spread = rows[:, 1].reshape(count, -1).mean(1).std() / np.sqrt(count)
         figures = f"{np.sqrt(rows[:, 0].mean()):13.3f}   {rows[:, 1].mean():.3f} ± {spread:.3f}"
         print(f"{title:28} {figures}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

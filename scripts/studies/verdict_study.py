@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, SAMPLE, face_errors, normalised, options_of
+from scripts.runner import DATA, SAMPLE, face_errors, normalised, script
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
@@ -531,8 +531,8 @@ def sound(where: str, seed: int) -> dict:
     return answer(drawn(case_of(where), seed))
 
 
-def main() -> None:
-    given = options_of(__doc__, only="", sets="sample,block,own", sound=40, json=Path)
+@script(only="", sets="sample,block,own", sound=40, json=Path)
+def main(given) -> None:
     sets = given.sets.split(",")
     causes = [name for name in CAUSES if given.only in name]
     pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
@@ -563,7 +563,3 @@ def main() -> None:
     print(f"sound sets: {len(wrong)} of {len(drawn_sound)} answered No or With care, {share}{listed}")
     if given.json:
         given.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from scripts.runner import executor_of, head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, observed, residuals, tips
@@ -104,10 +104,9 @@ def error(found: Identified, true: Robot, seed: int) -> float:
     return float(np.sqrt((residuals(found.state, observed(exact, kind)) ** 2).sum(1).mean()))
 
 
+@script(draws=200, only="", scheduler=str)
 @one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    arguments = options_of(__doc__, draws=200, only="", scheduler=str)
+def main(arguments) -> None:
     print(f"{arguments.draws} draws each, simulated\n")
     head("observed", "rows", "wrong", "by, mm", "within 1.1", "worst", "named", "called wrong")
     with executor_of(arguments.scheduler) as pool:
@@ -117,7 +116,3 @@ def main() -> None:
             named, wrong = (sum(each[k] for each in found) for k in (1, 2))
             called = f"{wrong} of {len(found) * case.rows}"
             row(case.title(), (ratio <= 1.1).sum(), f"{ratio.max():.2f}", named, called)
-
-
-if __name__ == "__main__":
-    main()
