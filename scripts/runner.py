@@ -4,9 +4,11 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stcal.parallel import one_thread
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,13 +48,15 @@ def options_of(doc: str | None, places: Mapping[str, object] | None = None, **de
     return parser.parse_args()
 
 
-def script(places: Mapping[str, object] | None = None, **defaults) -> Callable[[Callable], Callable]:
+def script(places: Mapping[str, object] | None = None, limited: bool = False, **defaults) -> Callable:
     """Decorates the main function, which is the last of its file: where this is run, calls it with its options, those
-    of :func:`options_of`."""
+    of :func:`options_of`; ``limited`` : BLAS has one thread meanwhile."""
 
     def decorated(main: Callable) -> Callable:
         if main.__module__ == "__main__":
-            main(options_of(sys.modules["__main__"].__doc__, places, **defaults))
+            options = options_of(sys.modules["__main__"].__doc__, places, **defaults)
+            with one_thread() if limited else nullcontext():
+                main(options)
         return main
 
     return decorated

@@ -23,7 +23,6 @@ from stcal.handeye import METHODS, motion_errors
 from stcal.handeye.data.pose_pairs import Loop, Motions
 from stcal.handeye.handeye_problem import UNIT_MM, HandEyeProblem
 from stcal.handeye.methods.closed_form import Bounds, EvolutionOptions, Objective, evolve, polish
-from stcal.parallel import one_thread
 from tests.support.handeye import Truth, simulated_views
 
 POSES, FITTED = 25, 18
@@ -123,8 +122,7 @@ def median_worst(values: np.ndarray) -> str:
     return f"{np.median(values):.3f} ({values.max():.3g})"
 
 
-@script(seeds=100, scheduler=str)
-@one_thread()
+@script(seeds=100, scheduler=str, limited=True)
 def main(arguments) -> None:
     with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))

@@ -21,7 +21,6 @@ from scripts.runner import face_errors, head, row, script
 from stcal.errors import StcalError
 from stcal.geometry.rigid import align_rigid
 from stcal.labels import dot_cells
-from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, Answer, in_steps
@@ -129,8 +128,7 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
         row(face, f"{um:.2f} ({goal_um:g})", f"{sigma:.2f}", f"{mdeg:.2f} ({goal_mdeg or '–'})")
 
 
-@script(trials=5, width=5184, keep=Path)
-@one_thread()
+@script(trials=5, width=5184, keep=Path, limited=True)
 def main(arguments) -> None:
     trials = []
     with tempfile.TemporaryDirectory() as scratch:

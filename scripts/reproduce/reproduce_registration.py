@@ -23,7 +23,6 @@ from scipy.special import comb
 from scripts.runner import row, script
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.consensus import MODELS, problem_of
 from stcal.register.registration import Liu2017Options, affine_least_squares, liu2017
@@ -183,8 +182,7 @@ def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
         print(f"{comb(good, 3, exact=True) / comb(POINTS, 3, exact=True):.2g}")
 
 
-@script(trials=6)
-@one_thread()
+@script(trials=6, limited=True)
 def main(arguments) -> None:
     robots = f"{arguments.trials} robots as made, wrong points off by {OFF_MM[0]:g} to {OFF_MM[1]:g} mm"
     print(f"Simulated: {POINTS} points in a cube of {SMALL:.0f} mm, {SIGMA_MM} mm noise, {robots}")

@@ -19,7 +19,6 @@ import numpy as np
 from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
-from stcal.parallel import one_thread
 from stcal.robot.axes.axes_model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals
@@ -326,8 +325,7 @@ def print_table(draws: list[Draw]) -> None:
             row(kind, model, *cells, *reduced, f"{gain[:, 2].mean():.1f} %")
 
 
-@script(draws=100, seed=0, gears=0.0, scheduler=str)
-@one_thread()
+@script(draws=100, seed=0, gears=0.0, scheduler=str, limited=True)
 def main(given) -> None:
     start = time.perf_counter()
     sweeps()  # once, before the processes part

@@ -27,7 +27,6 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import SigmaFactors, calibrate, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjusted
@@ -216,8 +215,7 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
     return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 
 
-@script(runs=200, only="", scheduler=str)
-@one_thread()
+@script(runs=200, only="", scheduler=str, limited=True)
 def main(given) -> None:
     fixed, refined = case_of(False), case_of(True)
     said = f"3 groups of 6 images, 2592×1728 px, {NOISE_PX} px (simulated centres)"

@@ -26,7 +26,6 @@ import numpy as np
 
 from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
@@ -199,8 +198,7 @@ def nees(each: np.ndarray) -> str:
     return f"{each.mean():.2f} ± {each.std() / np.sqrt(len(each)):.2f}"
 
 
-@script(draws=200, only="", scheduler=str, payload=False, trees=False, approach=False)
-@one_thread()
+@script(draws=200, only="", scheduler=str, payload=False, trees=False, approach=False, limited=True)
 def main(arguments) -> None:
     print(f"{arguments.draws} draws each, simulated\n")
     if arguments.payload:

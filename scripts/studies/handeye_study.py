@@ -21,7 +21,6 @@ from stcal.handeye.data.corner_views import Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
-from stcal.parallel import one_thread
 from tests.support.handeye import CAMERA, simulated_views
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
@@ -67,8 +66,7 @@ def print_cameras(pool, trials: int, only: str) -> None:
         row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")
 
 
-@script(trials=500, only="", scheduler=str)
-@one_thread()
+@script(trials=500, only="", scheduler=str, limited=True)
 def main(given) -> None:
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * given.trials) / (6 * given.trials))
     print(f"{given.trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")

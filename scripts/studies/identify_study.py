@@ -18,7 +18,6 @@ import numpy as np
 
 from scripts.runner import executor_of, script
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
@@ -176,8 +175,7 @@ def without_noise(case: Case, true: Robot, count: int, rng: np.random.Generator,
     return observed(replace(data, positions=None, rotations=None, distances=apart, from_row=start))
 
 
-@script(draws=200, only="", scheduler=str)
-@one_thread()
+@script(draws=200, only="", scheduler=str, limited=True)
 def main(given) -> None:
     draws = given.draws
     began = time.perf_counter()

@@ -158,8 +158,7 @@ def _drawn_sheet() -> tuple[np.ndarray, np.ndarray]:
     return sheet, np.array([[scale, 0, -scale * first[0] - half], [0, scale, -scale * first[1] - half], [0, 0, 1]])
 
 
-@script(part="", only="", most=int)
-@one_thread()
+@script(part="", only="", most=int, limited=True)
 def main(given) -> None:
     if given.part in ("", "subsets"):
         subsets(charuco_images(FOLDER), given.only, given.most)

@@ -17,7 +17,6 @@ import numpy as np
 from scripts.runner import executor_of, face_errors, row, script
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
@@ -89,8 +88,7 @@ def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
     return dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
 
 
-@script(seeds=20, scheduler=str)
-@one_thread()
+@script(seeds=20, scheduler=str, limited=True)
 def main(given) -> None:
     found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")

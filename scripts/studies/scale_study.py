@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from scripts.runner import face_errors, head, row, script
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.checks.suite import run_checks
@@ -120,8 +119,7 @@ def measure(count: int, kind: str) -> dict:
     }
 
 
-@script(sizes=list(SIZES), one=["none", "all"])
-@one_thread()
+@script(sizes=list(SIZES), one=["none", "all"], limited=True)
 def main(arguments) -> None:
     if arguments.one[0] != "none":
         print(json.dumps(measure(int(arguments.one[0]), arguments.one[1])))

@@ -25,7 +25,6 @@ import numpy as np
 from scripts.runner import script
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.parallel import one_thread
 from stcal.register import Registration, register
 from stcal.register.consensus import MODELS, jacobian
 from tests.support.point_pairs import cube, directions, make_scene, random_rigid
@@ -127,8 +126,7 @@ def clean(trials: int) -> None:
         one_line(name, trials, draw)
 
 
-@script(trials=300, clean=500, only=["shifts", "issue", "clean"])
-@one_thread()
+@script(trials=300, clean=500, only=["shifts", "issue", "clean"], limited=True)
 def main(given) -> None:
     print(f"{'':<34}{'trials':>7}{'refused':>9}{'told':>7}{'wrong':>7}{'silent':>8}{'clear':>8}")
     for name in given.only:

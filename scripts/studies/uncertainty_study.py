@@ -16,7 +16,6 @@ from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
@@ -53,8 +52,7 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     return list(zip(shares, normalised(result.target, errors), strict=True))
 
 
-@script(runs=200, scheduler=str)
-@one_thread()
+@script(runs=200, scheduler=str, limited=True)
 def main(given) -> None:
     count = given.runs
     print(f"{count} runs each, {NOISE_PX} px noise, 4 groups of 6 images, 2592×1728 px (simulated labels)")

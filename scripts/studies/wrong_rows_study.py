@@ -15,7 +15,6 @@ import numpy as np
 
 from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, observed, residuals, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
@@ -104,8 +103,7 @@ def error(found: Identified, true: Robot, seed: int) -> float:
     return float(np.sqrt((residuals(found.state, observed(exact, kind)) ** 2).sum(1).mean()))
 
 
-@script(draws=200, only="", scheduler=str)
-@one_thread()
+@script(draws=200, only="", scheduler=str, limited=True)
 def main(arguments) -> None:
     print(f"{arguments.draws} draws each, simulated\n")
     head("observed", "rows", "wrong", "by, mm", "within 1.1", "worst", "named", "called wrong")
