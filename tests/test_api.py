@@ -25,7 +25,7 @@ from stcal.handeye import HandEyePoses
 from stcal.locate import SeenTags
 from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
 from stcal.sfm import RunOptions, Trial
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "adjust", "synthetic", "workflows")
 
@@ -113,8 +113,7 @@ ROW = DHRow(100.0, 0.0, 0.0, 0.0)
     ],
 )
 def test_constructors_are_as_strict_as_readers_of_files(make, error):
-    with fails_with(error):
-        make()
+    refuses(error, make)
 
 
 def wrong_values(value: object, hint: object) -> list[object]:
@@ -234,6 +233,5 @@ def test_errors_speak_of_arguments(monkeypatch):
 def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     """Those of errors that a call from Python can raise: where the command's name differs, `PYTHON_NAMES` has it."""
     monkeypatch.delenv(errors.COMMAND_LINE)
-    with fails_with("E-OPTION-RANGE … flatness_mm 1e+09"):
-        RunOptions(flatness_mm=1e9).settled(reference_target())
+    refuses("E-OPTION-RANGE … flatness_mm 1e+09", RunOptions, flatness_mm=1e9).settled(reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())

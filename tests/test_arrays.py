@@ -16,7 +16,7 @@ from stcal.io.images import decode, grey_of
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.sfm.detect.detect_files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 
 MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
@@ -79,8 +79,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
     ],
 )
 def test_what_is_wrong_is_refused_in_one_line(make, error):
-    with fails_with(error):
-        make()
+    refuses(error, make)
 
 
 def test_a_camera_keeps_its_covariance_and_its_model_in_files(tmp_path):
@@ -91,14 +90,12 @@ def test_a_camera_keeps_its_covariance_and_its_model_in_files(tmp_path):
     assert again.colmap_model == "OPENCV"
     assert np.allclose(again.covariance, camera.covariance, rtol=1e-12)
     assert stcal.save_camera(tmp_path / "camera.yaml", camera) == ("σ and correlations of the parameters",)
-    with fails_with("E-OPTION-FORM … camera.json … .json"):
-        stcal.save_camera(tmp_path / "camera.json", camera)
+    refuses("E-OPTION-FORM … camera.json … .json", stcal.save_camera, tmp_path / "camera.json", camera)
 
 
 def test_a_size_that_no_file_states_is_given(tmp_path):
     (tmp_path / "m.yaml").write_text(f"camera_matrix: {MATRIX.tolist()}\ndist_coeffs: {EIGHT[:4]}\n", encoding="utf-8")
-    with fails_with("E-CAMERA-SIZE … m.yaml"):
-        stcal.load_camera(tmp_path / "m.yaml")
+    refuses("E-CAMERA-SIZE … m.yaml", stcal.load_camera, tmp_path / "m.yaml")
     assert stcal.load_camera(tmp_path / "m.yaml", size=SIZE).same_as(Camera.from_opencv(MATRIX, EIGHT[:4], SIZE))
 
 

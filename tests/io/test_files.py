@@ -14,7 +14,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, keep_apart, read_bytes, save
 from stcal.io.json import read_json
 from stcal.io.table import read_table
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 READERS = {
     "camera": (read_camera, SETTINGS_BYTES),
@@ -44,8 +44,7 @@ def test_a_larger_file_is_an_error_with_the_limit(tmp_path, kind):
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no file without end on this system")
 def test_a_file_without_end_is_an_error():
-    with fails_with("E-CAMERA-UNREADABLE … /dev/zero … 10"):
-        read_camera("/dev/zero")
+    refuses("E-CAMERA-UNREADABLE … /dev/zero … 10", read_camera, "/dev/zero")
 
 
 def test_a_link_to_itself(tmp_path):
@@ -53,8 +52,7 @@ def test_a_link_to_itself(tmp_path):
     link = tmp_path / "a"
     link.symlink_to("a")
     keep_apart([("--out", tmp_path / "b")], [("pairs", link)])
-    with fails_with("E-CAMERA-UNREADABLE … symbolic links"):
-        read_camera(link)
+    refuses("E-CAMERA-UNREADABLE … symbolic links", read_camera, link)
 
 
 def test_a_file_is_read_in_memory_of_its_own_size(tmp_path):
@@ -76,8 +74,7 @@ def test_no_result_is_larger_than_what_is_read_again(monkeypatch):
     assert len(files.json_text(rows)) < wide // 2
     assert json.loads(files.json_text(rows)) == rows
     monkeypatch.setattr(files, "TABLE_BYTES", wide // 4)
-    with fails_with("E-OUTPUT-SIZE … give fewer rows"):
-        files.json_text(rows)
+    refuses("E-OUTPUT-SIZE … give fewer rows", files.json_text, rows)
 
 
 def test_text_bytes_and_folders(tmp_path):

@@ -11,7 +11,7 @@ from stcal.io import decoding
 from stcal.io.cameras.read import camera_of_photograph
 from stcal.io.decoding import patterns_seen
 from stcal.io.images import decode, find_images
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 HEIGHT, WIDTH = 96, 128
 Y, X = np.mgrid[:HEIGHT, :WIDTH]
@@ -65,8 +65,7 @@ def test_the_turn_of_the_container_is_undone():
 
 def test_a_damaged_heic_photograph_is_refused(monkeypatch):
     monkeypatch.setattr("PIL.ImageFile.LOAD_TRUNCATED_IMAGES", True)  # as WeasyPrint leaves it
-    with fails_with("E-IMAGE-UNREADABLE … a.heic"):
-        decode(heic()[:400], "a.heic")
+    refuses("E-IMAGE-UNREADABLE … a.heic", decode, heic()[:400], "a.heic")
 
 
 def test_the_camera_of_a_heic_photograph(tmp_path):
@@ -87,8 +86,7 @@ def test_a_raw_photograph_is_refused(name):
     """Told by its suffix, or by the tag of a DNG, which OpenCV would read as the grey image that it is not."""
     stream = io.BytesIO()
     Image.fromarray(SCENE).save(stream, "TIFF", tiffinfo={decoding.DNG_VERSION: bytes([1, 4, 0, 0])})
-    with fails_with(f"E-IMAGE-TYPE … {name} … TIFF or PNG"):
-        decode(stream.getvalue(), name)
+    refuses(f"E-IMAGE-TYPE … {name} … TIFF or PNG", decode, stream.getvalue(), name)
 
 
 ROW, COLUMN = np.mgrid[:240, :320]
@@ -113,11 +111,10 @@ def mosaic(pattern: str, light: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_a_mosaic_is_refused(tmp_path, pattern):
     cv2.imwrite(str(tmp_path / "a.png"), mosaic(pattern, scene()))
-    with fails_with(f"E-IMAGE-MOSAIC … a.png … {pattern}"):
-        find_images(tmp_path)
+    refuses(f"E-IMAGE-MOSAIC … a.png … {pattern}", find_images, tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_other_images_are_no_mosaics(seed):
     light = scene(seed)
     stripes = np.where(seed % 2 == COLUMN % 2, 200, 60)
