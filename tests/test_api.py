@@ -233,5 +233,5 @@ def test_errors_speak_of_arguments(monkeypatch):
 def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     """Those of errors that a call from Python can raise: where the command's name differs, `PYTHON_NAMES` has it."""
     monkeypatch.delenv(errors.COMMAND_LINE)
-    refuses("E-OPTION-RANGE … flatness_mm 1e+09", RunOptions, flatness_mm=1e9).settled(reference_target())
+    refuses("E-OPTION-RANGE … flatness_mm 1e+09", RunOptions(flatness_mm=1e9).settled, reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())

@@ -143,10 +143,10 @@ def test_simulated_cameras(tmp_path):
     options = synthetic.SceneOptions(width=324, height=216, images_per_group=2, groups=(("1", "2"),), distance_mm=500)
     scene = synthetic.make_scene(options, camera=own)
     np.testing.assert_array_equal(scene.camera.focal, own.focal)
-    words = "--images", 2, "--width", 324, "--distance", 500, "--groups", "12", "--fisheye", 120
+    words = "--images", 2, "--width", 324, "--distance", 500, "--groups", "12", "--fisheye", 120, "--workers", 1
     call("sfm", "simulate", tmp_path / "wide", *words)
     wide = replace(options, fisheye_deg=120.0)
-    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide))
+    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide), workers=1)
     assert (tmp_path / "own/cameras.txt").read_text() == (tmp_path / "wide/cameras.txt").read_text()
     refuses("E-OPTION-CONFLICT … two cameras", synthetic.make_scene, wide, camera=own)
     refuses("E-OPTION-RANGE … fisheye_deg 20", replace, options, fisheye_deg=20.0)
