@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import DATA, options_of
 from stcal.boards.board_file import board_toml, load_dots
 from stcal.boards.target_file import load_target
 from stcal.design import reference_board
@@ -44,7 +44,6 @@ from tests.support.arms import LEFT, MARKERS, RIGHT, elastic, two_arms
 from tests.support.film import filmed
 
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
 GROUPS = 4
 STREAM = 40, 1728
@@ -204,7 +203,7 @@ def handeye_charuco(scratch: Path) -> None:
     sys.path.append(str(Path(__file__).parent / "studies"))
     import handeye_shared
 
-    handeye_shared.charuco(SHARED, scratch / "charuco", splits=handeye_shared.DEFAULT)
+    handeye_shared.charuco(DATA, scratch / "charuco", splits=handeye_shared.DEFAULT)
 
 
 def rows(data: Path, stream: Path, film: Path, scratch: Path) -> Iterator[tuple[str, Callable]]:
@@ -224,10 +223,10 @@ def rows(data: Path, stream: Path, film: Path, scratch: Path) -> Iterator[tuple[
     call(run_words(stream, scratch / "stream"))
     yield "measure, 2 Mpx, one core", lambda: measured_stream(stream, scratch / "stream" / "faces.json")
     yield "Tracker.locate, one core", tracked(film)
-    if (real := SHARED / "real" / "multidic_chessboard").is_dir():
+    if (real := DATA / "real" / "multidic_chessboard").is_dir():
         words = ["calibrate-camera", real / "201", "--board", real / "board.toml", "--out", scratch / "camera.txt"]
         yield "calibrate-camera, 25 chessboards, 8 Mpx", lambda: call([*words, "--overwrite"])
-    if (SHARED / "charuco_handeye").is_dir():
+    if (DATA / "charuco_handeye").is_dir():
         yield "handeye, ChArUco, 16 of 1.9 Mpx", lambda: handeye_charuco(scratch)
     yield f"identify, elastic tree of 18 joints, {ROWS} rows", tree_identified()
 

@@ -6,7 +6,6 @@ The pages are those of docs/ and data_layout.md, and those made from the program
 Sphinx ends it, and so does a link of the pages built that leads nowhere; nothing is asked of the network.
 """
 
-import argparse
 import posixpath
 import re
 import shutil
@@ -17,12 +16,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
+from scripts.runner import ROOT, script
+
 try:
     from sphinx.cmd.build import build_main
 except ImportError:  # told where the site is built, so that its tests run without it
     build_main = None
 
-ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 SITE = DOCS / "site"
 LINK = re.compile(r"(\]\()([^)\s]+)(\))")
@@ -177,11 +177,6 @@ def build(out: Path, say: Callable[[str], None] = print) -> None:
     say(f"{len(list(out.rglob('*.html')))} pages: {out / 'index.html'}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "site")
-    build(parser.parse_args().out.resolve())
-
-
-if __name__ == "__main__":
-    main()
+@script(out=ROOT / "build" / "site")
+def main(given) -> None:
+    build(given.out.resolve())

@@ -8,14 +8,13 @@ are apart; `residuals` : the same simulated labels adjusted with and without the
 way of a photograph through `stcal/sfm`.
 """
 
-import argparse
 import ast
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import ROOT, face_errors, script
 from stcal.design import reference_board, reference_target
 from stcal.geometry.plane import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
@@ -26,7 +25,6 @@ from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 
-ROOT = Path(__file__).resolve().parents[1]
 BLUE, RED, GREEN = COLOURS[:3]
 FOCAL_PX = 24 / 36 * 5184
 """Of a 24 mm lens over 5184 px."""
@@ -89,28 +87,21 @@ def residuals() -> Drawing:
         target = replace(target, faces=tuple(replace(face, radius_mm=size * face.radius_mm) for face in target.faces))
         board = replace(board, radius_mm=size * board.radius_mm)
         scene = make_scene(SceneOptions(seed=1), target, board, reference_target().rough_poses())
-        plain = [
-            m.in_world(Similarity(1.0, Rigid()))
-            for m in true_models(scene, observe(scene, NOISE_PX, np.random.default_rng(1)))
-        ]
+        seen = observe(scene, NOISE_PX, np.random.default_rng(1))
+        plain = [m.in_world(Similarity(1.0, Rigid())) for m in true_models(scene, seen)]
         radius = target.radius_of() | board.radius_of()
         corrected = [replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)) for m in plain]
         for models, options in ((corrected, RunOptions()), (plain, RunOptions(eccentricity=False))):
             models = [adjust(m, scene.camera) for m in models]
             found = calibrate(models, scene.camera, target, board, options.adjustment(target))
-            apart = [
-                np.linalg.norm(found.target.target_from_face[face].translation - pose.translation)
-                for face, pose in scene.target_from_face.items()
-                if face != scene.reference_face
-            ]
+            off = face_errors(found.target, scene.target_from_face).values()
+            apart = [np.linalg.norm(each[3:]) for each in off]
             left = np.concatenate([m.residuals_px(scene.camera).ravel() for m in models])
             rows.append((float(np.sqrt((left**2).mean())), 1e3 * float(np.sqrt(np.mean(np.square(apart))))))
     values = np.array(rows).reshape(len(sizes), 2, 2)
     for size, ((left, apart), (plain_left, plain_apart)) in zip(sizes, values, strict=True):
-        print(
-            f"radii × {size:g}: residuals {left:.4f} px, faces {apart:.1f} µm; uncorrected {plain_left:.4f} px, "
-            f"{plain_apart:.1f} µm"
-        )
+        plain = f"uncorrected {plain_left:.4f} px, {plain_apart:.1f} µm"
+        print(f"radii × {size:g}: residuals {left:.4f} px, faces {apart:.1f} µm; {plain}")
     drawing = Drawing(8.4, 2.9)
     titles = "residuals, px RMS", "error of the faces, µm RMS"
     for k, (box, title) in enumerate(zip(drawing.panels(2, top=36), titles, strict=True)):
@@ -192,17 +183,9 @@ def folders() -> Drawing:
 DRAWINGS: dict[str, Callable] = {d.__name__: d for d in (eccentricity, residuals, chain, folders)}
 
 
-def main() -> None:
-    """Draw those that are named, or all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(DRAWINGS)}; all if none")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures")
-    arguments = parser.parse_args()
-    for name in arguments.names or DRAWINGS:
+@script({"names": list(DRAWINGS)}, out=ROOT / "docs" / "pictures")
+def main(arguments) -> None:
+    for name in arguments.names:
         path = arguments.out / f"{name}.svg"
         save(DRAWINGS[name](), path)
         print(path)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,7 +8,6 @@ need Chromium on the PATH, as pages and drawings are photographed in the browser
 photographs.
 """
 
-import argparse
 import csv
 import shutil
 import subprocess
@@ -19,10 +18,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from scripts.runner import ROOT, SAMPLE, script
 from stcal.sfm import run
 
-ROOT = Path(__file__).resolve().parents[1]
-SAMPLE = ROOT / "tests" / "data" / "sample"
 FOUND_IN = "12/IMG_1001.jpg"
 """Three faces and the board, turned."""
 MARGIN_PX = 45
@@ -54,19 +52,15 @@ def box_of_circles(detections: Path, image: str, size: tuple[int, int]) -> tuple
     with detections.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["image"] == image and row["label"]]
     x, y = ([float(row[key]) for row in rows] for key in ("x_px", "y_px"))
-    return (
-        max(min(x) - MARGIN_PX, 0),
-        max(min(y) - MARGIN_PX, 0),
-        min(max(x) + MARGIN_PX, size[0]),
-        min(max(y) + MARGIN_PX, size[1]),
-    )
+    first = (max(min(values) - MARGIN_PX, 0) for values in (x, y))
+    return (*first, *(min(max(values) + MARGIN_PX, side) for values, side in zip((x, y), size, strict=True)))
 
 
 def cut(image: Image.Image, box: tuple[float, float, float, float], width: int) -> Image.Image:
     """That part of an image, whatever its own size, of a photograph ``width`` px wide; ``HALF_WIDTH_PX`` wide."""
     scale = image.width / width
     height = round(HALF_WIDTH_PX * (box[3] - box[1]) / (box[2] - box[0]))
-    scaled = (box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale)
+    scaled = [side * scale for side in box]
     return image.resize((HALF_WIDTH_PX, height), Image.Resampling.LANCZOS, box=scaled)
 
 
@@ -132,20 +126,12 @@ def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> N
 PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report, "box": box, "cube": cube}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(PICTURES)}; all if none is given")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures")
-    arguments = parser.parse_args()
+@script({"names": list(PICTURES)}, out=ROOT / "docs" / "pictures")
+def main(arguments) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result"
-        names = arguments.names or list(PICTURES)
-        if {"found", "report"} & set(names):
+        if {"found", "report"} & set(arguments.names):
             run(SAMPLE / "images", SAMPLE / "cameras.txt", result)
-        for name in names:
+        for name in arguments.names:
             PICTURES[name](result, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

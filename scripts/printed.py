@@ -17,16 +17,11 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from scripts.runner import ROOT
+
 PRINTED = ROOT / "docs" / "printed"
-DOCUMENTS = (
-    "README.md",
-    *sorted(
-        str(path.relative_to(ROOT))
-        for path in (ROOT / "docs").rglob("*.md")
-        if ROOT / "docs" / "reference" not in path.parents
-    ),
-)
+_PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))
+DOCUMENTS = ("README.md", *(page for page in _PAGES if not page.startswith("docs/reference/")))
 """All but docs/reference, which holds formats and options."""
 MARK = re.compile(r"<!-- printed by: (.+?) -->")
 FIRST = re.compile(r"# (.+), at commit ([0-9a-f]{7,40})(, .+)?")

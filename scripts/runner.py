@@ -1,9 +1,14 @@
-"""What studies share: options, each stated by its default, tables, the shared data, and errors of faces."""
+"""What scripts share: options, each stated by its default, tables, the shared data, and errors of faces."""
 
 import argparse
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stcal.parallel import one_thread
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,6 +46,33 @@ def options_of(doc: str | None, places: Mapping[str, object] | None = None, **de
             kind |= {"default": default} | ({"nargs": "?"} if name in places else {})
         parser.add_argument(*words, **kind)
     return parser.parse_args()
+
+
+def script(places: Mapping[str, object] | None = None, limited: bool = False, **defaults) -> Callable:
+    """Decorates the main function, which is the last of its file: where this is run, calls it with its options, those
+    of :func:`options_of`; ``limited`` : BLAS has one thread meanwhile."""
+
+    def decorated(main: Callable) -> Callable:
+        if main.__module__ == "__main__":
+            options = options_of(sys.modules["__main__"].__doc__, places, **defaults)
+            with one_thread() if limited else nullcontext():
+                main(options)
+        return main
+
+    return decorated
+
+
+@contextmanager
+def executor_of(scheduler: str | None = None) -> Iterator[Executor]:
+    """Yields the workers of the Dask cluster at an address, or processes of this machine, one per core."""
+    if scheduler is None:
+        with ProcessPoolExecutor() as pool:
+            yield pool
+        return
+    from stcal.workflows.cluster import connected
+
+    with connected(scheduler) as client:
+        yield client.get_executor(pure=False)
 
 
 def head(*names: str) -> None:

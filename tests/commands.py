@@ -97,6 +97,13 @@ _DESIGNS = "--target @data/target.toml --board @data/board.toml"
 _SET = f"@data/images --camera @data/cameras.txt {_DESIGNS} --workers 1"
 _LOCATE = "--layout @locate/layout.toml --camera @locate/cameras.txt"
 _ALL = "--json >all.json --report >page.html"
+_SHOTS = "@shots --camera @data/cameras.txt --faces @run/faces.json"
+_ROBOT, _POSES = "--robot @robot/robot.toml", "@handeye/poses.csv"
+_EYE = "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye"
+_FORMS, _REFINED = "--ros >h.yaml --urdf >h.urdf --opencv >h.yml", "--camera-out >cameras.txt"
+_ARM = "--partial --targets @robot/targets.csv --out +arm"
+_TARGETS = "@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml"
+_CAMERA = "@data/images --camera @data/cameras.txt --faces @run/faces.json"
 CALLS = (
     Call("sfm run", f"{_SET} --out ~run", 3.5),
     Call("sfm run", f"{_SET} --out +new", 9.0),
@@ -135,18 +142,8 @@ CALLS = (
     Call("sfm budget", "@run --field operator=A --lengths @run --json >budget.json --report >page.html", 2.5),
     Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
     Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1 --report >page.html", 15.0),
-    Call(
-        "sfm measure",
-        "@shots --camera @data/cameras.txt --faces @run/faces.json --target @data/target.toml --sequence "
-        "--out >poses.csv --workers 1",
-        3.0,
-    ),
-    Call(
-        "sfm measure",
-        f"@shots --camera @data/cameras.txt --faces @run/faces.json {_DESIGNS} --joints @joints.csv "
-        f"--out >poses.csv --workers 1 {_ALL}",
-        1.5,
-    ),
+    Call("sfm measure", f"{_SHOTS} --target @data/target.toml --sequence --out >poses.csv --workers 1", 3.0),
+    Call("sfm measure", f"{_SHOTS} {_DESIGNS} --joints @joints.csv --out >poses.csv --workers 1 {_ALL}", 1.5),
     Call("camera show", "@cameras/sigma.txt --plot >camera.svg", 1.0),
     Call("camera convert", "@cameras/opencv.xml >camera.yaml --form kalibr"),
     Call("camera convert", "@cameras/ros.yaml >camera.cameramodel"),
@@ -157,58 +154,20 @@ CALLS = (
     Call("robot init", "+robot.toml"),
     Call("robot convert", "@robot/made.toml >robot.urdf"),
     Call("robot axes", f"@robot/sweeps.csv --robot @robot/robot.toml --out >axes.toml {_ALL}", 2.0),
-    Call(
-        "robot identify",
-        f"@robot/poses.csv --robot @robot/robot.toml --folds 2 --out >r.toml --offsets >offsets.csv {_ALL}",
-        4.0,
-    ),
+    Call("robot identify", f"@robot/poses.csv {_ROBOT} --folds 2 --out >r.toml --offsets >offsets.csv {_ALL}", 4.0),
     Call("robot identify", "@robot/sweeps.csv --robot @robot/robot.toml --observe distance --partial --folds 0", 1.0),
     Call("robot identify", "@robot/loaded.csv --robot @robot/elastic.toml --folds 0 --out >r.toml", 2.0),
     Call("robot evaluate", "@robot/loaded.csv --robot @robot/elastic.toml --refit none", 1.0),
-    Call(
-        "robot evaluate",
-        f"@robot/poses.csv --robot @robot/robot.toml --robot @robot/made.toml --out >rows.csv {_ALL}",
-        2.0,
-    ),
-    Call(
-        "robot compensate",
-        "@robot/targets.csv --robot @robot/made.toml --nominal @robot/robot.toml --payload-kg 12 --out >joints.csv "
-        f"{_ALL}",
-        1.2,
-    ),
-    Call(
-        "robot from-photos",
-        "@data/images --camera @data/cameras.txt --faces @run/faces.json --joints @held.csv --robot @robot/robot.toml "
-        f"{_DESIGNS} --partial --targets @robot/targets.csv --out +arm --workers 1",
-        6.0,
-    ),
+    Call("robot evaluate", f"@robot/poses.csv {_ROBOT} --robot @robot/made.toml --out >rows.csv {_ALL}", 2.0),
+    Call("robot compensate", f"{_TARGETS} --payload-kg 12 --out >joints.csv {_ALL}", 1.2),
+    Call("robot from-photos", f"{_CAMERA} --joints @held.csv {_ROBOT} {_DESIGNS} {_ARM} --workers 1", 6.0),
     Call("robot verify", f"@robot/verify.csv --plot >errors.svg {_ALL}", 0.5),
     Call("robot design", f"--robot @robot/robot.toml --count 20 --candidates 60 --out >poses.csv {_ALL}", 1.5),
-    Call(
-        "handeye",
-        "@handeye/poses.csv --splits 2 --out >h.json --ros >h.yaml --urdf >h.urdf --opencv >h.yml "
-        "--motions-held-out 2 --workers 1 " + _ALL,
-        1.2,
-    ),
-    Call(
-        "handeye",
-        "@handeye/poses.csv --splits 0 --method de --de-bounds-deg closed-form,10 --de-bounds-mm closed-form,20",
-    ),
-    *(
-        Call("handeye", f"@handeye/poses.csv --splits 0 --method {name}")
-        for name in ("de-polished", "tsai-lenz", "zhao")
-    ),
-    Call(
-        "handeye",
-        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/checker.yaml "
-        "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
-        3.0,
-    ),
-    Call(
-        "handeye",
-        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/boards.toml "
-        "--dry-run",
-    ),
+    Call("handeye", f"{_POSES} --splits 2 --out >h.json {_FORMS} --motions-held-out 2 --workers 1 {_ALL}", 1.2),
+    Call("handeye", f"{_POSES} --splits 0 --method de --de-bounds-deg closed-form,10 --de-bounds-mm closed-form,20"),
+    *(Call("handeye", f"{_POSES} --splits 0 --method {name}") for name in ("de-polished", "tsai-lenz", "zhao")),
+    Call("handeye", f"{_EYE}/checker.yaml --splits 0 --refine-camera {_REFINED} --out >h.json --workers 1", 3.0),
+    Call("handeye", f"{_EYE}/boards.toml --dry-run"),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),

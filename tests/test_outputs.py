@@ -11,18 +11,10 @@ from stcal.cli.main import main
 from stcal.cli.options import ALWAYS_NEW
 from stcal.io.files import RUN_ENTRIES, RUN_MARKER, keep_apart
 from tests.commands import CALLS, COMMANDS, paths_of
-from tests.outcome import fails_with
+from tests.outcome import assert_error, ended, fails_with, refuses
 
-FOLDERS = {
-    ("run", "out"),
-    ("detect", "out"),
-    ("init", "folder"),
-    ("design", "folder"),
-    ("simulate", "folder"),
-    ("demo", "out"),
-    ("from_photos", "out"),
-}
-FOLDERS |= {("export_model", "out"), ("capture", "out")}
+FOLDERS = {(name, "out") for name in ("run", "detect", "demo", "from_photos", "export_model", "capture")}
+FOLDERS |= {(name, "folder") for name in ("init", "design", "simulate")}
 """New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
@@ -55,8 +47,7 @@ def test_no_output_replaces_an_input(tmp_path):
     for command, output, read in PAIRS:
         given = dict.fromkeys(paths_of(command))
         for paths in ({read: own, output: own}, {read: own, output: another_way}, {read: tmp_path, output: own}):
-            with fails_with("E-OUTPUT-IS-INPUT … given"):
-                command(**given | paths)
+            refuses("E-OUTPUT-IS-INPUT … given", command, **given | paths)
     assert own.read_text() == "mine"
 
 
@@ -81,14 +72,11 @@ def test_overwrite_replaces_what_is_there(tmp_path, monkeypatch, capsys):
 
     def init(*more):
         monkeypatch.setattr("sys.argv", ["stcal", "robot", "init", "b.toml", *more])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return end.value.code, capsys.readouterr().err
+        return ended(main, capsys)
 
-    code, error = init()
-    assert (code, error) == (2, "error: b.toml: exists; give another name, or --overwrite to replace it\n")
+    assert_error(init(), 2, "E-OUTPUT-EXISTS", "error: b.toml: exists; give another name, or --overwrite to replace it")
     assert (tmp_path / "b.toml").read_text() == "mine"
-    assert init("--overwrite") == (0, "")
+    assert init("--overwrite")[::2] == (0, "")
     assert "[[joint]]" in (tmp_path / "b.toml").read_text()
 
 
@@ -114,35 +102,27 @@ def test_a_file_beside_a_runs_own_is_written_again(tmp_path):
     keep_apart([("--json", tmp_path / "advice.json")], [("run", tmp_path)])
     for name in RUN_ENTRIES:
         (tmp_path / name).touch()
-        with fails_with("E-OUTPUT-IS-INPUT … run"):
-            keep_apart([("--json", tmp_path / name)], [("run", tmp_path)])
+        refuses("E-OUTPUT-IS-INPUT … run", keep_apart, [("--json", tmp_path / name)], [("run", tmp_path)])
 
 
-def test_a_result_file_in_a_folder_of_images_is_written_again(tmp_path):
-    (tmp_path / "poses.json").write_text('{\n "format": "stcal poses 1"\n}')
-    (tmp_path / "a.jpg").write_bytes(b"x")
-    keep_apart([("--json", tmp_path / "poses.json")], [("images", Path(tmp_path))])
-    keep_apart([("--json", tmp_path / "new.json")], [("images", Path(tmp_path))])
-    with fails_with("E-OUTPUT-IS-INPUT … images"):
-        keep_apart([("--out", tmp_path / "a.jpg")], [("images", tmp_path)])
-
-
-def test_outputs_are_kept_apart_and_from_every_path_of_a_list(tmp_path):
-    with fails_with("E-OUTPUT-TWICE … --out"):
-        keep_apart([("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
-    with fails_with("E-OUTPUT-IS-INPUT"):
-        keep_apart([("--out", tmp_path / "a")], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
+def test_outputs_are_kept_apart_and_from_every_path_of_a_list(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refuses("E-OUTPUT-TWICE … --out", keep_apart, [("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
+    refuses("E-OUTPUT-FOLDER … --out", keep_apart, [("--out", tmp_path)], [])
+    for out in (tmp_path / "a", Path("a")):
+        with fails_with(f"E-OUTPUT-IS-INPUT … --out {out}"):
+            keep_apart([("--out", out)], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
 
 
 @pytest.mark.parametrize("name", ["poses.csv", "a.json", "b.HTML", "figure.svg"])
-def test_a_table_in_a_folder_of_images_is_written_again(tmp_path, name):
+def test_a_result_in_a_folder_of_images_is_written_again(tmp_path, name):
     """No command reads one from there."""
     (tmp_path / name).write_text("an earlier table")
-    keep_apart([("--out", tmp_path / name)], [("images", tmp_path)])
+    for out in (name, "new.json"):
+        keep_apart([("--out", tmp_path / out)], [("images", tmp_path)])
     for read in ("a.jpg", "cameras.txt", "points3D.bin", "database.db", "drawing.png"):
         (tmp_path / read).write_text("mine")
-        with fails_with("E-OUTPUT-IS-INPUT … images"):
-            keep_apart([("--out", tmp_path / read)], [("images", tmp_path)])
+        refuses("E-OUTPUT-IS-INPUT … images", keep_apart, [("--out", tmp_path / read)], [("images", tmp_path)])
 
 
 def test_numbers_have_both_ends():

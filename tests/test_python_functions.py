@@ -25,7 +25,7 @@ from stcal.io.files import json_text
 from stcal.robot.kinematics.robot_model import mh80
 from tests.commands import COMMANDS
 from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "howto" / "python.md"
 ROW = re.compile(r"^\| `stcal([ -])([\w -]+)` \| (.+) \|$", re.MULTILINE)
@@ -135,19 +135,18 @@ def test_load_universal(tmp_path):
     written = robot.load_robot(tmp_path / "arm.toml")
     np.testing.assert_allclose(robot.forward(found.robot, q).matrix(), robot.forward(written, q).matrix(), atol=1e-6)
     (tmp_path / "none.yaml").write_text("a: 1\n", encoding="utf-8")
-    with fails_with("E-ROBOT-FORM … none.yaml"):
-        robot.load_universal(tmp_path / "none.yaml")
+    refuses("E-ROBOT-FORM … none.yaml", robot.load_universal, tmp_path / "none.yaml")
 
 
 def test_simulated_cameras(tmp_path):
     own = stcal.Camera(640, 480, [450.0, 450.0], [319.5, 239.5], np.zeros(8))
-    options = synthetic.SceneOptions(width=640, height=426, images_per_group=2, groups=(("1", "2"),), distance_mm=500)
+    options = synthetic.SceneOptions(width=324, height=216, images_per_group=2, groups=(("1", "2"),), distance_mm=500)
     scene = synthetic.make_scene(options, camera=own)
     np.testing.assert_array_equal(scene.camera.focal, own.focal)
-    words = "--images", 2, "--width", 640, "--distance", 500, "--groups", "12", "--fisheye", 120
+    words = "--images", 2, "--width", 324, "--distance", 500, "--groups", "12", "--fisheye", 120, "--workers", 1
     call("sfm", "simulate", tmp_path / "wide", *words)
-    wide = replace(options, height=427, fisheye_deg=120.0)
-    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide))
+    wide = replace(options, fisheye_deg=120.0)
+    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide), workers=1)
     assert (tmp_path / "own/cameras.txt").read_text() == (tmp_path / "wide/cameras.txt").read_text()
     refuses("E-OPTION-CONFLICT … two cameras", synthetic.make_scene, wide, camera=own)
     refuses("E-OPTION-RANGE … fisheye_deg 20", replace, options, fisheye_deg=20.0)
@@ -175,12 +174,10 @@ def test_goals_in_the_base(tmp_path):
     np.testing.assert_allclose(
         on_flange["one"].matrix(), (flange @ mount @ results[0].pose.camera_from_obj).matrix(), atol=1e-9
     )
-    with fails_with("E-ROBOT-POSES-SCENE … none of scene two"):
-        locate.goals(results, locate.goal_chain(mount, robot_poses={"one": flange}))
-    with fails_with("E-OPTION-MISSING … registration needed"):
-        locate.goal_chain()
-    with fails_with("E-REGISTER-FILE … similarity"):
-        locate.goal_chain(registration=register.register(xyz_a, xyz_b * 1.1, model="similarity"))
+    one, similar = {"one": flange}, register.register(xyz_a, xyz_b * 1.1, model="similarity")
+    refuses("E-ROBOT-POSES-SCENE … none of scene two", locate.goals, results, locate.goal_chain(mount, robot_poses=one))
+    refuses("E-OPTION-MISSING … registration needed", locate.goal_chain)
+    refuses("E-REGISTER-FILE … similarity", locate.goal_chain, registration=similar)
 
 
 def test_a_hand_eye_result_leads_to_the_base():
@@ -192,5 +189,4 @@ def test_a_hand_eye_result_leads_to_the_base():
     chain = locate.goal_chain(found, robot_poses={"one": flange[0]})
     assert chain.moving
     np.testing.assert_allclose(chain.mount.rigid.matrix(), mount.matrix(), atol=1e-6)
-    with fails_with("E-OPTION-MISSING … the camera is on the flange"):
-        locate.goal_chain(found)
+    refuses("E-OPTION-MISSING … the camera is on the flange", locate.goal_chain, found)

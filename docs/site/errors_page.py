@@ -44,27 +44,28 @@ LINES_ABOVE = 8
 class _Texts(ast.NodeTransformer):
     """Puts texts that are given a name just above, such as ``fault = f"…"``, in place of the name."""
 
-    def __init__(self, tree: ast.Module):
-        assigned = (node for node in ast.walk(tree) if isinstance(node, ast.Assign))
+    def __init__(self, nodes: list[ast.AST]):
+        assigned = (node for node in nodes if isinstance(node, ast.Assign))
         texts = [node for node in assigned if isinstance(node.value, ast.JoinedStr | ast.Constant)]
         self.texts = [(node.lineno, ast.unparse(node.targets[0]), node.value) for node in texts]
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
         near = [text for at, name, text in self.texts if name == node.id and 0 < node.lineno - at <= LINES_ABOVE]
-        return near[-1] if near and isinstance(getattr(near[-1], "value", ""), str) else node
+        return self.visit(near[-1]) if near and isinstance(getattr(near[-1], "value", ""), str) else node
 
 
 def errors_in(source: str) -> Iterator[tuple[str, str, str]]:
     """(class, code, sentence) of each error that a module makes: calls with a code and a text, in this order."""
-    tree = ast.parse(source)
-    for node in ast.walk(_Texts(tree).visit(tree)):
+    nodes = list(ast.walk(ast.parse(source)))
+    texts = _Texts(nodes)
+    for node in nodes:
         if isinstance(node, ast.Tuple):  # code, text = "E-…", f"…"
             node = ast.Call(ast.Name("InputError"), node.elts, [])
         if not isinstance(node, ast.Call):
             continue
         for code, text in zip(node.args, node.args[1:], strict=False):
             if isinstance(code, ast.Constant) and CODE.fullmatch(str(code.value)):
-                yield ast.unparse(node.func), str(code.value), sentence(text)
+                yield ast.unparse(node.func), str(code.value), sentence(texts.visit(text))
 
 
 @functools.cache

@@ -16,15 +16,13 @@ without and with polishing; what λ = 1 means with lengths in m, cm and mm; the 
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, head, row, script
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
 from stcal.handeye.data.pose_pairs import Loop, Motions
 from stcal.handeye.handeye_problem import UNIT_MM, HandEyeProblem
 from stcal.handeye.methods.closed_form import Bounds, EvolutionOptions, Objective, evolve, polish
-from stcal.parallel import one_thread
-from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views
 
 POSES, FITTED = 25, 18
@@ -101,36 +99,32 @@ def by_unit(truth: Truth, motions: Motions) -> dict[str, tuple[float, float]]:
 def print_tables(trials: list[dict]) -> None:
     """Markdown."""
     print("\nObjective that differential evolution reaches, over its minimum\n")
-    print("| first population | median | 90 % | worst | below 1.001 | below 1.1 |\n|---|---|---|---|---|---|")
+    head("first population", "median", "90 %", "worst", "below 1.001", "below 1.1")
     for name in trials[0]["ratios"]:
         values = np.array([each["ratios"][name] for each in trials])
-        share = f"{(values < 1.001).sum()} of {len(values)} | {(values < 1.1).sum()} of {len(values)}"
-        print(f"| {name} | {np.median(values):.6g} | {np.quantile(values, 0.9):.4g} | {values.max():.4g} | {share} |")
+        shares = (f"{(values < most).sum()} of {len(values)}" for most in (1.001, 1.1))
+        row(name, f"{np.median(values):.6g}", f"{np.quantile(values, 0.9):.4g}", f"{values.max():.4g}", *shares)
     print("\nX at the minimum of the objective with λ = 1: median over all seeds (worst seed)\n")
-    print("| lengths in | X, mm | X, ° |\n|---|---|---|")
+    head("lengths in", "X, mm", "X, °")
     for name in UNITS:
         mm, rad = np.array([each["units"][name] for each in trials]).T
-        print(f"| {name} | {np.median(mm):.3f} ({mm.max():.3g}) | ", end="")
-        print(f"{np.degrees(np.median(rad)):.3f} ({np.degrees(rad.max()):.3g}) |")
+        row(name, *map(median_worst, (mm, np.degrees(rad))))
     print("\nHeld-out motions, and X itself: median over all seeds (worst seed)\n")
-    print("| method | Â, mm | Â, ° | X, mm | X, ° | failed |\n|---|---|---|---|---|---|")
+    head("method", "Â, mm", "Â, °", "X, mm", "X, °", "failed")
     for method in METHODS:
         good = [each[method] for each in trials if not isinstance(each[method], str)]
         motions, own = np.array([m.mean(0) for m, _ in good]), np.array([x for _, x in good])
         columns = [motions[:, 0], np.degrees(motions[:, 1]), own[:, 0], np.degrees(own[:, 1])]
-        cells = " | ".join(f"{np.median(c):.3f} ({c.max():.3g})" for c in columns)
-        print(f"| {method} | {cells} | {len(trials) - len(good)} |")
+        row(method, *map(median_worst, columns), len(trials) - len(good))
 
 
-@one_thread()
-def main() -> None:
-    """Run the seeds; print."""
-    arguments = options_of(__doc__, seeds=100, scheduler=str)
+def median_worst(values: np.ndarray) -> str:
+    return f"{np.median(values):.3f} ({values.max():.3g})"
+
+
+@script(seeds=100, scheduler=str, limited=True)
+def main(arguments) -> None:
     with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))
     print(f"{arguments.seeds} seeds, simulated; {FITTED} motions to solve with, {POSES - 1 - FITTED} held out")
     print_tables(trials)
-
-
-if __name__ == "__main__":
-    main()

@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import face_errors, head, row, script
 from stcal.errors import StcalError
-from stcal.geometry.rigid import Rigid, align_rigid
+from stcal.geometry.rigid import align_rigid
 from stcal.labels import dot_cells
-from stcal.parallel import one_thread
 from stcal.sfm import run
 from stcal.sfm.data.group_model import WorldModel
 from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, Answer, in_steps
@@ -72,12 +71,9 @@ def errors(answer: Answer, scene: Scene, predicted_um: dict[str, float] | None =
     """Errors against the scene."""
     boards = [board_errors(m, answer.scales[m.group].mm_per_unit, scene) for m in answer.models]
     faces = {}
-    for face, true in scene.target_from_face.items():
-        if face != scene.reference_face:
-            pose = answer.target.target_from_face[face]
-            turn = Rigid(pose.rotation @ true.rotation.T).angle_rad()
-            shift = np.linalg.norm(pose.translation - true.translation)
-            faces[face] = (1e3 * float(shift), 1e3 * float(np.degrees(turn)))
+    for face, off in face_errors(answer.target, scene.target_from_face).items():
+        turn, shift = np.linalg.norm(off.reshape(2, 3), axis=1)
+        faces[face] = (1e3 * float(shift), 1e3 * float(np.degrees(turn)))
     return Errors(faces, tuple(np.mean(boards, axis=0)), predicted_um or {})
 
 
@@ -111,34 +107,29 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
     boards = np.array([[each[m].board_um for m in methods] for each in trials])
     poses = np.array([[[each[m].faces[f] for f in faces] for m in methods] for each in trials])
     predicted = np.array([[each[OURS].predicted_um[f] for f in faces] for each in trials])
-    print(
-        "\nTable 1: length of the board residuals, µm: mean ± standard deviation against the design (mean against the"
-    )
-    print("true dots)\n")
-    print(f"| trial | published | {' | '.join(methods)} |\n|---|---|{'---|' * len(methods)}")
+    said = "mean ± standard deviation against the design (mean against the\ntrue dots)"
+    print(f"\nTable 1: length of the board residuals, µm: {said}\n")
+    head("trial", "published", *methods)
     both = zip(PUBLISHED_UM, PUBLISHED_SPREAD_UM, strict=True)
     published = [f"{um:.1f} ± {spread:.1f}" for um, spread in both] + [""] * len(trials)
-    rows = [(f"{i + 1}", published[i], row) for i, row in enumerate(boards)]
+    rows = [(f"{i + 1}", published[i], own) for i, own in enumerate(boards)]
     known = f"{np.mean(PUBLISHED_UM):.1f} ± {np.mean(PUBLISHED_SPREAD_UM):.1f}"
-    for name, shown, row in (*rows, ("mean", known, boards.mean(0))):
-        cells = " | ".join(f"{design:.1f} ± {spread:.1f} ({true:.1f})" for design, true, spread in row)
-        print(f"| {name} | {shown} | {cells} |")
+    for name, shown, own in (*rows, ("mean", known, boards.mean(0))):
+        row(name, shown, *(f"{design:.1f} ± {spread:.1f} ({true:.1f})" for design, true, spread in own))
     print("\nTable 2: errors of target_from_face, mean over the trials\n")
-    print(f"| face | {' | '.join(methods)} |\n|---|{'---|' * len(methods)}")
-    for face, row in zip(faces, poses.mean(0).swapaxes(0, 1), strict=True):
-        print(f"| {face} | {' | '.join(f'{um:.1f} µm, {mdeg:.1f} mdeg' for um, mdeg in row)} |")
+    head("face", *methods)
+    for face, own in zip(faces, poses.mean(0).swapaxes(0, 1), strict=True):
+        row(face, *(f"{um:.1f} µm, {mdeg:.1f} mdeg" for um, mdeg in own))
     print("\nOurs, RMS over the trials (goal)\n")
-    print("| face | position, µm | predicted σ, µm | rotation, mdeg |\n|---|---|---|---|")
+    head("face", "position, µm", "predicted σ, µm", "rotation, mdeg")
     own = np.sqrt((poses[:, methods.index(OURS)] ** 2).mean(0))
     for face, (um, mdeg), sigma in zip(faces, own, np.sqrt((predicted**2).mean(0)), strict=True):
         goal_um, goal_mdeg = GOALS[face]
-        print(f"| {face} | {um:.2f} ({goal_um:g}) | {sigma:.2f} | {mdeg:.2f} ({goal_mdeg or '–'}) |")
+        row(face, f"{um:.2f} ({goal_um:g})", f"{sigma:.2f}", f"{mdeg:.2f} ({goal_mdeg or '–'})")
 
 
-@one_thread()
-def main() -> None:
-    """Run the trials; print."""
-    arguments = options_of(__doc__, trials=5, width=5184, keep=Path)
+@script(trials=5, width=5184, keep=Path, limited=True)
+def main(arguments) -> None:
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(1, arguments.trials + 1):
@@ -148,7 +139,3 @@ def main() -> None:
             print(f"trial {seed} of {arguments.trials} done", flush=True)
     print(f"\nSimulated photographs, {arguments.width} px wide, 10 a group, board σ 5 µm")
     print_tables(trials)
-
-
-if __name__ == "__main__":
-    main()

@@ -20,10 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import comb
 
-from scripts.runner import options_of
+from scripts.runner import row, script
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.consensus import MODELS, problem_of
 from stcal.register.registration import Liu2017Options, affine_least_squares, liu2017
@@ -136,9 +135,8 @@ def solved(cell: Cell, points: Points) -> dict:
     ways[FIELD] = lambda new: found.b_from_a @ new.a + field.at(new.a)[0]
     ways[AFFINE] = lambda new: affine @ new.a
     try:
-        robot = grown(cell.drawn, measurements(points), good, IdentifyOptions("position", folds=0, partial=True))[
-            0
-        ].robot
+        options = IdentifyOptions("position", folds=0, partial=True)
+        robot = grown(cell.drawn, measurements(points), good, options)[0].robot
         ways[TOGETHER] = lambda new: positions(robot, measurements(new))
     except StcalError:  # places alone, with the tool down, hardly tell the wrist's axes
         pass
@@ -156,19 +154,16 @@ def trial(seed: int, case: tuple[float, float]) -> dict[str, tuple[np.ndarray, n
     cell = Cell.of(rng)
     tests = [cell.points(TESTS, side, case[1], rng) for side in (SMALL, LARGE)]
     ways = solved(cell, cell.measured(POINTS, SMALL, case, rng))
-    return {
-        name: tuple(np.linalg.norm(test.b - predict(test), axis=1) for test in tests) for name, predict in ways.items()
-    }
+    errors = {name: [test.b - predict(test) for test in tests] for name, predict in ways.items()}
+    return {name: tuple(np.linalg.norm(each, axis=1) for each in both) for name, both in errors.items()}
 
 
 def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
     """Markdown: medians over the robots of the mean error of 50 points."""
-    print(
-        "\nMean error of 50 new points, µm, median over the robots: in the cube of the fit (200 mm) / in one of 400\n"
-    )
+    said = "median over the robots: in the cube of the fit (200 mm) / in one of 400"
+    print(f"\nMean error of 50 new points, µm, {said}\n")
     names = [f"{share:.0%} wrong{', tool tilted' if tilt else ''}" for share, tilt in trials]
-    print(f"| | {' | '.join(names)} |")
-    print(f"|---|{'---|' * len(trials)}")
+    print(f"| | {' | '.join(names)} |\n|---|{'---|' * len(trials)}")
     for name in METHODS:
         cells = []
         for each in trials.values():
@@ -179,7 +174,7 @@ def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
                 cells.append(f"{small:.0f} / {large:.0f}{missing}")
             else:
                 cells.append("none delivered")
-        print(f"| {name} | {' | '.join(cells)} |")
+        row(name, *cells)
     for share in dict.fromkeys(share for share, _ in trials):
         good = round((1 - share) * POINTS)
         chance = comb(good, SAMPLE, exact=True) / comb(POINTS, SAMPLE, exact=True)
@@ -187,15 +182,9 @@ def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
         print(f"{comb(good, 3, exact=True) / comb(POINTS, 3, exact=True):.2g}")
 
 
-@one_thread()
-def main() -> None:
-    """Run the trials; print."""
-    arguments = options_of(__doc__, trials=6)
+@script(trials=6, limited=True)
+def main(arguments) -> None:
     robots = f"{arguments.trials} robots as made, wrong points off by {OFF_MM[0]:g} to {OFF_MM[1]:g} mm"
     print(f"Simulated: {POINTS} points in a cube of {SMALL:.0f} mm, {SIGMA_MM} mm noise, {robots}")
     trials = {case: [trial(seed, case) for seed in range(arguments.trials)] for case in CASES}
     print_table(trials)
-
-
-if __name__ == "__main__":
-    main()

@@ -16,10 +16,9 @@ from functools import cache
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
-from stcal.parallel import one_thread
 from stcal.robot.axes.axes_model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals
@@ -35,7 +34,6 @@ from stcal.robot.use.evaluation import MeasuredPoses, SetResult, verify
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 from tests.support.image_poses import KnownTarget, known_target, pose_error, see
 
 PUBLISHED = {"mean": (0.6493, 0.4742), "std": (0.5596, 0.2967), "max": (2.1259, 1.3311)}
@@ -300,9 +298,8 @@ def verified(targets: Targets, reached: dict[str, tuple[np.ndarray, np.ndarray]]
     rows = np.concatenate([rows for rows, _ in reached.values()])
     sets = tuple(name for name, (own, _) in reached.items() for _ in own)
     xyz = np.concatenate([xyz for _, xyz in reached.values()])
-    data = MeasuredPoses(
-        "commanded", range(len(rows)), sets, tuple(map(str, rows)), targets.poses.translation[rows], xyz
-    )
+    wanted = tuple(map(str, rows)), targets.poses.translation[rows]
+    data = MeasuredPoses("commanded", range(len(rows)), sets, *wanted, xyz)
     return {each.name: each for each in verify(data).sets}
 
 
@@ -313,8 +310,8 @@ def figures(draws: list[Draw], kind: str, model: str) -> np.ndarray:
 
 def print_table(draws: list[Draw]) -> None:
     """Markdown; beside the published figures ours, means over the draws."""
-    print("| 51 positions | model | mean, mm | std, mm | max, mm | mean reduced by | worst arm | max by |")
-    print("|---|---|---|---|---|---|---|---|")
+    reduced = "mean reduced by", "worst arm", "max by"
+    head("51 positions", "model", "mean, mm", "std, mm", "max, mm", *reduced)
     cells = [f"{before:.4f} → {after:.4f}" for before, after in PUBLISHED.values()]
     mean, most = (f"{100 * (1 - PUBLISHED[key][1] / PUBLISHED[key][0]):.0f} %" for key in ("mean", "max"))
     print(f"| published, by laser tracker | {CMMK} | {' | '.join(cells)} | {mean} | | {most} |")
@@ -324,14 +321,12 @@ def print_table(draws: list[Draw]) -> None:
             after = figures(draws, kind, model)
             cells = [f"{b:.4f} → {a:.4f}" for b, a in zip(before.mean(0), after.mean(0), strict=True)]
             gain = 100 * (1 - after / before)
-            spread = f"{gain[:, 0].mean():.1f} ± {gain[:, 0].std(ddof=1):.1f} % | {gain[:, 0].min():.1f} %"
-            print(f"| {kind} | {model} | {' | '.join(cells)} | {spread} | {gain[:, 2].mean():.1f} % |")
+            reduced = f"{gain[:, 0].mean():.1f} ± {gain[:, 0].std(ddof=1):.1f} %", f"{gain[:, 0].min():.1f} %"
+            row(kind, model, *cells, *reduced, f"{gain[:, 2].mean():.1f} %")
 
 
-@one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, draws=100, seed=0, gears=0.0, scheduler=str)
+@script(draws=100, seed=0, gears=0.0, scheduler=str, limited=True)
+def main(given) -> None:
     start = time.perf_counter()
     sweeps()  # once, before the processes part
     for kind in (FAR, NEAR):
@@ -355,7 +350,3 @@ def main() -> None:
         f"with the poses taken as independent {untold:.1f}."
     )
     print(f"\n{time.perf_counter() - start:.0f} s")
-
-
-if __name__ == "__main__":
-    main()

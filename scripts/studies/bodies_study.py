@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import head, row, script
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
@@ -63,23 +63,16 @@ def draw(name: str, seed: int) -> list[FaceErrors] | str:
         folder = Path(scratch)
         write_body(folder / "set", make_body_scene(target, body_camera(WIDTH), options), workers=1)
         try:
-            pipeline.run(
-                folder / "set/images",
-                None,
-                folder / "run",
-                folder / "set/target.toml",
-                options=RunOptions(workers=1),
-            )
+            own = folder / "set/images", None, folder / "run", folder / "set/target.toml"
+            pipeline.run(*own, options=RunOptions(workers=1))
             return list(compare(folder / "run", folder / "set/truth.json").faces.values())
         except StcalError as error:
             return str(error)
 
 
-def main() -> None:
-    """Print the table."""
-    arguments = options_of(__doc__, draws=10, body="")
-    print("| body | draws | faces found | error of a position, µm RMS | of a rotation, mdeg RMS | NEES |")
-    print("|---|---|---|---|---|---|", flush=True)
+@script(draws=10, body="")
+def main(arguments) -> None:
+    head("body", "draws", "faces found", "error of a position, µm RMS", "of a rotation, mdeg RMS", "NEES")
     names = [name for name in BODIES if arguments.body in f"{name}, {BODIES[name][0].name}"]
     seeds = range(arguments.draws)
     pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
@@ -98,13 +91,6 @@ def main() -> None:
             float(np.sqrt(np.mean([getattr(face, key) ** 2 for face in judged])))
             for key in ("translation_um", "rotation_mdeg", "normalised_error")
         )
-        wanted = len(BODIES[name][0].faces) * arguments.draws
-        print(
-            f"| {name} | {arguments.draws - lost} of {arguments.draws} | {len(faces)} of {wanted} | {position:.0f} | "
-            f"{rotation:.0f} | {sigmas**2:.2f} |",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()
+        counts = f"{arguments.draws - lost} of {arguments.draws}", len(faces), len(BODIES[name][0].faces)
+        found = f"{counts[1]} of {counts[2] * arguments.draws}"
+        row(name, counts[0], found, f"{position:.0f}", f"{rotation:.0f}", f"{sigmas**2:.2f}")

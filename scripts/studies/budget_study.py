@@ -21,13 +21,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import norm
 
-from scripts.runner import head, options_of, row
+from scripts.runner import executor_of, head, row, script
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity, align_rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import SigmaFactors, calibrate, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjusted
@@ -38,7 +37,6 @@ from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 GROUPS = ("1", "2"), ("1", "4"), ("1", "5")
 NOISE_PX = 0.02
@@ -107,10 +105,10 @@ def single_inputs(seed: int, count: int) -> np.ndarray:
 
 
 def drawn(
-    case: Case, which: str, single: np.ndarray, rng: np.random.Generator
+    case: Case, which: str, single: np.ndarray, rng: np.random.Generator, common: float = ONE_PLATE
 ) -> tuple[list[MetricModel], dict[CircleLabel, np.ndarray]]:
     """Models as photographed in a simulated calibration, with their true circles (at the reference temperature) by
-    label; ``single`` : of :func:`single_inputs`."""
+    label; ``single`` : of :func:`single_inputs`; ``common`` : share of the board's variance that all groups have."""
     on = set(ALONE) if which == ALL else {which}
     unit = dict(zip(SINGLE, single, strict=False))
     off = {key: unit[key] if key in on else 0.0 for key in SINGLE}
@@ -130,7 +128,7 @@ def drawn(
             normal = case.scene.target_from_face[label.face].rotation[:, 2]
             circles[label] = circles[label] + case.flatness_mm * rng.standard_normal() * normal
     dots = case.scene.board.labels()
-    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - ONE_PLATE, ONE_PLATE))
+    own, plate = (np.sqrt(share) * BOARD_SIGMA_MM * ("board_dots" in on) for share in (1 - common, common))
     plate = plate * rng.standard_normal((len(dots), 3))
     radius = case.scene.target.radius_of() | case.scene.board.radius_of()
     models = []
@@ -182,10 +180,12 @@ def stated_by(case: Case) -> Stated:
     return Stated(factors, found.joint.board_common, rows)
 
 
-def errors(case: Case, stated: Stated, which: str, single: np.ndarray, seed: int) -> list[np.ndarray]:
+def errors(
+    case: Case, stated: Stated, which: str, single: np.ndarray, seed: int, common: float = ONE_PLATE
+) -> list[np.ndarray]:
     """Error (r,) of each measurand of the budget in one simulated calibration, mm and rad; arguments as of
     :func:`drawn`."""
-    models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]))
+    models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]), common)
     if which == ALL:
         joint = whole(case, models)[0]
     else:
@@ -195,7 +195,7 @@ def errors(case: Case, stated: Stated, which: str, single: np.ndarray, seed: int
     true = np.array([circles[label] for label in joint.labels])
     xyz = joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction)
     away = align_rigid(true, xyz) @ xyz - true  # moved as one: derivatives are for small moves
-    return [row.measurand.jacobian @ away.ravel() for row in stated.budget.rows]
+    return [each.measurand.jacobian @ away.ravel() for each in stated.budget.rows]
 
 
 def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float, float], float, float]:
@@ -210,15 +210,13 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
         inside.append((length <= own.expanded).mean())
         if predicted > LEAST * own.standard:
             shares.append((length**2).mean() / predicted**2)
-    expected = np.mean([row.coverage for row in stated.budget.rows])
+    expected = np.mean([own.coverage for own in stated.budget.rows])
     single = 1 / np.sqrt(shares)
     return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 
 
-@one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, runs=200, only="", scheduler=str)
+@script(runs=200, only="", scheduler=str, limited=True)
+def main(given) -> None:
     fixed, refined = case_of(False), case_of(True)
     said = f"3 groups of 6 images, 2592×1728 px, {NOISE_PX} px (simulated centres)"
     print(f"{given.runs} simulated calibrations a row, {said}\n")
@@ -231,7 +229,3 @@ def main() -> None:
                 ratio, *covered = study(case, which, given.runs, pool.map)
                 covered = [f"{100 * share:.1f}" if which == ALL else "–" for share in covered]
                 row(title, *(f"{each:.3f}" for each in ratio), *covered)
-
-
-if __name__ == "__main__":
-    main()

@@ -4,13 +4,13 @@ fitted, and their files compared with OpenCV's projection, or the programs' form
 .venv/bin/python scripts/studies/camera_formats.py [../shared/cases]
 """
 
-import sys
 import tempfile
 import warnings
 from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import head, row, script
 from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import fit_lens
@@ -91,11 +91,8 @@ def held(form: str, folder: Path) -> list[str]:
             lost.update(made.lost)
         if (read.width, read.height) != (WIDTH, HEIGHT):
             lost.add("the image's size")
-    return [
-        "all" if back == list(LENSES) else "; ".join(back),
-        "; ".join(refused) or "–",
-        "; ".join(sorted(lost)) or "–",
-    ]
+    exactly = "all" if back == list(LENSES) else "; ".join(back)
+    return [exactly, "; ".join(refused) or "–", "; ".join(sorted(lost)) or "–"]
 
 
 def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
@@ -109,39 +106,33 @@ def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
     return f"{called} | {f'{off:.2g}' if off > EXACT_PX else 'less than 1e-9'}"
 
 
-def main() -> None:
+@script({"cases": ""})
+def main(given) -> None:
     warnings.simplefilter("ignore", InputNote)
-    print("| `--form` | read back exactly | refused | lost |")
-    print("|---|---|---|---|")
+    head("`--form`", "read back exactly", "refused", "lost")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         for form in WRITERS:
-            print(f"| `{form}` | {' | '.join(held(form, folder))} |")
-        print("\n| program | lens | fitted | px RMS | px at most | turned |")
-        print("|---|---|---|---|---|---|")
+            row(f"`{form}`", *held(form, folder))
+        print()
+        head("program", "lens", "fitted", "px RMS", "px at most", "turned")
         for (program, name), text in TRIED.items():
             (folder / "camera").write_text(text.format(WIDTH, HEIGHT))
             lens = read_lens(folder / "camera")
             assert isinstance(lens, ForeignLens)
             found = fit_lens(lens, WIDTH, HEIGHT)
             turn = np.degrees(found.camera_from_lens.angle_rad())
-            figures = f"{found.rms_px:.4f} | {found.most_px:.3f} | {f'{turn:.2f}°' if turn else '–'}"
-            print(f"| {program} | {name} | {found.camera.colmap_model} | {figures} |")
-        print("\n| written by | read as | px off at most |")
-        print("|---|---|---|")
+            figures = f"{found.rms_px:.4f}", f"{found.most_px:.3f}", f"{turn:.2f}°" if turn else "–"
+            row(program, name, found.camera.colmap_model, *figures)
+        print()
+        head("written by", "read as", "px off at most")
         for program, (text, wanted) in camera_files.FILES.items():
             (folder / "camera").write_text(text)
-            print(f"| {program} | {read_as(folder / 'camera', '', camera_files.RAYS, wanted)} |")
-    if len(sys.argv) < 2:
+            row(program, read_as(folder / "camera", "", camera_files.RAYS, wanted))
+    if not given.cases:
         return
-    print("\n| reported file | read as | px off at most |")
-    print("|---|---|---|")
+    print()
+    head("reported file", "read as", "px off at most")
     for (place, name), wanted in reported_cameras.CASES.items():
-        chosen = f" {name}" if name else ""
-        print(f"| {place}{chosen} | {read_as(Path(sys.argv[1]) / place, name, reported_cameras.RAYS, wanted())} |")
-    for (place, _), why in reported_cameras.REFUSED.items():
-        print(f"| {place} | refused: {why.split(' … ')[0]} | – |")
-
-
-if __name__ == "__main__":
-    main()
+        own = read_as(Path(given.cases) / place, name, reported_cameras.RAYS, wanted())
+        row(f"{place} {name}".strip(), own)

@@ -25,7 +25,8 @@ import pycolmap
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import options_of
+from scripts.runner import DATA, head, script
+from scripts.runner import row as print_row
 from stcal.boards.board_file import board_of
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
@@ -46,7 +47,6 @@ SIZE = 2592, 1728
 VIEWS = 15
 NOISE_PX = 0.02
 MODEL, MRCAL_MODEL = "OPENCV", "LENSMODEL_OPENCV4"
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "stereo_target"
 SETS = ("clean", "clutter", "white_block")
 
 
@@ -215,8 +215,8 @@ def as_near(squares: np.ndarray, best: np.ndarray) -> bool:
     return bool(further.mean() <= 2 * further.std(ddof=min(1, len(best) - 1)) / np.sqrt(len(best)))
 
 
-def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
-    """RMS of the trials; the nearest to the truth over the image, and what is as near, in bold."""
+def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> None:
+    """Prints RMS of the trials; the nearest to the truth over the image, and what is as near, in bold."""
     squares = {way: np.square([trial.get(way, (np.nan, np.nan)) for trial in trials]) for way in COLUMNS}
     rms = {way: np.sqrt(each.mean(axis=0)) for way, each in squares.items()}
     best = squares[min((way for way in COLUMNS if np.isfinite(rms[way][0])), key=lambda way: rms[way][0])][:, 0]
@@ -225,23 +225,21 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> str:
         whole, inside = rms[way]
         bold = "**" if as_near(squares[way][:, 0], best) else ""
         cells.append(f"{bold}{whole:.4f} ({inside:.4f}){bold}" if np.isfinite(whole) else "–")
-    return f"| {name} | {len(trials)} | " + " | ".join(cells) + " |"
+    print_row(name, len(trials), *cells)
 
 
-def main() -> None:
-    """Simulate, calibrate, print."""
-    options = options_of(__doc__, trials=60)
-    print(f"| px RMS over the image (where dots are) | trials | {' | '.join(COLUMNS)} |")
-    print("|---|" + "---|" * (len(COLUMNS) + 1))
+@script(trials=60)
+def main(options) -> None:
+    head("px RMS over the image (where dots are)", "trials", *COLUMNS)
     peers = WAYS | {FREE: by_free_mrcal}
     for name, (board, sigma_mm, bow_mm) in boards().items():
         trials = []
         for seed in range(options.trials):
             views = simulated(board, sigma_mm, bow_mm, np.random.default_rng(seed))
             trials.append({way: errors(calibrate(views, board, SIZE), TRUE, views) for way, calibrate in peers.items()})
-        print(row(f"simulated {name}", trials), flush=True)
-    for name in SETS if DATA.is_dir() else ():
-        folder = DATA / name
+        row(f"simulated {name}", trials)
+    for name in SETS if (DATA / "stereo_target").is_dir() else ():
+        folder = DATA / "stereo_target" / name
         target_file, board_file = (p if p.exists() else None for p in (folder / "target.toml", folder / "board.toml"))
         target, board = target_of(target_file), board_of(board_file)
         found = calibrate_camera(folder / "images", target, board, MODEL)
@@ -251,8 +249,4 @@ def main() -> None:
         own = found.intrinsics.camera
         ways |= {"stcal": own, TARGET: with_the_target(folder, own, (target_file, board_file))}
         trial = {way: errors(camera, truth, found.views) for way, camera in ways.items()}
-        print(row(f"rendered {name}, {len(found.views)} views", [trial]), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        row(f"rendered {name}, {len(found.views)} views", [trial])

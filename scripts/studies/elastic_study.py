@@ -19,15 +19,13 @@ joint vectors carry 0 … 100 kg. ``unknown`` : identified without the masses, a
 so do the new joint vectors. Columns as without.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
@@ -35,7 +33,6 @@ from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, elastic, two_arms
 
 NEW_POSES = 50
@@ -196,43 +193,25 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
 
-@one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    arguments = options_of(__doc__, draws=200, only="", scheduler=str, payload=False, trees=False, approach=False)
-    print(f"{arguments.draws} draws each, simulated\n")
-    if arguments.payload:
-        payloads(arguments)
-        return
-    print("| observed | rows | usual σ × | elastic taken | rigid, mm | elastic, mm | auto, mm | bound | NEES |")
-    print("|---" * 9 + "|")
-    cases = TREES if arguments.trees else LOOSE if arguments.approach else CASES
-    with executor_of(arguments.scheduler) as pool:
-        for case in (each for each in cases if each.title().startswith(arguments.only)):
-            taken, squares, normal = zip(*pool.map(partial(draw, case), range(arguments.draws)), strict=True)
-            rms = np.sqrt(np.mean(squares, axis=0))
-            cells = [str(sum(taken)), *(f"{value:.3f}" for value in rms[:3])]
-            cells += [f"{rms[1] / rms[3]:.2f}", nees(np.array(normal))]
-            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
-
-
-def payloads(arguments: argparse.Namespace) -> None:
-    """Run the cases with payloads; print."""
-    print("| observed | rows | payloads, kg | unknown, mm | known, mm | bound | NEES | axis |")
-    print("|---" * 8 + "|")
-    with executor_of(arguments.scheduler) as pool:
-        for case in (each for each in LOADED if each.title().startswith(arguments.only)):
-            squares, normal = zip(*pool.map(partial(draw_loaded, case), range(arguments.draws)), strict=True)
-            rms = np.sqrt(np.mean(squares, axis=0))
-            cells = [*(f"{value:.3f}" for value in rms[:2]), f"{rms[1] / rms[2]:.2f}"]
-            cells += [nees(each) for each in np.transpose(normal)]
-            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
-
-
 def nees(each: np.ndarray) -> str:
     """Of draws (d,)."""
     return f"{each.mean():.2f} ± {each.std() / np.sqrt(len(each)):.2f}"
 
 
-if __name__ == "__main__":
-    main()
+@script(draws=200, only="", scheduler=str, payload=False, trees=False, approach=False, limited=True)
+def main(arguments) -> None:
+    print(f"{arguments.draws} draws each, simulated\n")
+    if arguments.payload:
+        head("observed", "rows", "payloads, kg", "unknown, mm", "known, mm", "bound", "NEES", "axis")
+        cases, one = LOADED, draw_loaded
+    else:
+        rms = "rigid, mm", "elastic, mm", "auto, mm"
+        head("observed", "rows", "usual σ ×", "elastic taken", *rms, "bound", "NEES")
+        cases, one = TREES if arguments.trees else LOOSE if arguments.approach else CASES, draw
+    with executor_of(arguments.scheduler) as pool:
+        for case in (each for each in cases if each.title().startswith(arguments.only)):
+            *taken, squares, normal = zip(*pool.map(partial(one, case), range(arguments.draws)), strict=True)
+            rms = np.sqrt(np.mean(squares, axis=0))
+            figures = (f"{value:.3f}" for value in rms[:-1])
+            squared = np.transpose(np.reshape(normal, (arguments.draws, -1)))
+            row(case.title(), *map(sum, taken), *figures, f"{rms[1] / rms[-1]:.2f}", *map(nees, squared))

@@ -24,11 +24,12 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import SAMPLE, face_errors, normalised, script
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
@@ -40,11 +41,10 @@ from stcal.sfm.runs.saved import RunResult
 from tests.support import degrade
 from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
 
-ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = ROOT / "tests" / "data" / "sample"
 NEAR_PX, NEAR_RADII = 1.5, 0.25
 SILENT_SIGMA = 4.0
 Place = Callable[[np.ndarray], np.ndarray]
+Make = Callable[[Photograph, Any, "Case"], "Picture"]
 
 
 @dataclass
@@ -85,43 +85,35 @@ class Kind:
     name: str
     unit: str
     values: tuple
-    make: Callable[[Photograph, float, Case], Picture]
+    make: Make
     goal: int = 5
     camera: Callable[[Case], Camera] | None = None
     may_end: tuple[int, ...] = ()
 
 
-def simple(function: Callable[..., np.ndarray], *words) -> Callable[[Photograph, float, Case], Picture]:
-    """A kind that takes pixels and strength alone."""
-    return lambda photo, value, case: Picture(function(photo.grey, value, *words))
+def simple(function: Callable[..., np.ndarray | bytes], more: Callable | None = None) -> Make:
+    """A kind that takes pixels, strength, and perhaps what ``more`` gives for a photograph."""
+    return lambda photo, value, case: Picture(function(photo.grey, value, *([more(photo, case)] if more else [])))
+
+
+def of_photo(function: Callable[[Photograph, float], np.ndarray]) -> Make:
+    return lambda photo, value, case: Picture(function(photo, value))
+
+
+def seeded(photo: Photograph, case: Case) -> int:
+    return case.seed(photo.name)
+
+
+def on_sensor(_: Photograph, case: Case) -> int:
+    """The same places in all photographs."""
+    return case.seed()
+
+
+def angle(most: float) -> Callable[[Photograph, Case], float]:
+    return lambda photo, case: case.rng(photo.name).uniform(0, most)
 
 
 # ---------------------------------------------------------------- kinds
-
-
-def plain(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture((case.data.folder / "images" / photo.name).read_bytes())
-
-
-def motion(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.motion_blurred(photo.grey, value, case.rng(photo.name).uniform(0, np.pi)))
-
-
-def noise(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.noisy(photo.grey, value, case.seed(photo.name)))
-
-
-def gradient(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.graded(photo.grey, value, case.rng(photo.name).uniform(0, 2 * np.pi)))
-
-
-def on_sensor(function) -> Callable[[Photograph, float, Case], Picture]:
-    """The same places in all photographs."""
-    return lambda photo, value, case: Picture(function(photo.grey, value, case.seed()))
-
-
-def haze(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.hazy(photo.grey, value, case.seed(photo.name)))
 
 
 def dim_face(photo: Photograph, value: float, case: Case) -> Picture:
@@ -188,27 +180,10 @@ def cover_one_board(photo: Photograph, value: float, case: Case) -> Picture:
     return cover_board(photo, value, case) if photo.number == 0 else Picture(photo.grey)
 
 
-def uneven(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.unevenly_lit(photo, value))
-
-
-def half(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.half_darker(photo, value))
-
-
-def file_of_quality(photo: Photograph, value: float, case: Case) -> Picture:
-    return Picture(degrade.jpeg(photo.grey, int(value)))
-
-
 def rolling(photo: Photograph, value: float, case: Case) -> Picture:
     shift = value * case.rng(photo.name).choice([-1, 1])
     height = photo.grey.shape[0]
     return Picture(degrade.rolling_shutter(photo.grey, shift), place=lambda xy: degrade.rolled(xy, shift, height))
-
-
-def deep(photo: Photograph, value: float, case: Case) -> Picture:
-    """Sensors of 10 to 16 bits, their values kept as they are."""
-    return Picture(photo.grey.astype(np.float32), bits=int(value))
 
 
 def small_camera(case: Case) -> Camera:
@@ -239,14 +214,8 @@ MIRRORED = ("one image", "some", "1 a group", "a group", "all")
 def mirror_images(photo: Photograph, value, case: Case) -> Picture:
     groups = list(case.data.truth["groups"])
     at = groups.index(photo.group)
-    hit = {
-        "one image": at == photo.number == 0,
-        "some": photo.number == 0 and at % 2 == 0,
-        "1 a group": photo.number == 0,
-        "a group": at == len(groups) - 1,
-        "all": True,
-    }[value]
-    if not hit:
+    first, last = photo.number == 0, at == len(groups) - 1
+    if not dict(zip(MIRRORED, (at == photo.number == 0, first and at % 2 == 0, first, last, True), strict=True))[value]:
         return Picture(photo.grey)
     width = photo.grey.shape[1]
     place = lambda xy: np.stack([width - 1 - np.asarray(xy)[..., 0], np.asarray(xy)[..., 1]], axis=-1)  # noqa: E731
@@ -377,29 +346,30 @@ def all_faces(photo: Photograph) -> tuple[Plane, ...]:
     return (*photo.faces, *photo.hidden_faces)
 
 
-def reflection(photo: Photograph, value: float, case: Case) -> Picture:
-    motion = best_motion(photo, case, all_faces, mirrors(case))
-    planes = facing(photo, all_faces(photo), motion)
-    shown = max(photo.faces, key=lambda face: sum(photo.must_find.get(label, False) for label in face.labels))
-    circle, plate = photo.levels(shown)
+def drawn_behind(
+    photo: Photograph, value: float, case: Case, planes_of: Callable, candidates: Callable, like: Plane
+) -> Picture:
+    """Planes that stand behind, ``value`` times as bright as ``like``."""
+    planes = facing(photo, planes_of(photo), best_motion(photo, case, planes_of, candidates))
+    circle, plate = photo.levels(like)
     return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+
+
+def reflection(photo: Photograph, value: float, case: Case) -> Picture:
+    shown = max(photo.faces, key=lambda face: sum(photo.must_find.get(label, False) for label in face.labels))
+    return drawn_behind(photo, value, case, all_faces, mirrors(case), shown)
 
 
 def second_target(photo: Photograph, value: float, case: Case) -> Picture:
-    motion = best_motion(photo, case, all_faces, behind_motions(case, lambda p: case_middle(case), 1.0))
-    planes = facing(photo, all_faces(photo), motion)
-    circle, plate = photo.levels(photo.faces[0])
-    return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+    motions = behind_motions(case, lambda p: case_middle(case), 1.0)
+    return drawn_behind(photo, value, case, all_faces, motions, photo.faces[0])
 
 
 def second_board(photo: Photograph, value: float, case: Case) -> Picture:
     def middle(p: Photograph) -> np.ndarray:
         return p.camera_from_target.inverse() @ p.board.xyz_camera(p.board.xy_mm.mean(0))
 
-    motion = best_motion(photo, case, lambda p: [p.board], behind_motions(case, middle, 0.6))
-    planes = facing(photo, [photo.board], motion)
-    circle, plate = photo.levels(photo.board)
-    return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
+    return drawn_behind(photo, value, case, lambda p: [p.board], behind_motions(case, middle, 0.6), photo.board)
 
 
 def discs(photo: Photograph, case: Case, k: int, hexagonal: bool) -> Plane:
@@ -426,7 +396,7 @@ def discs(photo: Photograph, case: Case, k: int, hexagonal: bool) -> Plane:
     return Plane("discs", matrix, labels, xy, np.full(len(xy), radius))
 
 
-def plates(hexagonal: bool) -> Callable[[Photograph, float, Case], Picture]:
+def plates(hexagonal: bool) -> Make:
     """``value`` plates of equal discs behind; every other one with the contrast turned round."""
 
     def make(photo: Photograph, value: float, case: Case) -> Picture:
@@ -446,28 +416,28 @@ def plates(hexagonal: bool) -> Callable[[Photograph, float, Case], Picture]:
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("plain", "as it is", (0,), plain),
+        Kind("plain", "as it is", (0,), lambda p, _, c: Picture((c.data.folder / "images" / p.name).read_bytes())),
         Kind("defocus", "px radius", (1, 2.5, 5, 8, 12), simple(degrade.defocused), goal=3),
-        Kind("motion", "px", (2, 5, 9, 14, 20), motion),
-        Kind("noise", "grey levels", (2, 8, 15, 30, 40), noise, goal=4),
+        Kind("motion", "px", (2, 5, 9, 14, 20), simple(degrade.motion_blurred, angle(np.pi))),
+        Kind("noise", "grey levels", (2, 8, 15, 30, 40), simple(degrade.noisy, seeded), goal=4),
         Kind("underexposed", "×", (0.7, 0.5, 0.35, 0.25, 0.15), simple(degrade.exposed)),
         Kind("overexposed", "×", (1.3, 1.6, 2.0, 2.5, 3.0), simple(degrade.exposed)),
         Kind("gamma", "exponent 1/", (1.25, 0.8, 1.6, 0.6, 2.2), simple(degrade.toned)),
-        Kind("jpeg", "quality", (95, 80, 60, 40, 20), file_of_quality),
+        Kind("jpeg", "quality", (95, 80, 60, 40, 20), simple(degrade.jpeg)),
         Kind("vignetting", "lost in the corners", (0.3, 0.45, 0.6, 0.75, 0.85), simple(degrade.vignetted)),
-        Kind("gradient", "brightest : darkest", (1.5, 2.5, 4, 6, 8), gradient),
+        Kind("gradient", "brightest : darkest", (1.5, 2.5, 4, 6, 8), simple(degrade.graded, angle(2 * np.pi))),
         Kind("face dimmed", "×", (0.7, 0.5, 0.35, 0.2, 0.15), dim_face),
         Kind("board brighter", "×", (1.5, 2, 3, 4, 5), bright_board),
-        Kind("unevenly lit", "brightest : darkest", (1.5, 2.5, 4, 6, 8), uneven),
+        Kind("unevenly lit", "brightest : darkest", (1.5, 2.5, 4, 6, 8), of_photo(degrade.unevenly_lit)),
         Kind("glare", "grey levels", (40, 80, 150, 250, 400), glare),
-        Kind("haze", "share", (0.15, 0.3, 0.45, 0.6, 0.75), haze),
+        Kind("haze", "share", (0.15, 0.3, 0.45, 0.6, 0.75), simple(degrade.hazy, seeded)),
         Kind("circles hidden", "per face", (1, 2, 3, 4, 6), hide),
         Kind("circles cut", "share of area", (0.05, 0.1, 0.2, 0.3, 0.4), cut),
         Kind("board covered", "share", (0.1, 0.2, 0.3, 0.4, 0.5), cover_board),
         Kind("one board covered", "share, one image a group", (0.1, 0.2, 0.3, 0.4, 0.5), cover_one_board),
-        Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), half),
-        Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), on_sensor(degrade.hot_pixels)),
-        Kind("dust", "spots", (5, 15, 40, 80, 150), on_sensor(degrade.dusty)),
+        Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), of_photo(degrade.half_darker)),
+        Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), simple(degrade.hot_pixels, on_sensor)),
+        Kind("dust", "spots", (5, 15, 40, 80, 150), simple(degrade.dusty, on_sensor)),
         Kind("printed grids", "grids behind", (1, 2, 3, 4, 5), plates(False)),
         Kind("perforated", "plates behind", (1, 2, 3, 4, 5), plates(True)),
         Kind("second board", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_board),
@@ -477,7 +447,8 @@ KINDS = {
         Kind("small circles", "px across", (12, 9, 7.5, 6, 5), small, camera=small_camera),
         Kind("rolling shutter", "px", (0.5, 1, 2, 4, 8), rolling),
         Kind("rotated", "", tuple(ROTATED), rotate, camera=rotated_camera),
-        Kind("deep", "bits", (10, 12, 14, 15, 16), deep),
+        # sensors of 10 to 16 bits, their values kept as they are
+        Kind("deep", "bits", (10, 12, 14, 15, 16), lambda p, v, _: Picture(p.grey.astype(np.float32), bits=int(v))),
     )
 }  # fmt: skip
 
@@ -579,14 +550,11 @@ def judge_faces(data: RenderedSet, run: RunResult) -> dict:
     """Faces found, and the largest errors: µm and in σ."""
     known = {face: Rigid.from_matrix(matrix) for face, matrix in data.truth["target_from_face"].items()}
     shown = {k.partition(":")[0] for p in data.photographs for k, must in p.must_find.items() if must}
-    poses, own, um, sigma = run.target.target_from_face, run.target.reference_face, 0.0, 0.0
-    for face in sorted(poses.keys() & known.keys() - {own}):
-        true = known[own].inverse() @ known[face]
-        shift = poses[face].translation - true.translation
-        error = np.concatenate([Rigid(poses[face].rotation @ true.rotation.T).log()[:3], shift])
-        um = max(um, 1e3 * float(np.linalg.norm(shift)))
-        sigma = max(sigma, float(np.sqrt(error @ np.linalg.solve(run.target.face_covariance[face], error) / 6)))
-    return {"faces": len(poses.keys() & known.keys()), "of": len(shown & known.keys()), "um": um, "sigma": sigma}
+    off = face_errors(run.target, known)
+    um = max((1e3 * float(np.linalg.norm(each[3:])) for each in off.values()), default=0.0)
+    sigma = float(np.sqrt(normalised(run.target, off).max(initial=0.0)))
+    faces = len(run.target.target_from_face.keys() & known.keys())
+    return {"faces": faces, "of": len(shown & known.keys()), "um": um, "sigma": sigma}
 
 
 def run_case(kind: Kind, strength: int, data: RenderedSet, workers: int) -> dict:
@@ -629,8 +597,8 @@ def line_of(row: dict) -> str:
     return text + ("  SILENT" if silent(row) else "")
 
 
-def main() -> None:
-    given = options_of(__doc__, sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+@script(sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+def main(given) -> None:
     done = json.loads(given.json.read_text()) if given.json and given.json.exists() else []
     known = {(r["set"], r["kind"], r["strength"]): r for r in done}
     print(f"{'':40}{'circ %':>6} {'dots %':>6} {'wrong':>5} face {'µm':>7} {'σ':>6} {'bad':>4}", flush=True)
@@ -653,7 +621,3 @@ def main() -> None:
     print(f"{len(ended)} runs ended, {len(inside)} of them within the goals (*: beyond them)")
     print(f"faces lost in {sum(r['faces'] < r['of'] for r in rows if 'error' not in r)} runs")
     print(f"{share(rows, 'found', 'must')} % of circles, {share(rows, 'dots', 'must_dots')} % of dots found")
-
-
-if __name__ == "__main__":
-    main()

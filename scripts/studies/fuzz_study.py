@@ -11,7 +11,6 @@ already are not run again: a study that was stopped goes on. The seed and the ca
 `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
 
-import argparse
 import json
 import os
 import signal
@@ -28,7 +27,7 @@ from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
-from scripts.runner import options_of
+from scripts.runner import script
 from stcal.io.files import json_text
 from stcal.io.files import save as write
 from tests.commands import CALLS, COMMANDS
@@ -42,7 +41,7 @@ SHOWN = 600
 """Characters of a failure."""
 
 
-def names_of(arguments: argparse.Namespace) -> list[str]:
+def names_of(arguments) -> list[str]:
     """Cases: each call on good data, mistakes, every option with every odd value, and those that are drawn."""
     if arguments.only:
         return [arguments.only]
@@ -91,21 +90,12 @@ def summary(found: list[Judged], seed: int) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Run; print."""
-    arguments = options_of(
-        __doc__,
-        count=1000,
-        seed=1,
-        kills=20,
-        kept=60,
-        closed=20,
-        drawn_only=False,
-        json=Path,
-        only="",
-        no_mistakes=False,
-        workers=os.cpu_count() or 1,
-    )
+COUNTS = {"count": 1000, "kills": 20, "kept": 60, "closed": 20}
+SWITCHES = {"drawn_only": False, "no_mistakes": False}
+
+
+@script(**COUNTS, **SWITCHES, seed=1, json=Path, only="", workers=os.cpu_count() or 1)
+def main(arguments) -> None:
     missing = set(COMMANDS) - {call.command for call in CALLS}
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")
@@ -125,7 +115,3 @@ def main() -> None:
                 save(arguments.json, arguments.seed, found)
     print(f"\n{summary(found, arguments.seed)}\n\n{time.monotonic() - start:.0f} s")
     sys.exit(any(kind not in ALLOWED for each in found for kind, _ in each.failures))
-
-
-if __name__ == "__main__":
-    main()

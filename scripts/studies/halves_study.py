@@ -17,12 +17,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from handeye_shared import CHARUCO, robot_table
 from real_bodies import pycamset_cube
-from same_results import prepare
+from same_results import CHARUCO, prepare, robot_table
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import options_of
+from scripts.runner import DATA, head, script
+from scripts.runner import row as print_row
 from stcal.boards.board_designs import ChessboardDesign
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.target_file import target_of
@@ -31,7 +31,7 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.print_modes import PrintModes
-from stcal.geometry.rigid import Poses, skew
+from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
@@ -47,7 +47,6 @@ from stcal.sfm.data.group_model import ImageObservations
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 from stcal.workflows.handeye_inputs import read_handeye
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CAMERAS = {
     "ChArUco 1, real": ("real/pycamset_charuco/1", "real/pycamset_charuco/board.toml"),
     "ChArUco 2, real": ("real/pycamset_charuco/2", "real/pycamset_charuco/board.toml"),
@@ -69,11 +68,11 @@ def squares(off: np.ndarray, covariance: np.ndarray) -> list[float]:
     return [float(e @ np.linalg.solve(c, e) / len(e)) for e, c in parts]
 
 
-def row(name: str, table: Sequence[Sequence[float]], *more: str) -> str:
-    """A row of the table: the mean of each column, and its standard error for the last."""
+def row(name: str, table: Sequence[Sequence[float]], *more: str) -> None:
+    """Prints a row of the table: the mean of each column, and its standard error for the last."""
     values = np.array(table)
     error = values[:, -1].std(ddof=1) / np.sqrt(len(values))
-    return f"| {' | '.join([name, *(f'{v:.2f}' for v in values.mean(0)), f'{error:.2f}', *more])} |"
+    print_row(name, *(f"{v:.2f}" for v in values.mean(0)), f"{error:.2f}", *more)
 
 
 def parameters(result: Intrinsics) -> np.ndarray:
@@ -83,10 +82,8 @@ def parameters(result: Intrinsics) -> np.ndarray:
 
 def halves(calibration: CameraCalibration, board: BoardDesign, draws: int) -> Iterator[list[float]]:
     """χ² of the difference of random halves; a draw whose half does not determine the camera is left out."""
-    rng, views = np.random.default_rng(0), calibration.views
-    for _ in range(draws):
-        drawn = rng.permutation(len(views))
-        parts = [sorted(drawn[: len(views) // 2]), sorted(drawn[len(views) // 2 :])]
+    views = calibration.views
+    for parts in drawn_halves(len(views), draws):
         try:
             one, two = (of_some_views(calibration.intrinsics, [views[i] for i in part], board) for part in parts)
         except StcalError:
@@ -96,8 +93,7 @@ def halves(calibration: CameraCalibration, board: BoardDesign, draws: int) -> It
 
 def of_cameras(draws: int) -> None:
     """Print the table of halves."""
-    print("| photographs | views | f | c | lens | all | ± | photographs differ, × σ | stretch, % |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    head("photographs", "views", *GROUPS, "±", "photographs differ, × σ", "stretch, %")
     for name, (folder, file) in CAMERAS.items():
         if not (DATA / folder).is_dir():
             continue
@@ -109,11 +105,10 @@ def of_cameras(draws: int) -> None:
             board, calibration = corner_grid(flat), calibrate_camera_by_corners(DATA / folder, flat)
         result, table = calibration.intrinsics, list(halves(calibration, board, draws))
         stretch = ", ".join(f"{100 * own[0]:.3f}" for own in result.prints().values())
-        name = f"{name} | {len(calibration.views)}"
-        print(row(name, table, f"{result.differ:.2f}", stretch), flush=True)
+        row(f"{name} | {len(calibration.views)}", table, f"{result.differ:.2f}", stretch)
 
 
-def of_bodies() -> None:
+def of_bodies(_: int) -> None:
     """Print χ² of the poses that two cameras find of the faces of one cube."""
     runs = []
     for camera in ("cam0", "cam1"):
@@ -123,10 +118,8 @@ def of_bodies() -> None:
     one, two = runs
     apart = []
     for face in one.target_from_face.keys() & two.target_from_face.keys() - {one.reference_face}:
-        first, second = (Poses.of([target.target_from_face[face]]) for target in runs)
-        (off,) = second.difference(first)
-        covariance = one.face_covariance[face] + two.face_covariance[face]
-        apart.append(float(off @ np.linalg.solve(covariance, off) / 6))
+        first, second = (target.target_from_face[face] for target in runs)
+        apart.append(chi2(second, first, one.face_covariance[face] + two.face_covariance[face]))
     print(f"\ncube of ChArUco faces, real, two cameras: {np.mean(apart):.2f} (faces {np.round(sorted(apart), 2)})")
 
 
@@ -162,18 +155,19 @@ def of_measuring(run: Path, other: Path) -> None:
         off = each.difference(Poses.of([mean] * len(names))).ravel()
         mean = mean.moved(np.linalg.solve(motion.T @ weight @ motion, motion.T @ weight @ off))
     off = each.difference(Poses.of([mean] * len(names))).ravel()
-    print(row_of("measure: cube, two cameras, real", len(names), [off @ weight @ off / (len(off) - 6)]))
+    print_row("measure: cube, two cameras, real", len(names), f"{off @ weight @ off / (len(off) - 6):.2f}")
+
+
+def chi2(one: Rigid, two: Rigid, covariance: np.ndarray) -> float:
+    """Of the difference of two poses, per degree of freedom."""
+    (off,) = Poses.of([one]).difference(Poses.of([two]))
+    return float(off @ np.linalg.solve(covariance, off) / 6)
 
 
 def square_root(covariance: np.ndarray) -> np.ndarray:
     """A matrix whose product with its transpose is the covariance."""
     value, vector = np.linalg.eigh(covariance)
     return vector * np.sqrt(np.maximum(value, 0))
-
-
-def row_of(name: str, count: int, values: Sequence[float]) -> str:
-    """A row of the table of uses."""
-    return f"| {name} | {count} | {np.mean(values):.2f} |"
 
 
 def drawn_halves(count: int, draws: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -194,18 +188,16 @@ def of_use(draws: int) -> None:
         of_measuring(scratch / "cam0", scratch / "cam1")
         folder = DATA / "charuco_handeye" / "test_set_charuco"
         (scratch / "board.toml").write_text(CHARUCO)
-        table = robot_table(folder / "poses", scratch / "poses.csv")
-        given = read_handeye(folder / "images", table, folder / "cal_data.yaml", scratch / "board.toml", workers=1)
+        (scratch / "poses.csv").write_text(robot_table(folder / "poses"))
+        files = folder / "images", scratch / "poses.csv", folder / "cal_data.yaml", scratch / "board.toml"
+        given = read_handeye(*files, workers=1)
         assert given.views is not None
         values = []
         for parts in drawn_halves(len(given.pairs), draws):
             halves = (HandEyeProblem(given.pairs[own], "eye-to-hand", given.views[own]) for own in parts)
             one, two = (half.solved("reprojection").result for half in halves)
-            (off,) = Poses.of([one.mount_from_camera]).difference(Poses.of([two.mount_from_camera]))
-            assert one.covariance is not None
-            assert two.covariance is not None
-            values.append(off @ np.linalg.solve(one.covariance + two.covariance, off) / 6)
-        print(row_of("hand-eye: ChArUco by corners, real", len(given.pairs), values), flush=True)
+            values.append(chi2(one.mount_from_camera, two.mount_from_camera, one.covariance + two.covariance))
+        print_row("hand-eye: ChArUco by corners, real", len(given.pairs), f"{np.mean(values):.2f}")
         prepare(scratch)
         robot = load_robot(scratch / "rokae.toml")
         data = read_measurements(scratch / "rokae.csv", robot)
@@ -221,7 +213,7 @@ def of_use(draws: int) -> None:
                 off, covariance = ends[0][0] - ends[1][0], ends[0][1] + ends[1][1]
                 square = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
                 values.append(float(square.mean() / 3))
-            print(row_of(f"robot: Rokae by {kind}s, real", len(data), values), flush=True)
+            print_row(f"robot: Rokae by {kind}s, real", len(data), f"{np.mean(values):.2f}")
 
 
 def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
@@ -255,8 +247,8 @@ def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
 
 def of_simulated(draws: int) -> None:
     """Print χ² of errors, and σ over those of independent errors of pixels."""
-    print("\n| simulated | f | c | lens | all | ± | σ over those of independent pixels |")
-    print("|---|---|---|---|---|---|---|")
+    print()
+    head("simulated", *GROUPS, "±", "σ over those of independent pixels")
     board = corner_grid(ChessboardDesign(7, 9, 30.0, 0.005))  # the places of the dots, without their extent
     for kind in KINDS:
         table, larger = [], []
@@ -265,21 +257,16 @@ def of_simulated(draws: int) -> None:
             off = parameters(result) - model_parameters(TRUE, "OPENCV")
             table.append(squares(off, result.covariance))
             larger.append(np.sqrt(np.diag(result.covariance) / np.diag(result.independent)).mean())
-        print(row(kind, table, f"{np.mean(larger):.2f}"), flush=True)
+        row(kind, table, f"{np.mean(larger):.2f}")
 
 
-def main() -> None:
-    """Print the tables."""
-    arguments = options_of(__doc__, part="all", draws=20)
-    if arguments.part in ("all", "cameras"):
-        of_cameras(arguments.draws)
-    if arguments.part in ("all", "bodies") and (DATA / "real" / "pycamset_cube").is_dir():
-        of_bodies()
-    if arguments.part in ("all", "use") and (DATA / "rokae_tracker").is_dir():
-        of_use(arguments.draws)
-    if arguments.part in ("all", "simulated"):
-        of_simulated(arguments.draws)
-
-
-if __name__ == "__main__":
-    main()
+@script(part="all", draws=20)
+def main(arguments) -> None:
+    for part, needed, print_part in (
+        ("cameras", ".", of_cameras),
+        ("bodies", "real/pycamset_cube", of_bodies),
+        ("use", "rokae_tracker", of_use),
+        ("simulated", ".", of_simulated),
+    ):
+        if arguments.part in ("all", part) and (DATA / needed).is_dir():
+            print_part(arguments.draws)

@@ -7,14 +7,14 @@ of the 16 held out, with the camera and the board as their files have them, and 
 dotgrid_handeye: 15 photographs of a dot board by a camera on a robot; the pitch of the dots from the robot's motion.
 """
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from scripts.runner import DATA, head, row, script
+from scripts.studies.same_results import CHARUCO, DOTS, robot_table
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.handeye_file import HandEyeFile
@@ -24,26 +24,6 @@ from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye_inputs import read_handeye
 from stcal.workflows.handeye_run import ALL, calibrate_handeye
 
-CHARUCO = """type = "charuco"
-rows = 7
-columns = 5
-square_mm = 36.195
-marker_mm = 18.256
-dictionary = "DICT_6X6_250"
-"""
-DOTS = """# As the label on the sheet has it; target.yaml says 25.4 mm.
-rows = 10
-columns = 10
-pitch_mm = 20.0
-radius_mm = 5.0
-polarity = "dark"
-sigma_mm = 0.1
-
-[corner]
-row = 9
-column = 0
-radius_mm = 10.0
-"""
 # The two camera files of the data set differ by 8 and 14 px, and have no distortion.
 DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)
 SHOWN = ("reprojection", "pose", "shah", "park-martin", "tsai-lenz", "daniilidis", "zhao")
@@ -82,33 +62,13 @@ def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = 
     return scratch / "cameras.txt"
 
 
-def robot_table(folder: Path, path: Path) -> Path:
-    """Writes the robot's poses of ROS-Industrial's files, one for each image, as a table."""
-    names = [f"base_from_flange_{name}" for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
-    rows = [["image", *names]]
-    for file in sorted(folder.glob("*.yaml")):
-        pose = yaml.safe_load(file.read_text(encoding="utf-8"))
-        rows.append([file.stem, *(repr(float(pose[key])) for key in ("x", "y", "z", "qw", "qx", "qy", "qz"))])
-    path.write_text("".join(",".join(row) + "\n" for row in rows), encoding="utf-8")
-    return path
-
-
-def _handeye(
-    folder: Path,
-    scratch: Path,
-    camera: Path,
-    board: str,
-    setup: str,
-    method: str | None,
-    splits: dict,
-    adjust: bool,
-) -> tuple[dict, str]:
+def _handeye(folder, scratch: Path, camera: Path, board: str, setup: str, method, splits, adjust) -> tuple[dict, str]:
     """One data set; ``adjust`` : camera and size of the board too."""
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
-    poses = robot_table(folder / "poses", scratch / "poses.csv")
-    files, workers = (folder / "images", poses, camera, scratch / "board.toml"), splits.get("workers")
-    given = read_handeye(*files, setup=setup, workers=workers)
+    (scratch / "poses.csv").write_text(robot_table(folder / "poses"))
+    files = folder / "images", scratch / "poses.csv", camera, scratch / "board.toml"
+    given = read_handeye(*files, setup=setup, workers=splits.get("workers"))
     outcome = calibrate_handeye(given, method, HandEyeOptions(with_scale=adjust), refine_camera=adjust, **splits)
     return HandEyeFile.of(outcome, whole=True).content(), outcome_report(outcome).text()
 
@@ -120,26 +80,24 @@ def by_split(data: dict) -> np.ndarray:
 
 def _side_by_side(rows: dict[str, dict]) -> None:
     """Mean 3-D error at the board of the methods shown, by what they were given."""
-    print(f"\n| 3-D error at the board, mm | {' | '.join(SHOWN)} |\n|{'---|' * (len(SHOWN) + 1)}")
+    print()
+    head("3-D error at the board, mm", *SHOWN)
     for name, found in rows.items():
-        of = {row["method"]: by_split(row).mean() for row in found["methods"]}
-        print(f"| {name} | {' | '.join(f'{of[each]:.3f}' for each in SHOWN)} |")
+        of = {each["method"]: by_split(each).mean() for each in found["methods"]}
+        row(name, *(f"{of[each]:.3f}" for each in SHOWN))
 
 
 def _compare(found: dict) -> None:
-    park, ours = by_split(next(row for row in found["methods"] if row["method"] == "park-martin")), by_split(found)
+    park, ours = by_split(next(m for m in found["methods"] if m["method"] == "park-martin")), by_split(found)
     print("3-D error at the board by split:")
     for name, errors in ((found["method"], ours), ("park-martin", park)):
         print(f"  {name}: mean {errors.mean():.3f}, {errors.min():.3f} to {errors.max():.3f} mm")
     print(f"  {found['method']} worse than park-martin on {(ours >= park).sum()} of {len(ours)} splits")
 
 
-def main() -> None:
-    """Both data sets."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    shared = Path(__file__).resolve().parents[3] / "shared" / "data"
-    parser.add_argument("data", nargs="?", type=Path, default=shared, help="folder of the data sets")
-    data = parser.parse_args().data
+@script({"data": DATA})
+def main(given) -> None:
+    data = given.data
     for name in ("charuco_handeye", "dotgrid_handeye"):
         if not (data / name).is_dir():
             sys.exit(f"error: {data / name} is missing; give the folder that holds it")
@@ -159,7 +117,3 @@ def main() -> None:
         board = found["board"]
         sigma = board["scale_sigma"] * board["pitch_mm"] / board["scale"]
         print(f"pitch found: {board['pitch_mm']:.2f} ± {sigma:.2f} mm; 20 mm on the label, 25.4 mm in target.yaml")
-
-
-if __name__ == "__main__":
-    main()

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
@@ -21,8 +21,6 @@ from stcal.handeye.data.corner_views import Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.camera_model import camera_prior
-from stcal.parallel import one_thread
-from stcal.workflows.cluster import executor_of
 from tests.support.handeye import CAMERA, simulated_views
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
@@ -61,23 +59,16 @@ def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> t
 def print_cameras(pool, trials: int, only: str) -> None:
     """The table of camera files that are off."""
     print(f"\n{POSES_OFF} poses, σ estimated:\n")
-    print("| method | setup | noise | camera off | calibration | RMS error, mm |\n|---|---|---|---|---|---|")
+    head("method", "setup", "noise", "camera off", "calibration", "RMS error, mm")
     for case in product([name for name in CAMERAS if name.startswith(only)], SETUPS, NOISES, OFF):
         found = np.array(list(pool.map(partial(camera_trial, *case), range(trials), chunksize=10)))
         ratio, rms = np.sqrt(found.mean(0) / [6, 1])
-        method, setup, noise, off = case
-        print(f"| {method} | {setup} | {noise} | {off:g} σ | {ratio:.3f} | {rms:.3g} |", flush=True)
+        row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")
 
 
-@one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    given = options_of(__doc__, trials=500, only="", scheduler=str)
+@script(trials=500, only="", scheduler=str, limited=True)
+def main(given) -> None:
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * given.trials) / (6 * given.trials))
     print(f"{given.trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")
     with executor_of(given.scheduler) as pool:
         print_cameras(pool, given.trials, given.only)
-
-
-if __name__ == "__main__":
-    main()

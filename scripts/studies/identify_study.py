@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, script
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
@@ -26,7 +25,6 @@ from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, two_arms
 
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4
@@ -177,9 +175,8 @@ def without_noise(case: Case, true: Robot, count: int, rng: np.random.Generator,
     return observed(replace(data, positions=None, rotations=None, distances=apart, from_row=start))
 
 
-@one_thread()
-def main() -> None:
-    given = options_of(__doc__, draws=200, only="", scheduler=str)
+@script(draws=200, only="", scheduler=str, limited=True)
+def main(given) -> None:
     draws = given.draws
     began = time.perf_counter()
     print(f"simulated arms, {draws} draws: eᵀC⁻¹e over its degrees of freedom, expected 1")
@@ -192,7 +189,3 @@ def main() -> None:
             )
             print(f"{case.title():<28}{case.rows:>6}  {case.sigma:<12}{cells}", flush=True)
     print(f"{time.perf_counter() - began:.0f} s")
-
-
-if __name__ == "__main__":
-    main()

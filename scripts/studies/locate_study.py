@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import options_of
+from scripts.runner import DATA, head, row, script
 from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 from stcal.geometry.camera import Camera
@@ -37,7 +37,7 @@ from tests.support.holdout import PoseTrial, half_calibrated, subset_trials
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17
 ORIGIN = 8
-FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "charuco_handeye" / "test_set_charuco"
+FOLDER = DATA / "charuco_handeye" / "test_set_charuco"
 EDGE_LAYOUT = TagLayout.from_tags(
     "APRILTAG_36h11", (0, 1, 2), [[0.0, 0.0], [120.0, 0.0], [0.0, 110.0]], [60.0, 60.0, 40.0], [0.0, 90.0, 180.0]
 )
@@ -66,19 +66,14 @@ def charuco_images(folder: Path) -> CalibrationImages:
     return replace(found, names=names, views=views, tags=tags)
 
 
-def halves(images: CalibrationImages) -> list[tuple[list[int], list[int]]]:
-    """Images to calibrate with and to locate."""
-    even, odd = list(range(0, len(images.names), 2)), list(range(1, len(images.names), 2))
-    return [(even, odd), (odd, even)]
-
-
 def subsets(images: CalibrationImages, only: str, most: int | None) -> None:
     print("real images, against the chessboard corners; subsets: all, or so many of each size and image (--most)\n")
-    print("| gate | tags | poses | accepted | ambiguous | wrong branch | off by > 5° | mean of the accepted | worst |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    counts = "poses", "accepted", "ambiguous", "wrong branch", "off by > 5°"
+    head("gate", "tags", *counts, "mean of the accepted", "worst")
     gates = {"verdict": VerdictOptions(), "odds of the other 1:100": VerdictOptions(flip_odds=1e-2)}
     gates["the patent's gate"] = PatentOptions()
-    calibrated = [(half_calibrated(images, charuco_plan(), chosen), others) for chosen, others in halves(images)]
+    halves = [list(range(first, len(images.names), 2)) for first in (0, 1)]
+    calibrated = [(half_calibrated(images, charuco_plan(), own), other) for own, other in (halves, halves[::-1])]
     for name, options in gates.items():
         if not name.startswith(only):
             continue
@@ -86,35 +81,35 @@ def subsets(images: CalibrationImages, only: str, most: int | None) -> None:
             trials: list[PoseTrial] = []
             for half, others in calibrated:
                 trials += subset_trials(images, others, half, size, options, most)
-            print(f"| {name} | {f'any {size}' if size else 'all'} | {_cells(trials)} |", flush=True)
+            row(name, f"any {size}" if size else "all", *_cells(trials))
 
 
-def _cells(trials: Sequence[PoseTrial]) -> str:
+def _cells(trials: Sequence[PoseTrial]) -> list:
     used = [t for t in trials if t.decision == "accept"]
     ambiguous = sum(t.decision == "ambiguous" for t in trials)
     flipped, far = sum(t.flipped for t in used), sum(t.error_rad > np.radians(5) for t in used)
-    text = f"{len(trials)} | {len(used)} | {ambiguous} | {flipped} | {far} | "
+    counts = [len(trials), len(used), ambiguous, flipped, far]
     if not used:
-        return text + "– | –"
+        return [*counts, "–", "–"]
     rad, mm = np.array([(t.error_rad, t.error_mm) for t in used]).T
-    return text + f"{np.degrees(rad.mean()):.2f}°, {mm.mean():.2f} mm | {np.degrees(rad.max()):.1f}°, {mm.max():.1f} mm"
+    mean, worst = (
+        f"{np.degrees(rad.mean()):.2f}°, {mm.mean():.2f} mm",
+        f"{np.degrees(rad.max()):.1f}°, {mm.max():.1f} mm",
+    )
+    return [*counts, mean, worst]
 
 
 def edges(count: int) -> None:
     print(f"three tags of 30 to 130 px, rendered with noise of 1 % of the contrast, {count} scenes a row\n")
-    print("| rendered | blur, px | turned | tilted | mean of e'C^-1 e / 6 | largest | accepted |")
-    print("|---|---|---|---|---|---|---|")
+    head("rendered", "blur, px", "turned", "tilted", "mean of e'C^-1 e / 6", "largest", "accepted")
     views = [(turn, 0) for turn in (0, 1, 2, 5, 20, 45)] + [(0, 20), (0, 40), (0, 60), (20, 60)]
-    rows = [
-        (kind, blur, turn, tilt, count)
-        for kind, blur in (("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5))
-        for turn, tilt in views
-    ]
+    kinds = ("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5)
+    cases = [(*kind, *view, count) for kind in kinds for view in views]
     pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
-    for row, (squares, accepted) in zip(rows, pool.map(_edge_scenes, *zip(*rows, strict=True)), strict=True):
-        kind, blur, turn, tilt, _ = row
-        figures = f"{np.mean(squares):.2f} | {np.max(squares):.1f}"
-        print(f"| {kind} | {blur} | {turn}° | {tilt}° | {figures} | {accepted} of {count} |", flush=True)
+    for case, (squares, accepted) in zip(cases, pool.map(_edge_scenes, *zip(*cases, strict=True)), strict=True):
+        kind, blur, turn, tilt, _ = case
+        figures = f"{np.mean(squares):.2f}", f"{np.max(squares):.1f}"
+        row(kind, blur, f"{turn}°", f"{tilt}°", *figures, f"{accepted} of {count}")
 
 
 @one_thread()
@@ -163,14 +158,9 @@ def _drawn_sheet() -> tuple[np.ndarray, np.ndarray]:
     return sheet, np.array([[scale, 0, -scale * first[0] - half], [0, scale, -scale * first[1] - half], [0, 0, 1]])
 
 
-@one_thread()
-def main() -> None:
-    given = options_of(__doc__, part="", only="", most=int)
+@script(part="", only="", most=int, limited=True)
+def main(given) -> None:
     if given.part in ("", "subsets"):
         subsets(charuco_images(FOLDER), given.only, given.most)
     if given.part in ("", "edges"):
         edges(given.most or 160)
-
-
-if __name__ == "__main__":
-    main()

@@ -10,17 +10,17 @@ import sys
 import tempfile
 from pathlib import Path
 
+from scripts.runner import DATA, script
 from stcal.sfm import RunOptions, run
 from stcal.sfm.interop.crosscheck import comparison_text, crosscheck
 from stcal.sfm.report.compare import compare, comparison_table
 from stcal.sfm.runs.saved import load_run
 
 
-def main() -> None:
-    default = Path(__file__).resolve().parents[3] / "shared" / "data" / "stereo_target"
-    root = Path(sys.argv[1]) if len(sys.argv) > 1 else default
+@script({"root": DATA / "stereo_target"})
+def main(given) -> None:
     for name in ("clean", "clutter"):
-        folder = root / name
+        folder = given.root / name
         if not folder.is_dir():
             sys.exit(f"error: {folder} is missing; give the folder that holds clean/ and clutter/")
         for title, options in (
@@ -32,15 +32,9 @@ def main() -> None:
                 out = Path(scratch) / "run"
                 run(folder / "images", folder / "cameras.txt", out, options=options)
                 summary = json.loads((out / "report.json").read_text())["summary"]
-                print(
-                    f"\n{name}, {title}: {summary['images_mapped']} of {summary['images']} images registered, "
-                    f"residual RMS {summary['residual_rms_px']:.4f} px"
-                )
+                registered = f"{summary['images_mapped']} of {summary['images']} images registered"
+                print(f"\n{name}, {title}: {registered}, residual RMS {summary['residual_rms_px']:.4f} px")
                 print(comparison_table(compare(out, folder / "truth.json")))
                 if options == RunOptions() and shutil.which("colmap"):
                     print(f"\n{name}, cross-check with the native COLMAP:")
                     print(comparison_text(crosscheck(load_run(out))))
-
-
-if __name__ == "__main__":
-    main()

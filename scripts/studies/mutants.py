@@ -12,7 +12,6 @@ together take `--seconds`, until one fails. Results are added to the file; a sec
 Needs `pip install "stereo-target-calibration[mutants]"`.
 """
 
-import argparse
 import ast
 import json
 import math
@@ -30,18 +29,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.runner import ROOT, script
+
 PACKAGE = ROOT / "stcal"
 OPERATORS = ("ReplaceComparisonOperator_", "ReplaceBinaryOperator_", "ReplaceUnaryOperator_")
-ALSO = (
-    "AddNot",
-    "ReplaceTrueWithFalse",
-    "ReplaceFalseWithTrue",
-    "ReplaceAndWithOr",
-    "ReplaceOrWithAnd",
-    "NumberReplacer",
-)
-ALSO += ("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ZeroIterationForLoop")
+ALSO = ("AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd")
+ALSO += ("NumberReplacer", "ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ZeroIterationForLoop")
 NEVER = ("BitOr", "BitAnd", "BitXor", "Shift", "Is", "Pow", "FloorDiv", "Invert")
 """In names of operators: of annotations and sets, or faults of types rather than of values."""
 PYTEST = (sys.executable, "-m", "pytest", "-p", "no:randomly")
@@ -204,16 +197,11 @@ def run(file: Path, seconds: float, marked: str, workers: int) -> list[dict]:
     return faults
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["draw", "run"])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--count", type=int, default=150)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--marked", default="not full")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    given = parser.parse_args()
+NUMBERS = {"count": 150, "seed": 1, "seconds": 60.0, "workers": os.cpu_count() or 1}
+
+
+@script({"what": str, "file": Path}, marked="not full", **NUMBERS)
+def main(given) -> None:
     if given.what == "draw":
         faults = draw(given.count, given.seed)
         given.file.write_text(json.dumps(faults, indent=1, ensure_ascii=False), encoding="utf-8")
@@ -225,7 +213,3 @@ def main() -> None:
     for fault in faults:
         if fault["outcome"] != "killed":
             print(f"{fault['path']}:{fault['line']}\n    {fault['before'].strip()}\n    {fault['after'].strip()}")
-
-
-if __name__ == "__main__":
-    main()

@@ -14,16 +14,14 @@ from itertools import product
 
 import numpy as np
 
-from scripts.runner import face_errors, options_of, row
+from scripts.runner import executor_of, face_errors, row, script
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +88,8 @@ def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
     return dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
 
 
-@one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, seeds=20, scheduler=str)
+@script(seeds=20, scheduler=str, limited=True)
+def main(given) -> None:
     found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
     titles = "position, µm", "bound, µm", "position / bound", "rotation, mdeg", "uncorrected, µm"
@@ -103,7 +99,3 @@ def main() -> None:
             position, rotation, bound, control = found[Point(**{name: value})]
             figures = (f"{each:.2f}" for each in (position, bound, position / bound, rotation))
             row(title, f"{value:g}", *figures, f"{control:.1f}")
-
-
-if __name__ == "__main__":
-    main()

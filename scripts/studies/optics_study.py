@@ -10,7 +10,6 @@ degree of freedom; largest correction for defocus, px; wrong labels; verdict, an
 `--rim` : runs that estimate rims, and their height.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -19,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import DATA, script
 from stcal.geometry.normal_equations import free_motions
 from stcal.report.text import text_table
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "stereo_target"
+SETS = ("exact", "sample", "clean", "clutter", "white_block", "focus", "uneven", "rim")
 COMMAND = [sys.executable, "-m", "stcal", "sfm"]
 DRAWS = 20_000
 FREE = 1e6
@@ -86,26 +86,13 @@ def row_of(name: str, images: Path, folder: Path, run: Path, options: list[str])
         f"{chi2 / freedom:.2f}",
         f"{max((row['shift_px'] for row in report['focus']), default=0.0):.4f}",
         str(wrong),
-        *([_rim(report)] if "--rim" in options else []),
+        *([f"{report['summary']['rim_mm'] or 0.0:.3f}"] if "--rim" in options else []),
         f"{report['judgement']['verdict']}{': ' if bad else ''}{', '.join(bad)}",
     ]
 
 
-def _rim(report: dict) -> str:
-    """Height of the rim that the run found in front of the circles of the faces, mm."""
-    return f"{report['summary']['rim_mm'] or 0.0:.3f}"
-
-
-def main() -> None:
-    """The table of all sets."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "sets", nargs="*", default=["exact", "sample", "clean", "clutter", "white_block", "focus", "uneven", "rim"]
-    )
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--runs", type=Path, help="keep the runs here")
-    parser.add_argument("--rim", action="store_true")
-    args = parser.parse_args()
+@script({"sets": list(SETS)}, data=DATA / "stereo_target", runs=Path, rim=False)
+def main(args) -> None:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         runs = args.runs or Path(scratch)
@@ -114,21 +101,6 @@ def main() -> None:
                 form = " PNG" if images.name.endswith("png") else ""
                 run = runs / f"{name}{form.strip().lower()}"
                 rows.append(row_of(name + form, images, args.data / name, run, ["--rim"] if args.rim else []))
-    heads = [
-        "<set",
-        "faces µm",
-        "expected",
-        "chance %",
-        "mdeg",
-        "worst σ",
-        "χ²/dof",
-        "defocus px",
-        "wrong",
-        *(["rim mm"] if args.rim else []),
-        "<verdict",
-    ]
+    heads = ["<set", "faces µm", "expected", "chance %", "mdeg", "worst σ", "χ²/dof", "defocus px", "wrong"]
+    heads += [*(["rim mm"] if args.rim else []), "<verdict"]
     print("\n".join(text_table([heads, *rows])))
-
-
-if __name__ == "__main__":
-    main()

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from scripts.runner import head, row, script
 from stcal.design import reference_board, reference_target
 from stcal.sfm.planning import forecast
 from stcal.sfm.planning.forecast import nominal_poses
@@ -27,11 +28,7 @@ FOCAL_MM, SENSOR_MM, WAVELENGTH_MM = 24.0, 36.0, 550e-6
 """A lens of 24 mm before a full-frame sensor, in green light."""
 DEPTH_MM = 150.0
 """From the plane in focus to the nearest part of target and board."""
-GROUPS = {
-    "4: 12, 14, 15, 23": "12,14,15,23",
-    "5: and 34, a loop": "12,14,15,23,34",
-    "8: every pair of neighbours": "12,14,15,23,25,34,35,45",
-}
+GROUPS = {"5: and 34, a loop": "12,14,15,23,34", "8: every pair of neighbours": "12,14,15,23,25,34,35,45"}
 
 
 def centre_noise(
@@ -44,32 +41,23 @@ def centre_noise(
     )
 
 
-def cases():
-    """What departs, in words, its value, the options and the σ of the board in mm (None: the reference board's)."""
-    yield "base", "", BASE, None
-    for count in (3, 5, 20, 40):
-        yield "images in each group", f"{count}", replace(BASE, images=count), None
-    for spread in (15, 25, 60):
-        yield "spread of the views", f"±{spread}°", replace(BASE, spread_deg=float(spread)), None
-    for distance in (700, 1500, 2500):
-        yield "distance", f"{distance} mm", replace(BASE, distance_mm=float(distance)), None
-    for width in (2592, 1728):
-        yield "width of the images", f"{width} px", replace(BASE, width=width), None
-    for name, pairs in GROUPS.items():
-        if pairs != "12,14,15,23":
-            yield "groups", name, replace(BASE, groups=pairs_of_faces(pairs, reference_target())), None
-    for sigma in (2, 10, 20):
-        yield "σ of the board's dots", f"{sigma} µm", BASE, sigma / 1e3
-    yield "board", "a new print for each group", replace(BASE, one_board=False), None
-    yield "intrinsics", "`--refine-camera`", replace(BASE, run=RunOptions(refine_camera=True)), None
-    for noise in (0.003, 0.03):
-        yield "image noise", f"{100 * noise:g} %", replace(BASE, noise=centre_noise(noise=noise)), None
-    yield "contrast", "35 %", replace(BASE, noise=centre_noise(contrast=0.35)), None
-    for blur in (1.5, 3.0):
-        yield "blur of the edges", f"{blur:g} px", replace(BASE, noise=centre_noise(blur=blur)), None
+CASES = (
+    ("images in each group", "{}", (3, 5, 20, 40), lambda n: {"images": n}),
+    ("spread of the views", "±{}°", (15, 25, 60), lambda deg: {"spread_deg": float(deg)}),
+    ("distance", "{} mm", (700, 1500, 2500), lambda mm: {"distance_mm": float(mm)}),
+    ("width of the images", "{} px", (2592, 1728), lambda px: {"width": px}),
+    ("groups", "{}", GROUPS, lambda name: {"groups": pairs_of_faces(GROUPS[name], reference_target())}),
+    ("σ of the board's dots", "{} µm", (2, 10, 20), lambda _: {}),
+    ("board", "{}", ("a new print for each group",), lambda _: {"one_board": False}),
+    ("intrinsics", "{}", ("`--refine-camera`",), lambda _: {"run": RunOptions(refine_camera=True)}),
+    ("image noise", "{} %", (0.3, 3), lambda share: {"noise": centre_noise(noise=share / 100)}),
+    ("contrast", "{} %", (35,), lambda share: {"noise": centre_noise(contrast=share / 100)}),
+    ("blur of the edges", "{:g} px", (1.5, 3.0), lambda px: {"noise": centre_noise(blur=px)}),
+)
+"""What departs, in words, the form of its values, these, and the change of the options."""
 
 
-def forecast_of(options: PlanOptions, sigma_mm: float | None) -> str:
+def forecast_of(options: PlanOptions, sigma_mm: float | None = None) -> str:
     """Cells of a row: worst face, σ of its position, largest σ of an orientation, σ of a centre."""
     target, board = reference_target(), reference_board()
     if sigma_mm is not None:
@@ -89,20 +77,19 @@ def blur_px(f_number: float) -> tuple[float, float, float]:
     return defocus, diffraction, float(np.linalg.norm([defocus, diffraction, forecast.BLUR_PX]))
 
 
-def main() -> None:
-    """Print both tables."""
+@script()
+def main(_) -> None:
     print("| | | worst face | σ of its position, µm | largest σ of an orientation, mdeg | σ of a centre, px |")
     print("|---|---|---|---|---|---|")
-    for what, value, options, sigma in cases():
-        print(f"| {what} | {value} | {forecast_of(options, sigma)} |", flush=True)
+    row("base", "", forecast_of(BASE))
+    for what, form, values, change in CASES:
+        for value in values:
+            sigma_mm = value / 1e3 if form == "{} µm" else None
+            row(what, form.format(value), forecast_of(replace(BASE, **change(value)), sigma_mm))
     print()
-    print("| aperture | defocus, px | diffraction, px | blur, px | worst face | σ, µm | σ, mdeg | σ of a centre, px |")
-    print("|---|---|---|---|---|---|---|---|")
+    blurs = "defocus, px", "diffraction, px", "blur, px"
+    head("aperture", *blurs, "worst face", "σ, µm", "σ, mdeg", "σ of a centre, px")
     for f_number in (2.8, 4, 5.6, 8, 11, 16, 22):
-        defocus, diffraction, blur = blur_px(f_number)
-        row = forecast_of(replace(BASE, noise=centre_noise(blur=blur)), None)
-        print(f"| f/{f_number:g} | {defocus:.2f} | {diffraction:.2f} | {blur:.2f} | {row} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        blurs = blur_px(f_number)
+        found = forecast_of(replace(BASE, noise=centre_noise(blur=blurs[-1])))
+        row(f"f/{f_number:g}", *(f"{each:.2f}" for each in blurs), found)

@@ -10,7 +10,6 @@ stcal with the places of its dots and corners estimated from the other views. σ
 Data: `real` of shared/data; a set that is not there is left out. Each set takes minutes.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from scripts.runner import DATA, head, row, script
 from stcal.boards.board_designs import CharucoDesign, ChessboardDesign
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of
@@ -28,7 +28,6 @@ from stcal.io.images import find_images
 from stcal.sfm.camera.calibrate import FOLDS, CameraCalibration, calibrate_camera, residual_rms_px
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 SETS = {
     "boofcv_circle_regular": (".", "board.toml"),
     "multidic_chessboard": ("201", "board.toml"),
@@ -59,10 +58,10 @@ class Fared:
     focal: float
     focal_sigma: float
 
-    def cells(self) -> str:
+    def cells(self) -> tuple:
         """The row of the table."""
         held_out = f"{self.held_out:.3f}" if np.isfinite(self.held_out) else "–"
-        return f"{self.views} | {self.points} | {self.rms:.3f} | {held_out} | {self.focal:.1f} ± {self.focal_sigma:.2g}"
+        return self.views, self.points, f"{self.rms:.3f}", held_out, f"{self.focal:.1f} ± {self.focal_sigma:.2g}"
 
 
 def found_by_opencv(grey: np.ndarray, board) -> tuple[np.ndarray, np.ndarray] | None:
@@ -127,10 +126,11 @@ def by_stcal(found: CameraCalibration) -> Fared:
     )
 
 
-def rows(name: str) -> list[str]:
-    """The table's rows of one set."""
+def rows(name: str) -> None:
+    """Prints the table's rows of one set."""
     images, file = SETS[name]
-    folder, board = DATA / name / images, load_flat_board(DATA / name / file)
+    place = DATA / "real" / name
+    folder, board = place / images, load_flat_board(place / file)
     count = len(find_images(folder)[0])
     dots = isinstance(board, BoardDesign)
     grid = board if dots else corner_grid(board)
@@ -143,29 +143,19 @@ def rows(name: str) -> list[str]:
         ways["stcal"] = lambda: by_stcal(found)
         ways["OpenCV, stcal's corners"] = lambda: by_opencv(views, size)
     except StcalError as error:
-        message = str(error)
-        return [f"| {name}: {count} images | stcal | {message} | | | | |"]
+        print(f"| {name}: {count} images | stcal | {error} | | | | |", flush=True)
+        return
     ways["OpenCV"] = lambda: by_opencv(views_of_opencv(folder, board), size)
-    table = []
     for way, fare in ways.items():
         try:
-            table.append(f"| {name}: {count} images | {way} | {fare().cells()} |")
+            row(f"{name}: {count} images", way, *fare().cells())
         except cv2.error:
-            table.append(f"| {name}: {count} images | {way} | 0 | | | | |")
-    return table
+            print(f"| {name}: {count} images | {way} | 0 | | | | |", flush=True)
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", nargs="+", choices=sorted(SETS), default=list(SETS))
-    names = parser.parse_args().sets
-    print("| photographs | way | views | points | RMS px | held out px | focal length px |")
-    print("|---|---|---|---|---|---|---|")
-    for name in names:
-        if (DATA / name).is_dir():
-            print(*rows(name), sep="\n", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+@script(sets=list(SETS))
+def main(given) -> None:
+    head("photographs", "way", "views", "points", "RMS px", "held out px", "focal length px")
+    for name in given.sets:
+        if (DATA / "real" / name).is_dir():
+            rows(name)

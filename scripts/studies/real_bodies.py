@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import DATA, head, script
+from scripts.runner import row as print_row
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.sfm import pipeline
 from stcal.sfm.runs.saved import RunResult
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 SAME_PLANE_DEG = 45.0
 """Smallest angle between the planes of neighbouring faces."""
 
@@ -33,8 +34,8 @@ def pycamset_cube() -> TargetDesign:
 SETS = {"pycamset_cube": ("cam0", pycamset_cube)}
 
 
-def row(name: str, result: RunResult) -> str:
-    """The row of the table."""
+def row(name: str, result: RunResult) -> None:
+    """Prints the row of the table."""
     target, joint, camera = result.target, result.calibration.joint, result.refined_camera
     assert joint is not None
     assert camera is not None
@@ -46,7 +47,7 @@ def row(name: str, result: RunResult) -> str:
     residuals = np.concatenate([m.residuals_px(result.calibration.camera).ravel() for m in joint.models])
     images = sum(len(solution.model.images) for solution in result.solutions)
     total = len(result.detection.images) + len(result.detection.skipped)
-    cells = [
+    print_row(
         name,
         f"{images} of {total}",
         f"{len(target.target_from_face)} of {len(result.target_design.faces)}",
@@ -55,23 +56,14 @@ def row(name: str, result: RunResult) -> str:
         f"{off.mean():.2f}, {off.max():.2f}",
         f"{1e3 * sigma[:, 3:].max():.0f}",
         f"{1e3 * np.degrees(sigma[:, :3].max()):.0f}",
-    ]
-    return f"| {' | '.join(cells)} |"
-
-
-def main() -> None:
-    """Print the table."""
-    print(
-        "| set | images | faces | residuals, px | focal length, px | neighbours off 90°, mean and worst, ° | "
-        "σ of a position, µm | of a rotation, mdeg |"
     )
-    print("|---|---|---|---|---|---|---|---|")
+
+
+@script()
+def main(_) -> None:
+    neighbours, sigmas = "neighbours off 90°, mean and worst, °", ("σ of a position, µm", "of a rotation, mdeg")
+    head("set", "images", "faces", "residuals, px", "focal length, px", neighbours, *sigmas)
     for name, (folder, design) in SETS.items():
-        if not (DATA / name).is_dir():
-            continue
-        with tempfile.TemporaryDirectory() as scratch:
-            print(row(name, pipeline.run(DATA / name / folder, None, Path(scratch) / "run", design())), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        if (images := DATA / "real" / name / folder).is_dir():
+            with tempfile.TemporaryDirectory() as scratch:
+                row(name, pipeline.run(images, None, Path(scratch) / "run", design()))

@@ -13,7 +13,6 @@ Then, from all places of a station, held out in four folds: one rigid transform,
 --write FOLDER writes robot.toml and for each station a file of pairs with joint values, for `stcal register`.
 """
 
-import argparse
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
@@ -24,6 +23,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from scripts.runner import DATA, head, row, script
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
@@ -37,7 +37,6 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import robot_toml
 from stcal.robot.kinematics.robot_model import Chain, DHRow, Joint, Robot
 
-DEFAULT = Path(__file__).resolve().parents[3] / "shared" / "data" / "hilti_stationing"
 TIP, BASE = "prism", "base_link"
 COLUMN = "column_top_joint"
 """The column's two stages each move half of its value; together they are one prismatic joint."""
@@ -168,20 +167,18 @@ def print_tables(found: dict[str, Station], robot: Robot) -> None:
     """Markdown."""
     real = {name: identified(robot, everything(station)) for name, station in found.items()}
     print("Fitted to the 7 or 8 places of each height and region, errors of the others: mean, 95 % within\n")
-    print("| station | places | rigid, mm | affine least squares, m | rigid, kinematics of another station, mm |")
-    print("|---|---|---|---|---|")
+    head("station", "places", "rigid, mm", "affine least squares, m", "rigid, kinematics of another station, mm")
     for name, station in found.items():
         rigid, affine = errors_by_part(station, robot), errors_by_part(station, robot, affine=True)
         others = [errors_by_part(station, real[other]) for other in found if other != name]
         spread = f"{min(e.mean() for e in others):.1f} … {max(e.mean() for e in others):.1f}"
-        line = f"{figures(rigid)} | {figures(affine, 1000.0)} | {figures(np.concatenate(others))} ({spread})"
-        print(f"| {name} | {len(rigid)} | {line} |")
+        by_others = f"{figures(np.concatenate(others))} ({spread})"
+        row(name, len(rigid), figures(rigid), figures(affine, 1000.0), by_others)
     print("\nAll places of a station, held out in four folds, mm\n")
-    print("| station | places | one rigid transform | base and kinematics together |\n|---|---|---|---|")
+    head("station", "places", "one rigid transform", "base and kinematics together")
     for name, station in found.items():
         places = everything(station)
-        rigid, together = held_out(places, robot)
-        print(f"| {name} | {len(places.q)} | {figures(rigid)} | {figures(together)} |")
+        row(name, len(places.q), *map(figures, held_out(places, robot)))
     name, station = next(iter(found.items()))
     try:
         identify(robot, Places.joined(fit for fit, _ in station).measurements(), replace(PARTIAL, partial=False))
@@ -202,14 +199,8 @@ def write(folder: Path, found: dict[str, Station], robot: Robot) -> None:
         )
 
 
-def main() -> None:
-    """Print, and write where asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("root", nargs="?", type=Path, default=DEFAULT)
-    parser.add_argument(
-        "--write", type=Path, metavar="FOLDER", help="write robot.toml and pairs, and print nothing else"
-    )
-    arguments = parser.parse_args()
+@script({"root": DATA / "hilti_stationing"}, write=Path)
+def main(arguments) -> None:
     if not arguments.root.is_dir():
         sys.exit(f"error: {arguments.root} is missing; give the folder of the data sets")
     found, robot = stations(arguments.root), robot_of(arguments.root / "data" / "trailblazer.urdf")
@@ -217,7 +208,3 @@ def main() -> None:
         write(arguments.write, found, robot)
     else:
         print_tables(found, robot)
-
-
-if __name__ == "__main__":
-    main()

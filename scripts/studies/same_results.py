@@ -26,6 +26,8 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 KEPT = {".json", ".csv", ".toml", ".txt", ".out"}
 PASSED_OVER = {".stcal", "overlays", "points3D.txt", "images.txt", "frames.txt"}
 LAYOUT_TAGS = range(17)
+NESTS = ("N1", "N2", "N3")
+PAIRS = ("base_from_flange", "camera_from_board")
 
 CHARUCO = """type = "charuco"
 rows = 7
@@ -34,7 +36,8 @@ square_mm = 36.195
 marker_mm = 18.256
 dictionary = "DICT_6X6_250"
 """
-DOTS = """rows = 10
+DOTS = """# As the label on the sheet has it; target.yaml says 25.4 mm.
+rows = 10
 columns = 10
 pitch_mm = 20.0
 radius_mm = 5.0
@@ -47,6 +50,16 @@ column = 0
 radius_mm = 10.0
 """
 FANUC = ((312, -90, 0, 0), (1075, 180, 0, -90), (225, -90, 0, 0), (0, 90, -1280, 0), (0, -90, 0, 0), (0, 180, -215, 0))
+
+
+def table(header: str, rows) -> str:
+    """CSV of texts and numbers."""
+    cells = ([cell if isinstance(cell, str) else repr(float(cell)) for cell in row] for row in rows)
+    return "\n".join([header, *map(",".join, cells)]) + "\n"
+
+
+def wxyz(turn: Rotation) -> np.ndarray:
+    return turn.as_quat()[[3, 0, 1, 2]]
 
 
 def robot_toml(name: str, convention: str, rows, coupling: str = "") -> str:
@@ -63,65 +76,49 @@ def prepare(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "charuco.toml").write_text(CHARUCO)
     (folder / "dots.toml").write_text(DOTS)
-    lines = ["target,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"]
-    for row in np.loadtxt(DATA / "fanuc_sweeps" / "N1N2N3Jval.csv"):
-        for k, target in enumerate(("N1", "N2", "N3")):
-            lines.append(",".join([target, *map(repr, [*row[15:].tolist(), *row[3 * k : 3 * k + 3].tolist()])]))
-    (folder / "fanuc.csv").write_text("\n".join(lines) + "\n")
+    joints = ",".join(f"q{k}_deg" for k in range(1, 7))
+    sweeps = np.loadtxt(DATA / "fanuc_sweeps" / "N1N2N3Jval.csv")
+    rows = [[target, *each[15:], *each[3 * k : 3 * k + 3]] for each in sweeps for k, target in enumerate(NESTS)]
+    (folder / "fanuc.csv").write_text(table(f"target,{joints},x_mm,y_mm,z_mm", rows))
     coupling = np.eye(6)
     coupling[2, 1] = 1
-    rows = ", ".join(str(row) for row in coupling.tolist())
-    (folder / "fanuc.toml").write_text(robot_toml("R-2000", "standard", FANUC, f"coupling = [{rows}]\n"))
+    coupled = ", ".join(str(row) for row in coupling.tolist())
+    (folder / "fanuc.toml").write_text(robot_toml("R-2000", "standard", FANUC, f"coupling = [{coupled}]\n"))
     rokae = DATA / "rokae_tracker" / "data"
     dh = np.loadtxt(rokae / "dh.csv", delimiter=",", skiprows=1)
     (folder / "rokae.toml").write_text(robot_toml("Rokae", "modified", [(a, al, d, t) for al, a, d, t in dh]))
-    joints = [re.search(r"j:\{([^}]*)\}", line) for line in (rokae / "joint_angle.csv").read_text().splitlines()]
-    q = [[cell.strip() for cell in found.group(1).split(",")[:6]] for found in joints if found]
+    measured = [re.search(r"j:\{([^}]*)\}", line) for line in (rokae / "joint_angle.csv").read_text().splitlines()]
+    q = [[cell.strip() for cell in found.group(1).split(",")[:6]] for found in measured if found]
     pose = [line.split()[7:13] for line in (rokae / "laser_pos.csv").read_text().splitlines() if line.strip()]
-    turn = Rotation.from_euler("xyz", [[float(v) for v in p[3:]] for p in pose], degrees=True).as_quat()[
-        :, [3, 0, 1, 2]
-    ]
-    lines = ["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm,qw,qx,qy,qz"]
-    for own, place, wxyz in zip(q, pose, turn, strict=True):
-        lines.append(",".join([*own, *place[:3], *[repr(float(v)) for v in wxyz]]))
-    (folder / "rokae.csv").write_text("\n".join(lines) + "\n")
-    targets = ["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg", *[",".join(own) for own in q[:10]]]
-    (folder / "targets.csv").write_text("\n".join(targets) + "\n")
+    turn = Rotation.from_euler("xyz", [[float(v) for v in p[3:]] for p in pose], degrees=True)
+    rows = [[*own, *place[:3], *wxyz(one)] for own, place, one in zip(q, pose, turn, strict=True)]
+    (folder / "rokae.csv").write_text(table(f"{joints},x_mm,y_mm,z_mm,qw,qx,qy,qz", rows))
+    (folder / "targets.csv").write_text(table(joints, q[:10]))
     rng = np.random.default_rng(5)
     commanded = rng.uniform(-500, 500, (40, 3))
-    header = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
-    lines = [header]
-    for name, size in (("before", 0.5), ("after", 0.05)):
-        for row in commanded:
-            lines.append(",".join([name, *map(repr, [*row.tolist(), *(row + rng.normal(0, size, 3)).tolist()])]))
-    (folder / "measured.csv").write_text("\n".join(lines) + "\n")
+    sizes = {"before": 0.5, "after": 0.05}.items()
+    rows = [[name, *row, *(row + rng.normal(0, size, 3))] for name, size in sizes for row in commanded]
+    head = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
+    (folder / "measured.csv").write_text(table(head, rows))
     a = rng.uniform(-300, 300, (60, 3))
     turn = Rotation.from_rotvec([0.3, -0.5, 1.0])
     b = turn.apply(a) + np.array([1000, -400, 250]) + rng.normal(0, 0.1, (60, 3))
     b[:12] += rng.normal(0, 20, (12, 3))
-    lines = ["ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"]
-    lines += [",".join(map(repr, [*p.tolist(), *r.tolist()])) for p, r in zip(a, b, strict=True)]
-    (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
-    names = ["hand", "pose"]
+    (folder / "pairs.csv").write_text(table("ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm", np.hstack([a, b])))
     truth = [Rotation.from_rotvec([0.1, 0.2, 1.5]), Rotation.from_rotvec([2.0, 0.3, -0.4])]
     places = [np.array([30.0, -20.0, 80.0]), np.array([900.0, 200.0, 50.0])]
-    head = [f"base_from_flange_{k}" for k in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")]
-    head += [k.replace("base_from_flange", "camera_from_board") for k in head]
-    lines = [",".join(["name", *head])]
+    rows = []
     for i in range(24):
         hand = Rotation.from_rotvec(rng.normal(0, 0.8, 3))
         where = rng.uniform(-300, 300, 3) + np.array([600, 0, 500])
         # camera_from_board = (base_from_flange @ flange_from_camera)^-1 @ base_from_board
         camera = hand * truth[0]
         origin = hand.apply(places[0]) + where
-        board = camera.inv() * truth[1]
         seen = camera.inv().apply(places[1] - origin) + rng.normal(0, 0.1, 3)
-        board = Rotation.from_rotvec(rng.normal(0, 2e-4, 3)) * board
-        cells = []
-        for rotation, t in ((hand, where), (board, seen)):
-            cells += [*t.tolist(), *rotation.as_quat()[[3, 0, 1, 2]].tolist()]
-        lines.append(",".join([f"{names[0]}{i}", *map(repr, cells)]))
-    (folder / "handeye.csv").write_text("\n".join(lines) + "\n")
+        board = Rotation.from_rotvec(rng.normal(0, 2e-4, 3)) * (camera.inv() * truth[1])
+        rows.append([f"hand{i}", *where, *wxyz(hand), *seen, *wxyz(board)])
+    head = [f"{pair}_{k}" for pair in PAIRS for k in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")]
+    (folder / "handeye.csv").write_text(table(",".join(["name", *head]), rows))
     (folder / "charuco_poses.csv").write_text(robot_table(DATA / "charuco_handeye" / "test_set_charuco" / "poses"))
     (folder / "dots_poses.csv").write_text(robot_table(DATA / "dotgrid_handeye" / "poses"))
     tags = "".join(f'\n[[tag]]\ndictionary = "DICT_6X6_250"\nid = {k}\nsize_mm = 18.256\n' for k in LAYOUT_TAGS)

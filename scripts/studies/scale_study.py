@@ -5,7 +5,6 @@ Every size is run in a process of its own: graph, database, mapping, refinement,
 the final database. Centres carry 0.02 px noise and one label in ten is missing. Prints a Markdown table.
 """
 
-import argparse
 import json
 import resource
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.parallel import one_thread
+from scripts.runner import face_errors, head, row, script
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.checks.suite import run_checks
@@ -70,18 +69,9 @@ def ellipse_shapes(scene: Scene, group: str, image: int) -> dict[str, np.ndarray
 
 def evidence(scene: Scene, observations, options: AdjustOptions, solutions, result: Calibration) -> Evidence:
     """What a run gives to the checks, but for the blur of the edges, which needs pixels."""
-    return Evidence(
-        tuple(s.model for s in solutions),
-        tuple(o for s in solutions for o in s.outliers),
-        tuple(observations),
-        scene.camera,
-        scene.target,
-        scene.board,
-        options,
-        result,
-        None,
-        {},
-    )
+    models, outliers = tuple(s.model for s in solutions), tuple(o for s in solutions for o in s.outliers)
+    designs = scene.camera, scene.target, scene.board
+    return Evidence(models, outliers, tuple(observations), *designs, options, result, None, {})
 
 
 def measure(count: int, kind: str) -> dict:
@@ -111,10 +101,7 @@ def measure(count: int, kind: str) -> dict:
         write_database(database, scene.camera, observations, graph.pairs)
         marks.append(("write", time.perf_counter()))
         size = database.stat().st_size
-    error = [
-        np.linalg.norm(pose.translation - scene.target_from_face[face].translation)
-        for face, pose in result.target.target_from_face.items()
-    ]
+    error = [np.linalg.norm(each[3:]) for each in face_errors(result.target, scene.target_from_face).values()]
     processor = time.process_time() - processor
     seconds = {name: at - before for (name, at), (_, before) in zip(marks[1:], marks[:-1], strict=True)}
     return {
@@ -132,35 +119,21 @@ def measure(count: int, kind: str) -> dict:
     }
 
 
-@one_thread()
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="*", default=SIZES, help="images in all, multiples of 4")
-    parser.add_argument("--one", nargs=2, metavar=("COUNT", "KIND"), help="measure one size in this process, as JSON")
-    arguments = parser.parse_args()
-    if arguments.one:
+@script(sizes=list(SIZES), one=["none", "all"], limited=True)
+def main(arguments) -> None:
+    if arguments.one[0] != "none":
         print(json.dumps(measure(int(arguments.one[0]), arguments.one[1])))
         return
-    print(
-        "| images | pairs | mapped | pairs matched | ms an image | graph + map + adjust + check + write, s | "
-        "total, s | memory, MiB | database, MiB | worst face, µm |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    counts = "images", "pairs", "mapped", "pairs matched", "ms an image"
+    sizes = "memory, MiB", "database, MiB", "worst face, µm"
+    head(*counts, "graph + map + adjust + check + write, s", "total, s", *sizes)
     for count in arguments.sizes:
         for kind in ("all", "sparse"):
             if kind == "all" and count > ALL_UP_TO:
                 continue
             command = [sys.executable, __file__, "--one", str(count), kind]
             answer = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+            counts = answer["images"], kind, answer["mapped"], answer["pairs"], f"{answer['ms_per_image']:.1f}"
             parts = " + ".join(f"{s:.2f}" for s in answer["seconds"].values())
-            print(
-                f"| {answer['images']} | {kind} | {answer['mapped']} | {answer['pairs']} | "
-                f"{answer['ms_per_image']:.1f} | {parts} | {sum(answer['seconds'].values()):.1f} | "
-                f"{answer['memory_mib']:.0f} | {answer['database_mib']:.1f} | {answer['worst_face_um']:.2f} |",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()
+            sizes = f"{answer['memory_mib']:.0f}", f"{answer['database_mib']:.1f}", f"{answer['worst_face_um']:.2f}"
+            row(*counts, parts, f"{sum(answer['seconds'].values()):.1f}", *sizes)

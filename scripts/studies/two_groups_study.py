@@ -17,15 +17,14 @@ clean
     Clean sets, and sets with 20 % of the rows off at random, of which the note is given all the same.
 """
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from scripts.runner import script
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.parallel import one_thread
 from stcal.register import Registration, register
 from stcal.register.consensus import MODELS, jacobian
 from tests.support.point_pairs import cube, directions, make_scene, random_rigid
@@ -82,13 +81,8 @@ def is_wrong(found: Registration, trial: Trial) -> bool:
     return bool(error > TIMES_SIGMA * stated and error > TIMES_BEST * least)
 
 
-def tells(found: Registration) -> bool:
-    """Whether a note says that rows disagree together."""
-    return any(word in note for note in found.notes for word in TOLD)
-
-
-def one_line(name: str, trials: int, draw: Callable[[np.random.Generator], Trial]) -> str:
-    """Counts of a case."""
+def one_line(name: str, trials: int, draw: Callable[[np.random.Generator], Trial]) -> None:
+    """Prints the counts of a case."""
     told = wrong = silent = clear = refused = 0
     for k in range(trials):
         trial = draw(np.random.default_rng([k, len(name)]))
@@ -97,13 +91,10 @@ def one_line(name: str, trials: int, draw: Callable[[np.random.Generator], Trial
         except DegenerateError:
             refused += 1
             continue
-        bad, said = is_wrong(found, trial), tells(found)
+        bad, said = is_wrong(found, trial), any(word in note for note in found.notes for word in TOLD)
         told, wrong, silent = told + said, wrong + bad, silent + (bad and not said)
         clear += bad and not said and trial.off >= CLEAR_OFF and len(trial.good) >= CLEAR_ROWS
-    return f"{name:<34}{trials:7}{refused:9}{told:7}{wrong:7}{silent:8}{clear:8}"
-
-
-HEAD = f"{'':<34}{'trials':>7}{'refused':>9}{'told':>7}{'wrong':>7}{'silent':>8}{'clear':>8}"
+    print(f"{name:<34}{trials:7}{refused:9}{told:7}{wrong:7}{silent:8}{clear:8}", flush=True)
 
 
 def shifts(trials: int) -> None:
@@ -114,14 +105,14 @@ def shifts(trials: int) -> None:
             n, sigma, shift, share = (rng.choice(each) for each in (SIZES, SIGMAS_MM, SHIFTS_MM, SHARES))
             return made(rng, kind, int(n), sigma, shift, share)
 
-        print(one_line(kind, trials, draw), flush=True)
+        one_line(kind, trials, draw)
 
 
 def issue(trials: int) -> None:
     """As it was seen first."""
     for share in (0.4, 0.45):
         name = f"0.7 mm, {100 * share:.0f} %, σ 0.15 mm, n 100"
-        print(one_line(name, trials, lambda rng, share=share: made(rng, "anywhere", 100, 0.15, 0.7, share)), flush=True)
+        one_line(name, trials, lambda rng, share=share: made(rng, "anywhere", 100, 0.15, 0.7, share))
 
 
 def clean(trials: int) -> None:
@@ -132,20 +123,11 @@ def clean(trials: int) -> None:
             s = make_scene(rng, int(rng.choice(SIZES)), share, sigma_mm=float(rng.choice(SIGMAS_MM)))
             return Trial(s.xyz_a, s.xyz_b, s.b_from_a, s.clean)
 
-        print(one_line(name, trials, draw), flush=True)
+        one_line(name, trials, draw)
 
 
-@one_thread()
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=300)
-    parser.add_argument("--clean", type=int, default=500)
-    parser.add_argument("--only", nargs="+", choices=("shifts", "issue", "clean"), default=["shifts", "issue", "clean"])
-    given = parser.parse_args()
-    print(HEAD)
+@script(trials=300, clean=500, only=["shifts", "issue", "clean"], limited=True)
+def main(given) -> None:
+    print(f"{'':<34}{'trials':>7}{'refused':>9}{'told':>7}{'wrong':>7}{'silent':>8}{'clear':>8}")
     for name in given.only:
         {"shifts": shifts, "issue": issue, "clean": clean}[name](given.clean if name == "clean" else given.trials)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,18 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from scripts.runner import face_errors, normalised, options_of
+from scripts.runner import executor_of, face_errors, normalised, script
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 NOISE_PX = 0.02
 CAMERA_SIGMA = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
@@ -54,10 +52,8 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     return list(zip(shares, normalised(result.target, errors), strict=True))
 
 
-@one_thread()
-def main() -> None:
-    """Print the table."""
-    given = options_of(__doc__, runs=200, scheduler=str)
+@script(runs=200, scheduler=str, limited=True)
+def main(given) -> None:
     count = given.runs
     print(f"{count} runs each, {NOISE_PX} px noise, 4 groups of 6 images, 2592×1728 px (simulated labels)")
     print(f"{'':28} error / bound   normalised squared error")
@@ -72,7 +68,3 @@ def main() -> None:
         spread = rows[:, 1].reshape(count, -1).mean(1).std() / np.sqrt(count)
         figures = f"{np.sqrt(rows[:, 0].mean()):13.3f}   {rows[:, 1].mean():.3f} ± {spread:.3f}"
         print(f"{title:28} {figures}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import DATA, SAMPLE, face_errors, normalised, script
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
@@ -50,9 +50,6 @@ from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, mak
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 from tests.support.photograph import read_set
 
-ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = ROOT / "tests" / "data" / "sample"
-BLOCK = ROOT.parent / "shared" / "data" / "stereo_target" / "white_block"
 NOISE_PX = 0.02
 SILENT_SIGMA = 4.0
 
@@ -230,29 +227,22 @@ def moved(which: Callable[[Case, ImageObservations, int], bool], faces: Callable
     """The target, or some of its faces, stands elsewhere (mm) against the board in some images."""
 
     def plant(case: Case, value: float) -> Case:
-        def change(image: ImageObservations, k: int) -> np.ndarray:
-            if not which(case, image, k):
-                return image.centre_px
-            xyz, normal, radius = _seen(case, image)
-            pose = case.scene.groups[image.group].camera_from_target[int(image.name.rpartition("/")[2])]
-            shift = pose.rotation @ (value * np.array([0.6, -0.5, 0.62]))
-            hit = np.array([isinstance(x, CircleLabel) and faces(x.face) for x in image.labels])
-            before, after = (circle_image_offset(at, normal, radius) for at in (xyz, xyz + hit[:, None] * shift))
-            project = case.scene.camera.project
-            return image.centre_px + project(after) - project(before)
+        def shift(image: ImageObservations, k: int) -> np.ndarray:
+            hit = [which(case, image, k) and isinstance(x, CircleLabel) and faces(x.face) for x in image.labels]
+            return np.outer(hit, value * np.array([0.6, -0.5, 0.62]))
 
-        return case.centres(change)
+        return shifted_points(case, shift)
 
     return plant
 
 
-def shifted_points(case: Case, shift_mm: Callable[[ImageObservations], np.ndarray]) -> Case:
+def shifted_points(case: Case, shift_mm: Callable[[ImageObservations, int], np.ndarray]) -> Case:
     """Circles (n,) that stand elsewhere, by (n, 3) mm in the frame of the target."""
 
-    def change(image: ImageObservations, _: int) -> np.ndarray:
+    def change(image: ImageObservations, k: int) -> np.ndarray:
         xyz, normal, radius = _seen(case, image)
         pose = case.scene.groups[image.group].camera_from_target[int(image.name.rpartition("/")[2])]
-        shift = shift_mm(image) @ pose.rotation.T
+        shift = shift_mm(image, k) @ pose.rotation.T
         before, after = (circle_image_offset(at, normal, radius) for at in (xyz, xyz + shift))
         return image.centre_px + case.scene.camera.project(after) - case.scene.camera.project(before)
 
@@ -263,7 +253,7 @@ def board_shifted(at: Callable[[np.ndarray, BoardDesign], np.ndarray]) -> Callab
     """Dots of the board off their places: ``at`` gives (n, 3) of unit size, board frame, from (n, 2) cells, −1 to 1."""
 
     def plant(case: Case, value: float) -> Case:
-        def shift(image: ImageObservations) -> np.ndarray:
+        def shift(image: ImageObservations, _: int) -> np.ndarray:
             dots = case.scene.groups[image.group].board_circles_target.reshape(case.board.rows, case.board.columns, 3)
             axes = np.array([dots[0, -1] - dots[0, 0], dots[-1, 0] - dots[0, 0]])
             axes = axes / np.linalg.norm(axes, axis=1)[:, None]
@@ -271,9 +261,8 @@ def board_shifted(at: Callable[[np.ndarray, BoardDesign], np.ndarray]) -> Callab
             out = np.zeros((len(image.labels), 3))
             for k, label in enumerate(image.labels):
                 if isinstance(label, DotLabel):
-                    cell = np.array(
-                        [2 * label.column / (case.board.columns - 1) - 1, 2 * label.row / (case.board.rows - 1) - 1]
-                    )
+                    most = np.array([case.board.columns, case.board.rows]) - 1
+                    cell = 2 * np.array([label.column, label.row]) / most - 1
                     out[k] = value * at(cell, case.board) @ axes
             return out
 
@@ -310,14 +299,15 @@ def noisy(case: Case, value: float) -> Case:
     return case.centres(change)
 
 
-def radii(case: Case, factor: Callable[[CircleLabel | DotLabel], float]) -> Case:
+def radii(which: Callable[[Case, CircleLabel | DotLabel], bool]) -> Callable[[Case, float], Case]:
     """Circles of other radii than their design, seen from the same places."""
-    return replace(
-        case,
-        images=[
-            replace(i, shape=i.shape * np.array([factor(x) for x in i.labels])[:, None, None]) for i in case.images
-        ],
-    )
+
+    def plant(case: Case, value: float) -> Case:
+        factors = [np.array([1 + value * which(case, x) for x in i.labels]) for i in case.images]
+        pairs = zip(case.images, factors, strict=True)
+        return replace(case, images=[replace(i, shape=i.shape * own[:, None, None]) for i, own in pairs])
+
+    return plant
 
 
 def behind_rims(case: Case, value: float) -> Case:
@@ -326,7 +316,7 @@ def behind_rims(case: Case, value: float) -> Case:
     zero = np.zeros(3)
     raised = shifted_points(
         case,
-        lambda i: np.array([value / 2 * normals[x.face] if isinstance(x, CircleLabel) else zero for x in i.labels]),
+        lambda i, _: np.array([value / 2 * normals[x.face] if isinstance(x, CircleLabel) else zero for x in i.labels]),
     )
     images = []
     for image in raised.images:
@@ -348,21 +338,13 @@ def centroids(case: Case, value: float) -> Case:
     return case.centres(change)
 
 
-def with_board(**change: Callable[[BoardDesign, float], float]) -> Callable[[Case, float], Case]:
-    return lambda case, v: replace(case, board=replace(case.board, **{k: f(case.board, v) for k, f in change.items()}))
-
-
-def one_image(case: Case, image: ImageObservations, k: int) -> bool:
-    return k == 2
+def pitch(sign: int) -> Callable[[Case, float], Case]:
+    return lambda c, v: replace(c, board=replace(c.board, pitch_mm=c.board.pitch_mm * (1 + sign * v)))
 
 
 def half_a_group(case: Case, image: ImageObservations, k: int) -> bool:
     own = [i.name for i in case.images if i.group == case.last]
     return image.name in own[len(own) // 2 :]
-
-
-def whole_group(case: Case, image: ImageObservations, k: int) -> bool:
-    return image.group == case.last
 
 
 def first_circle(case: Case) -> CircleLabel:
@@ -371,104 +353,7 @@ def first_circle(case: Case) -> CircleLabel:
 
 def lifted_circle(case: Case, value: float) -> Case:
     label, normal = first_circle(case), case.scene.target_from_face[first_circle(case).face].rotation[:, 2]
-    return shifted_points(case, lambda i: np.array([value * normal * (x == label) for x in i.labels]))
-
-
-Plant = Callable[[Case, float], Case]
-CAUSES: dict[str, tuple[tuple[float, float, float], Plant, tuple[str, ...]]] = {
-    "focal length long": (
-        (0.002, 0.005, 0.02),
-        lambda c, v: c.file(focal=c.camera.focal * (1 + v)),
-        ("the focal length",),
-    ),
-    "focal length short": (
-        (0.002, 0.005, 0.02),
-        lambda c, v: c.file(focal=c.camera.focal * (1 - v)),
-        ("the focal length",),
-    ),
-    "fx over fy": ((0.001, 0.004, 0.02), lambda c, v: c.file(focal=c.camera.focal * [1 + v, 1]), ("width and height",)),
-    "cropped": (
-        (5, 20, 80),
-        lambda c, v: c.file(centre=c.camera.centre + np.array([v, -0.6 * v])),
-        ("the principal point", "turned by 180°"),
-    ),
-    "another camera": (
-        (0.3, 1, 3),
-        lambda c, v: c.file(
-            focal=c.camera.focal * [1 + 0.01 * v, 1 + 0.007 * v],
-            centre=c.camera.centre + np.array([9 * v, 5 * v]),
-            distortion=c.camera.distortion + 0.02 * v * np.eye(12)[0],
-        ),
-        ("the intrinsics", "the focal length", "scaled", "the principal point", "width and height"),
-    ),
-    "distortion": (
-        (0.02, 0.1, 0.5),
-        lambda c, v: through(c, LENS).file(distortion=LENS * (1 - v)),
-        ("the distortion", "undistorted"),
-    ),
-    "no distortion in the file": ((0.1, 0.3, 1), lens(1, 1, 0), ("the distortion",)),
-    "distortion negated": ((0.1, 0.3, 1), lens(1, 1, -1), ("negated", "reversed")),
-    "already undistorted": ((0.1, 0.3, 1), lens(1, 0, 1), ("already undistorted",)),
-    "scaled": (
-        (0.002, 0.005, 0.02),
-        lambda c, v: c.centres(lambda i, _: (1 + v) * (i.centre_px + 0.5) - 0.5),
-        ("photographs are scaled", "the focal length"),
-    ),
-    "turned by 180°": ((6, 20, 60), lambda c, v: turned_by_180(c, v), ("turned by 180°", "the principal point")),
-    "zoom by group": (
-        (0.001, 0.004, 0.02),
-        zoomed(lambda c, i, _: list(c.scene.groups).index(i.group) - 1),
-        ("between the groups",),
-    ),
-    "autofocus": ((0.001, 0.004, 0.02), zoomed(lambda c, i, k: spread(k, 1)[0]), ("from image to image",)),
-    "rolling shutter": ((0.5, 2, 6), rolling, ("rolling shutter",)),
-    "pitch long": ((0.001, 0.004, 0.02), with_board(pitch_mm=lambda b, v: b.pitch_mm * (1 + v)), ("pitch",)),
-    "pitch short": ((0.001, 0.004, 0.02), with_board(pitch_mm=lambda b, v: b.pitch_mm * (1 - v)), ("pitch",)),
-    "board stretched": (
-        (3e-4, 1e-3, 5e-3),
-        board_shifted(lambda c, b: np.array([c[0], 0, 0]) * b.pitch_mm * (b.columns - 1) / 2),
-        ("board", "board-lines", "stretched"),
-    ),
-    "board bent": ((0.05, 0.2, 1), board_shifted(lambda c, b: np.array([0, 0, c @ c])), ("board", "bent")),
-    "column of dots off": (
-        (0.05, 0.2, 1),
-        board_shifted(lambda c, b: np.array([c[0] > 0.99, 0, 0])),
-        ("board", "board-lines"),
-    ),
-    "radii of the board": (
-        (0.03, 0.08, 0.2),
-        lambda c, v: radii(c, lambda x: 1 + v * isinstance(x, DotLabel)),
-        ("radius-design",),
-    ),
-    "radii of the target": (
-        (0.03, 0.08, 0.2),
-        lambda c, v: radii(c, lambda x: 1 + v * isinstance(x, CircleLabel)),
-        ("radius-design",),
-    ),
-    "radius of one circle": (
-        (0.03, 0.08, 0.2),
-        lambda c, v: radii(c, lambda x: 1 + v * (x == first_circle(c))),
-        ("radius",),
-    ),
-    "circle out of plane": ((0.2, 0.5, 2), lifted_circle, ("flatness",)),
-    "rim": ((0.05, 0.15, 0.4), behind_rims, ("rim",)),
-    "centroids": ((0.3, 0.6, 1), centroids, ("control", "eccentricity")),
-    "target moved, one image": ((0.05, 0.2, 1), moved(one_image), ("moved",)),
-    "target moved, half a group": ((0.05, 0.2, 1), moved(half_a_group), ("moved",)),
-    "a face moved, one group": (
-        (0.05, 0.2, 1),
-        lambda c, v: moved(whole_group, lambda f: f == seen_in_last(c))(c, v),
-        ("groups", "loops", "agreement"),
-    ),
-    "one image of another focus": (
-        (0.002, 0.005, 0.02),
-        zoomed(lambda c, i, k: k == 2),
-        ("moved", "image-residuals", "image of another focus"),
-    ),
-    "one noisy image": ((4, 8, 20), noisy, ("image-residuals",)),
-    "labels exchanged": ((1, 2, 3), exchanged, ("labels",)),
-}
-"""By name: strengths, what is planted, and keys of checks or words of causes that name it."""
+    return shifted_points(case, lambda i, _: np.array([value * normal * (x == label) for x in i.labels]))
 
 
 def turned_by_180(case: Case, value: float) -> Case:
@@ -485,6 +370,77 @@ def seen_in_last(case: Case) -> str:
     elsewhere = {face for image in case.images if image.group != case.last for face in image.face_ids()}
     own = [face for image in case.images if image.group == case.last for face in image.face_ids() if face in elsewhere]
     return max(set(own), key=own.count)
+
+
+Plant = Callable[[Case, float], Case]
+MUCH, TENTHS, MOVES = (0.001, 0.004, 0.02), (0.1, 0.3, 1), (0.05, 0.2, 1)
+FOCAL, RADII, BOTH = (0.002, 0.005, 0.02), (0.03, 0.08, 0.2), "board; board-lines"
+CAUSES: dict[str, tuple[tuple[float, float, float], Plant, str]] = {
+    "focal length long": (FOCAL, lambda c, v: c.file(focal=c.camera.focal * (1 + v)), "the focal length"),
+    "focal length short": (FOCAL, lambda c, v: c.file(focal=c.camera.focal * (1 - v)), "the focal length"),
+    "fx over fy": (MUCH, lambda c, v: c.file(focal=c.camera.focal * [1 + v, 1]), "width and height"),
+    "cropped": (
+        (5, 20, 80),
+        lambda c, v: c.file(centre=c.camera.centre + np.array([v, -0.6 * v])),
+        "the principal point; turned by 180°",
+    ),
+    "another camera": (
+        (0.3, 1, 3),
+        lambda c, v: c.file(
+            focal=c.camera.focal * [1 + 0.01 * v, 1 + 0.007 * v],
+            centre=c.camera.centre + np.array([9 * v, 5 * v]),
+            distortion=c.camera.distortion + 0.02 * v * np.eye(12)[0],
+        ),
+        "the intrinsics; the focal length; scaled; the principal point; width and height",
+    ),
+    "distortion": (
+        (0.02, 0.1, 0.5),
+        lambda c, v: through(c, LENS).file(distortion=LENS * (1 - v)),
+        "the distortion; undistorted",
+    ),
+    "no distortion in the file": (TENTHS, lens(1, 1, 0), "the distortion"),
+    "distortion negated": (TENTHS, lens(1, 1, -1), "negated; reversed"),
+    "already undistorted": (TENTHS, lens(1, 0, 1), "already undistorted"),
+    "scaled": (
+        FOCAL,
+        lambda c, v: c.centres(lambda i, _: (1 + v) * (i.centre_px + 0.5) - 0.5),
+        "photographs are scaled; the focal length",
+    ),
+    "turned by 180°": ((6, 20, 60), turned_by_180, "turned by 180°; the principal point"),
+    "zoom by group": (MUCH, zoomed(lambda c, i, _: list(c.scene.groups).index(i.group) - 1), "between the groups"),
+    "autofocus": (MUCH, zoomed(lambda c, i, k: spread(k, 1)[0]), "from image to image"),
+    "rolling shutter": ((0.5, 2, 6), rolling, "rolling shutter"),
+    "pitch long": (MUCH, pitch(1), "pitch"),
+    "pitch short": (MUCH, pitch(-1), "pitch"),
+    "board stretched": (
+        (3e-4, 1e-3, 5e-3),
+        board_shifted(lambda c, b: np.array([c[0], 0, 0]) * b.pitch_mm * (b.columns - 1) / 2),
+        f"{BOTH}; stretched",
+    ),
+    "board bent": (MOVES, board_shifted(lambda c, b: np.array([0, 0, c @ c])), "board; bent"),
+    "column of dots off": (MOVES, board_shifted(lambda c, b: np.array([c[0] > 0.99, 0, 0])), BOTH),
+    "radii of the board": (RADII, radii(lambda c, x: isinstance(x, DotLabel)), "radius-design"),
+    "radii of the target": (RADII, radii(lambda c, x: isinstance(x, CircleLabel)), "radius-design"),
+    "radius of one circle": (RADII, radii(lambda c, x: x == first_circle(c)), "radius"),
+    "circle out of plane": ((0.2, 0.5, 2), lifted_circle, "flatness"),
+    "rim": ((0.05, 0.15, 0.4), behind_rims, "rim"),
+    "centroids": ((0.3, 0.6, 1), centroids, "control; eccentricity"),
+    "target moved, one image": (MOVES, moved(lambda c, i, k: k == 2), "moved"),
+    "target moved, half a group": (MOVES, moved(half_a_group), "moved"),
+    "a face moved, one group": (
+        MOVES,
+        lambda c, v: moved(lambda c, i, _: i.group == c.last, lambda f: f == seen_in_last(c))(c, v),
+        "groups; loops; agreement",
+    ),
+    "one image of another focus": (
+        FOCAL,
+        zoomed(lambda c, i, k: k == 2),
+        "moved; image-residuals; image of another focus",
+    ),
+    "one noisy image": ((4, 8, 20), noisy, "image-residuals"),
+    "labels exchanged": ((1, 2, 3), exchanged, "labels"),
+}
+"""By name: strengths, what is planted, and keys of checks or words of causes that name it."""
 
 
 # ---------------------------------------------------------------- runs
@@ -539,25 +495,17 @@ def _named_by(error: StcalError) -> str:
 
 def worst_sigma(case: Case, target) -> float:
     """√(eᵀC⁻¹e/6), the largest of all faces."""
-    known, own = case.scene.target_from_face, target.reference_face
-    worst = 0.0
-    for face, pose in target.target_from_face.items():
-        if face == own:
-            continue
-        true = known[own].inverse() @ known[face]
-        error = np.concatenate([Rigid(pose.rotation @ true.rotation.T).log()[:3], pose.translation - true.translation])
-        covariance = target.face_covariance[face]
-        worst = max(worst, float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6)))
-    return worst
+    return float(np.sqrt(normalised(target, face_errors(target, case.scene.target_from_face)).max(initial=0.0)))
 
 
-def names_it(first: str, words: tuple[str, ...]) -> bool:
+def names_it(first: str, words: str) -> bool:
     """Whether a first sentence names a planted cause: by the key of a check, or by words of a whole set's cause."""
     key, _, title = first.partition(": ")
-    return key in words or (key == CAUSE and any(word in title for word in words))
+    return key in words.split("; ") or (key == CAUSE and any(word in title for word in words.split("; ")))
 
 
-MAKERS = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(BLOCK), "own": lambda: simulated()}
+MAKERS = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(DATA / "stereo_target" / "white_block")}
+MAKERS["own"] = simulated
 
 
 @cache
@@ -583,8 +531,8 @@ def sound(where: str, seed: int) -> dict:
     return answer(drawn(case_of(where), seed))
 
 
-def main() -> None:
-    given = options_of(__doc__, only="", sets="sample,block,own", sound=40, json=Path)
+@script(only="", sets="sample,block,own", sound=40, json=Path)
+def main(given) -> None:
     sets = given.sets.split(",")
     causes = [name for name in CAUSES if given.only in name]
     pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
@@ -597,15 +545,9 @@ def main() -> None:
         quiet = [r for r in runs if r["verdict"] == "yes"]
         silent = [r for r in quiet if r["sigma"] > SILENT_SIGMA]
         others = sorted({r["first"].partition(": ")[2] for r in asked if not r["named"]})
-        rows.append(
-            [
-                name,
-                f"{sum(r['named'] for r in asked)}/{len(asked)}",
-                f"{len(quiet)}" + (f" ({max(r['sigma'] for r in quiet):.1f} σ)" if quiet else ""),
-                str(len(silent)),
-                "; ".join(text[:60] for text in others),
-            ]
-        )
+        worst = f" ({max(r['sigma'] for r in quiet):.1f} σ)" if quiet else ""
+        counts = f"{sum(r['named'] for r in asked)}/{len(asked)}", f"{len(quiet)}{worst}", str(len(silent))
+        rows.append([name, *counts, "; ".join(text[:60] for text in others)])
     asked = [r for r in kept if r["verdict"] != "yes"]
     named = sum(r["named"] for r in asked)
     quiet = [r for r in kept if r["verdict"] == "yes"]
@@ -621,7 +563,3 @@ def main() -> None:
     print(f"sound sets: {len(wrong)} of {len(drawn_sound)} answered No or With care, {share}{listed}")
     if given.json:
         given.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -13,16 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from scripts.runner import options_of
+from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, observed, residuals, tips
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from stcal.workflows.cluster import executor_of
 
 NEW_POSES = 50
 MIXED = (1.0, 50.0)
@@ -77,9 +75,8 @@ def simulated(case: Case, seed: int) -> tuple[Robot, Measurements, np.ndarray]:
 def draw(case: Case, seed: int) -> tuple[float, bool, int]:
     """Ratio of the errors, whether each wrong row was named, and how many good ones were."""
     true, data, bad = simulated(case, seed)
-    options = IdentifyOptions(folds=0)
-    found = identify(mh80(), data, options)
-    good = identify(mh80(), without(data, bad), replace(options, robust=False))
+    found = identify(mh80(), data, IdentifyOptions(folds=0))
+    good = identify(mh80(), without(data, bad), IdentifyOptions(folds=0, robust=False))
     ratio = error(found, true, seed) / error(good, true, seed)
     named = {int(max(found.seen.first[row], found.seen.second[row])) for row, _ in found.outliers()}
     return ratio, set(bad.tolist()) <= named, len(named - set(bad.tolist()))
@@ -106,24 +103,14 @@ def error(found: Identified, true: Robot, seed: int) -> float:
     return float(np.sqrt((residuals(found.state, observed(exact, kind)) ** 2).sum(1).mean()))
 
 
-@one_thread()
-def main() -> None:
-    """Run all cases; print."""
-    arguments = options_of(__doc__, draws=200, only="", scheduler=str)
+@script(draws=200, only="", scheduler=str, limited=True)
+def main(arguments) -> None:
     print(f"{arguments.draws} draws each, simulated\n")
-    print("| observed | rows | wrong | by, mm | within 1.1 | worst | named | called wrong |\n" + "|---" * 8 + "|")
+    head("observed", "rows", "wrong", "by, mm", "within 1.1", "worst", "named", "called wrong")
     with executor_of(arguments.scheduler) as pool:
         for case in (each for each in CASES if each.title().startswith(arguments.only)):
             found = list(pool.map(partial(draw, case), range(arguments.draws), chunksize=5))
             ratio = np.array([each[0] for each in found])
-            cells = (
-                f"{(ratio <= 1.1).sum()}",
-                f"{ratio.max():.2f}",
-                f"{sum(each[1] for each in found)}",
-                f"{sum(each[2] for each in found)} of {len(found) * case.rows}",
-            )
-            print(f"| {case.title()} | {' | '.join(cells)} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+            named, wrong = (sum(each[k] for each in found) for k in (1, 2))
+            called = f"{wrong} of {len(found) * case.rows}"
+            row(case.title(), (ratio <= 1.1).sum(), f"{ratio.max():.2f}", named, called)

@@ -45,9 +45,8 @@ def manner(quiet: bool, verbose: bool) -> Iterator[None]:
         yield
     finally:
         beat.over.set()
-        _quiet.reset(tokens[0])
-        _verbose.reset(tokens[1])
-        _beating.reset(tokens[2])
+        for token in tokens:
+            token.var.reset(token)  # type: ignore[arg-type]
 
 
 def wait_for_others() -> None:

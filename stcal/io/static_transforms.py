@@ -89,16 +89,14 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
 
 def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     """Return a launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
-    lines = [f"# {line}" for line in said]
-    lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
-    lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
+    text = "".join(f"# {line}\n" for line in said)
+    text += "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n\n\n"
+    text += "def generate_launch_description() -> LaunchDescription:\n    nodes = [\n"
     for static in statics:
-        lines += ["        Node(", '            package="tf2_ros",']
-        lines += ['            executable="static_transform_publisher",', '            output="log",']
-        lines += ["            arguments=["]
-        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(static)]
-        lines += ["            ],", "        ),"]
-    return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
+        words = "".join(f"                {json.dumps(word, ensure_ascii=False)},\n" for word in _arguments(static))
+        text += '        Node(\n            package="tf2_ros",\n            executable="static_transform_publisher",\n'
+        text += f'            output="log",\n            arguments=[\n{words}            ],\n        ),\n'
+    return text + "    ]\n    return LaunchDescription(nodes)\n"
 
 
 def _arguments(each: Static) -> list[str]:

@@ -5,7 +5,7 @@ import contextlib
 import logging
 import re
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
+from concurrent.futures import CancelledError
 from importlib import metadata
 from typing import Any
 
@@ -27,7 +27,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     Raises InputError: the extra ``dask`` is not installed, no scheduler or worker answers, or a worker has other
     versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
     """
-    with _connected(address) as client:
+    with connected(address) as client:
         from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
@@ -41,18 +41,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def executor_of(address: str | None = None) -> Iterator[Executor]:
-    """Yield the workers of a Dask cluster as of :func:`dask_cluster`, or processes of this machine, one per core."""
-    if address is None:
-        with ProcessPoolExecutor() as pool:
-            yield pool
-    else:
-        with _connected(address) as client:
-            yield client.get_executor(pure=False)
-
-
-@contextlib.contextmanager
-def _connected(address: str) -> Iterator[Any]:
+def connected(address: str) -> Iterator[Any]:
     """Yields the client of a cluster whose workers have the versions of this machine and one thread for BLAS."""
     try:
         from distributed import Client

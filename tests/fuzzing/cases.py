@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.commands import CALLS, PLACES, Call, options_of
-from tests.fuzzing.judged import failures, hashes, in_process, lay_out
+from tests.fuzzing.judged import Outcome, failures, hashes, in_process, lay_out
 from tests.fuzzing.mutations import MAY_BE_READ, REFUSED, mutations_of, not_permitted, pick
 from tests.shared import own_copy
 
@@ -33,6 +33,10 @@ class Judged:
     seconds: float
     command: str
 
+    @classmethod
+    def of(cls, name: str, said: str, failures, outcome: Outcome, call: Call) -> "Judged":
+        return cls(name, said, tuple(failures), outcome.code, outcome.seconds, call.command)
+
 
 def judged(stock: Path, folder: Path, seed: int, number: int, brief: bool = False) -> Judged:
     """Lay out, spoil and run case ``number``, and judge it; ``brief`` : without calls that take long."""
@@ -44,9 +48,8 @@ def judged(stock: Path, folder: Path, seed: int, number: int, brief: bool = Fals
     outcome = in_process(call, program, folder, more, plain)
     found = failures(call, folder, outcome, before, refused)
     _restore(folder)
-    name = f"c{number}"
     words = f"{program} {' '.join([call.command, *call.inputs])}: {said}"
-    return Judged(name, words, tuple(found), outcome.code, outcome.seconds, call.command)
+    return Judged.of(f"c{number}", words, found, outcome, call)
 
 
 def option_cases() -> list[tuple[str, str, str]]:
@@ -63,17 +66,14 @@ def judged_option(stock: Path, folder: Path, number: int) -> Judged:
     before = hashes(folder)
     outcome = in_process(call, "stcal", folder, (f"{name}={value}",))
     found = failures(call, folder, outcome, before, refused=False)
-    said = f"{command}: {name}={value[:20]!r}"
-    return Judged(f"o{number}", said, tuple(found), outcome.code, outcome.seconds, command)
+    return Judged.of(f"o{number}", f"{command}: {name}={value[:20]!r}", found, outcome, call)
 
 
 def chosen(rng: np.random.Generator, brief: bool) -> tuple[Call, str]:
     """Calls that take long are fewer; each command has its share."""
     calls = [call for call in CALLS if not (brief and call.seconds > BRIEF_S and not call.inputs)]
-    same = [sum(call.command == other.command for other in calls) for call in calls]
-    share = np.array(
-        [1 / (n * (0.3 + call.seconds)) ** (1 if brief else 0.5) for n, call in zip(same, calls, strict=True)]
-    )
+    same = np.array([sum(call.command == other.command for other in calls) for call in calls])
+    share = 1 / (same * (0.3 + np.array([call.seconds for call in calls]))) ** (1 if brief else 0.5)
     call = calls[int(rng.choice(len(calls), p=share / share.sum()))]
     return call, str(pick(rng, ["stcal", PLACES[call.command]]))
 

@@ -57,9 +57,7 @@ def of_kept(stock: Path, folder: Path, seed: int, number: int) -> Judged:
         said_so = _all_said(call, folder, outcome)
         told = call.command not in REMADE_BY and any(words in said_so for words in TOLD)
         found += [("silent wrong", f"{name} is another one: {outcome.said[-300:]}") for name in changed[:1] if not told]
-    return Judged(
-        f"s{number}", f"{call.command}: {'; '.join(said)}", tuple(found), outcome.code, outcome.seconds, call.command
-    )
+    return Judged.of(f"s{number}", f"{call.command}: {'; '.join(said)}", found, outcome, call)
 
 
 def _laid_out(stock: Path, folder: Path, call: Call) -> tuple[Path, Path]:
@@ -74,10 +72,8 @@ def _laid_out(stock: Path, folder: Path, call: Call) -> tuple[Path, Path]:
 
 
 def _all_said(call: Call, folder: Path, outcome: Outcome) -> str:
-    texts = (
-        path.read_text(encoding="utf-8") for name in call.outputs if (path := folder / OUT / name).suffix == ".json"
-    )
-    return "\n".join([outcome.said, *texts])
+    written = (folder / OUT / name for name in call.outputs if name.endswith(".json"))
+    return "\n".join([outcome.said, *(path.read_text(encoding="utf-8") for path in written)])
 
 
 def _reads_kept(call: Call) -> bool:
@@ -189,7 +185,7 @@ def closed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     if outcome.code != call.code:
         found.append(("exit code", f"{outcome.code}, {call.code} needed: {outcome.err[-300:]}"))
     said = f"{call.command}: {', '.join(['stdin', 'stdout', 'stderr'][n] for n in numbers)} closed"
-    return Judged(f"d{number}", said, tuple(found), outcome.code, outcome.seconds, call.command)
+    return Judged.of(f"d{number}", said, found, outcome, call)
 
 
 def _heard(outcome: Outcome, numbers: list[int]) -> Outcome:

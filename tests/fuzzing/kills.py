@@ -71,7 +71,7 @@ def _killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     found += _whole(folder / OUT, kind is signal.SIGKILL)
     # A run's folder holds the earlier results or the new ones, by its own hashes.
     found += [("earlier result lost", note) for place in call.folders for note in verify(folder / OUT / place).notes()]
-    return Judged(f"k{number}", f"{call.command}: {said}", tuple(found), outcome.code, outcome.seconds, call.command)
+    return Judged.of(f"k{number}", f"{call.command}: {said}", found, outcome, call)
 
 
 def start_program(

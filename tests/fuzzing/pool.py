@@ -47,9 +47,7 @@ def went_through(stock: Path, folder: Path, number: int) -> Judged:
     found += [("check is blind", name) for name in blind]
     if outcome.code != call.code:
         found.append(("exit code", f"{outcome.code}, {call.code} needed: {outcome.err[-300:]}"))
-    return Judged(
-        f"v{number}", f"{call.command} on good data", tuple(found), outcome.code, outcome.seconds, call.command
-    )
+    return Judged.of(f"v{number}", f"{call.command} on good data", found, outcome, call)
 
 
 def mistaken(stock: Path, folder: Path, name: str) -> Judged:
@@ -68,9 +66,7 @@ def mistaken(stock: Path, folder: Path, name: str) -> Judged:
         found.append(("silent wrong", outcome.said[-400:]))
     elif mistake.untold and not read_rightly:
         found.append(("told", f"is told, though none could: {outcome.said[-200:]}"))
-    return Judged(
-        name, f"{mistake.call.command}: {name}", tuple(found), outcome.code, outcome.seconds, mistake.call.command
-    )
+    return Judged.of(name, f"{mistake.call.command}: {name}", found, outcome, mistake.call)
 
 
 @cache

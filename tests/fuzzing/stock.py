@@ -128,15 +128,9 @@ def _cameras(folder: Path) -> None:
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
-    for name, form in (
-        ("ros.yaml", "ros"),
-        ("opencv.yaml", "opencv"),
-        ("cameras.bin", "colmap-bin"),
-        ("camchain.yaml", "kalibr"),
-        ("camera.cameramodel", "mrcal"),
-        ("metashape.xml", "metashape"),
-        ("matlab.mat", "matlab"),
-    ):
+    names = {"ros": "ros.yaml", "opencv": "opencv.yaml", "colmap-bin": "cameras.bin", "kalibr": "camchain.yaml"}
+    names |= {"mrcal": "camera.cameramodel", "metashape": "metashape.xml", "matlab": "matlab.mat"}
+    for form, name in names.items():
         content = written(given, form, "cam0").content
         (forms / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
@@ -160,17 +154,10 @@ def _robots(folder: Path, rng: np.random.Generator) -> None:
     places = (arm.world_from_base @ forward(arm, sweeps, "")).translation + rng.normal(0, 0.02, (len(sweeps), 3))
     write_rows(folder / "sweeps.csv", [*joints, *POSE[:3]], np.column_stack([np.degrees(sweeps), places]).tolist())
     wanted = forward(nominal, q[:8], "")
-    write_rows(
-        folder / "targets.csv",
-        [*joints, *POSE],
-        [[*d, *pose_cells(p)] for d, p in zip(np.degrees(q), wanted, strict=False)],
-    )
-    commanded = rng.uniform(-500, 500, (12, 3))
-    rows = [
-        [name, *c, *(c + rng.normal(0, size, 3))]
-        for name, size in (("before", 0.5), ("after", 0.05))
-        for c in commanded
-    ]
+    rows = [[*d, *pose_cells(p)] for d, p in zip(np.degrees(q), wanted, strict=False)]
+    write_rows(folder / "targets.csv", [*joints, *POSE], rows)
+    commanded, sizes = rng.uniform(-500, 500, (12, 3)), {"before": 0.5, "after": 0.05}.items()
+    rows = [[name, *c, *(c + rng.normal(0, size, 3))] for name, size in sizes for c in commanded]
     write_rows(folder / "verify.csv", ["set", *(f"commanded_{c}" for c in POSE[:3]), *POSE[:3]], rows)
     _loaded(folder, arm, q)
 
@@ -188,11 +175,8 @@ def _loaded(folder: Path, arm: Robot, q: np.ndarray) -> None:
 def _held(folder: Path) -> None:
     """Joint values of an arm that holds the target as the data set's photographs show it."""
     groups = json.loads((folder / "data/truth.json").read_text())["groups"]
-    shown = [
-        (name, Rigid.from_matrix(np.array(each["camera_from_target"])))
-        for own in groups.values()
-        for name, each in own["images"].items()
-    ]
+    images = {name: each for own in groups.values() for name, each in own["images"].items()}
+    shown = [(name, Rigid.from_matrix(np.array(each["camera_from_target"]))) for name, each in images.items()]
     base_from_camera = forward(mh80(), HOLDS)[0] @ shown[0][1].inverse()
     poses = Poses.of(base_from_camera @ pose for _, pose in shown)
     found = inverse(mh80(), poses, np.tile(HOLDS, (len(poses), 1)))
@@ -206,10 +190,8 @@ def _handeye(folder: Path, rng: np.random.Generator) -> None:
     folder.mkdir()
     pairs = simulated(rng, 14, robot=(2e-4, 0.1), camera=(5e-4, 0.2)).pairs
     header = [f"{name}_{column}" for name in ("base_from_flange", "camera_from_board") for column in POSE]
-    rows = [
-        [*pose_cells(a), *pose_cells(b)] for a, b in zip(pairs.base_from_flange, pairs.camera_from_board, strict=True)
-    ]
-    write_rows(folder / "poses.csv", header, rows)
+    both = zip(pairs.base_from_flange, pairs.camera_from_board, strict=True)
+    write_rows(folder / "poses.csv", header, [[*pose_cells(a), *pose_cells(b)] for a, b in both])
     inner = folder / "drawn"
     inner.mkdir()
     found = photographs(inner, *chessboard_mm(6, 8, 20.0), looks(rng, 7, np.array([70.0, 50.0]), 0.6), CHESSBOARD)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputNote
+from stcal.io import cache
 from stcal.io.cache import keep, kept
-from stcal.io.files import TABLE_BYTES
 
 ARRAYS = {"xyz": np.array([[0.1, 0.2, 0.3]]), "index": np.array([3, 1])}
 META = {"name": "ä", "count": 2}
@@ -67,6 +67,8 @@ def test_a_damaged_or_absent_file_is_none(tmp_path, end):
 def test_an_edited_file_and_that_of_another_are_none(tmp_path):
     """The edit is one that NumPy can read."""
     path, other = tmp_path / "key.npz", tmp_path / "other.npz"
+    keep(other, {"xyz": ARRAYS["xyz"]}, META)  # of another form
+    assert kept(other, together) is None
     keep(path, ARRAYS, META)
     keep(other, ARRAYS, META)
     assert kept(other, together) is not None
@@ -79,41 +81,29 @@ def test_an_edited_file_and_that_of_another_are_none(tmp_path):
         assert kept(path, together) is None
 
 
-def test_a_folder_in_its_place_makes_room(tmp_path):
+@pytest.mark.parametrize("make", [lambda path: (path / "deeper").mkdir(parents=True), os.mkfifo])
+def test_a_folder_or_a_pipe_in_its_place_makes_room_and_is_not_waited_for(tmp_path, make):
     path = tmp_path / "key.npz"
-    (path / "deeper").mkdir(parents=True)
+    make(path)
     with pytest.warns(InputNote, match=r"key\.npz is damaged"):
         assert kept(path, together) is None
     keep(path, ARRAYS, META)
     assert kept(path, together) is not None
 
 
-def test_a_named_pipe_in_its_place_is_not_waited_for(tmp_path):
-    path = tmp_path / "key.npz"
-    os.mkfifo(path)
-    with pytest.warns(InputNote, match=r"key\.npz is damaged"):
-        assert kept(path, together) is None
-    keep(path, ARRAYS, META)
-    assert kept(path, together) is not None
-
-
-def test_a_file_of_another_form_is_none(tmp_path):
-    path = tmp_path / "key.npz"
-    keep(path, {"xyz": ARRAYS["xyz"]}, META)
-    assert kept(path, together) is None
-
-
-def test_a_file_of_gigabytes_is_none_and_takes_no_memory(tmp_path):
+def test_a_file_of_gigabytes_is_none_and_takes_no_memory(tmp_path, monkeypatch):
     """Sparse, or of zeros that were packed."""
+    most = 5_000_000
+    monkeypatch.setattr(cache, "TABLE_BYTES", most)
     sparse, packed = tmp_path / "sparse.npz", tmp_path / "packed.npz"
     keep(sparse, ARRAYS, META)
     os.truncate(sparse, 3 << 30)
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("xyz.npy", bytes(TABLE_BYTES + 1))
+        file.writestr("xyz.npy", bytes(most + 1))
     tracemalloc.start()
     try:
         assert kept(sparse, together) is None
         assert kept(packed, together) is None
-        assert tracemalloc.get_traced_memory()[1] < 2 * TABLE_BYTES
+        assert tracemalloc.get_traced_memory()[1] < 2 * most
     finally:
         tracemalloc.stop()

@@ -10,7 +10,7 @@ from stcal.cli.instruments import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.read import SUFFIXES, WRITERS, read_camera, written
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 LENSES = {
     "PINHOLE": [],
@@ -132,5 +132,4 @@ def test_mrcal_is_read_with_its_comments(tmp_path):
 def test_a_wrong_file_is_named(tmp_path, name, content, message):
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with fails_with(message):
-        read_camera(path)
+    refuses(message, read_camera, path)

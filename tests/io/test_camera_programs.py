@@ -30,7 +30,7 @@ from tests.io.camera_files import (
     SIZE,
     perspective,
 )
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 
 def read(tmp_path, content: str | bytes):
@@ -160,8 +160,7 @@ def test_what_is_not_understood_names_the_programs_that_are_read(tmp_path):
 
 @pytest.mark.parametrize("key", ["kc", "dist_vec", "calib_dist", "rect_distortion", "D_vec", "lens", "num_dist"])
 def test_coefficients_under_any_name_are_refused(tmp_path, key):
-    with fails_with(f"E-CAMERA-KEY … {key} … distortion_coefficients"):
-        read(tmp_path, f"camera_matrix: {FLAT}\n{key}: {D5}\n")
+    refuses(f"E-CAMERA-KEY … {key} … distortion_coefficients", read, tmp_path, f"camera_matrix: {FLAT}\n{key}: {D5}\n")
 
 
 @pytest.mark.parametrize("other", ["turn: [0.5, 0.5, 0.5, 0.5]", "window: [0, 0, 1280, 720]", "tvec: [0.1, 2, 3, 4.5]"])
@@ -181,8 +180,7 @@ def test_four_coefficients_without_a_model_are_named(tmp_path):
 def test_the_essential_matrices_of_a_pair_are_no_cameras(tmp_path):
     path = tmp_path / "stereo.yml"
     path.write_text(f"K1: {FLAT}\nD1: {D5}\nK2: {EYE}\nD2: {D4}\nR: {EYE}\nE: {FLAT}\nF: {FLAT}\n")
-    with fails_with("E-CAMERA-SEVERAL … 2 cameras … 1, 2"):
-        read_lens(path)
+    refuses("E-CAMERA-SEVERAL … 2 cameras … 1, 2", read_lens, path)
     np.testing.assert_allclose(project(read_lens(path, "1")), perspective(D5), atol=1e-9)
 
 
@@ -197,8 +195,7 @@ def test_a_camera_of_a_pair_is_chosen(tmp_path):
     for first, second in (("M1", "M2"), ("camera_matrix_left", "camera_matrix_right")):
         d = {"M1": ("D1", "D2")}.get(first, ("dist_coeffs_left", "dist_coeffs_right"))
         path.write_text(f"{first}: {FLAT}\n{d[0]}: {D5}\n{second}: {other}\n{d[1]}: {D4}\nR: {EYE}\nT: [1, 0, 0]\n")
-        with fails_with("E-CAMERA-SEVERAL … 2 cameras … --camera-name"):
-            read_lens(path)
+        refuses("E-CAMERA-SEVERAL … 2 cameras … --camera-name", read_lens, path)
         names = ("1", "2") if first == "M1" else ("left", "right")
         np.testing.assert_allclose(project(read_lens(path, names[0])), perspective(D5), atol=1e-9)
         wanted = perspective(D4, (800.0, 801.0, 630.0, 350.0))
@@ -252,8 +249,7 @@ def test_a_database_without_its_log_is_named(tmp_path):
     copy = tmp_path / "copy.db"
     copy.write_bytes(path.read_bytes())
     database.close()
-    with fails_with("E-CAMERA-UNREADABLE … copy.db-wal … copy both"):
-        read_lens(copy)
+    refuses("E-CAMERA-UNREADABLE … copy.db-wal … copy both", read_lens, copy)
     assert sorted(each.name for each in tmp_path.iterdir() if each.name.startswith("copy")) == ["copy.db"]
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from stcal.geometry.arrays import OF_POSE, ROUNDING, Rows, first_fault, require_covariance
 from stcal.io.json import Part, PoseCovariance, checked
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 SIGMA = np.array([1e-5, 2e-5, 3e-5, 0.01, 0.02, 500.0])
 """rad and mm: sixteen orders of magnitude between variances."""
@@ -53,8 +53,7 @@ NONE = {
 @pytest.mark.parametrize("case", NONE)
 def test_what_is_none_is_named(case):
     matrix, message = NONE[case]
-    with fails_with(message):
-        require_covariance(matrix, 6, OF_POSE)
+    refuses(message, require_covariance, matrix, 6, OF_POSE)
 
 
 def test_files_name_the_place_and_not_the_numbers():
@@ -85,8 +84,7 @@ def test_rounding_of_zero_passes(seed):
 def test_just_beyond_rounding():
     low, high = (with_entry(0, 1, 1 + share * 6 * ROUNDING) for share in (0.5, 1.5))
     require_covariance(low, 6, OF_POSE)
-    with fails_with("E-COVARIANCE-VALUE … 1"):
-        require_covariance(high, 6, OF_POSE)
+    refuses("E-COVARIANCE-VALUE … 1", require_covariance, high, 6, OF_POSE)
 
 
 def test_what_is_inverted_must_not_be_singular():

@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.io import images
 from stcal.io.files import RUN_MARKER
 from stcal.io.images import TOP_GROUP, common_size, decode, find_images, name_fault, percentiles, size_fault, thumbnail
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 
 def encoded(suffix, image=None, params=()):
@@ -63,8 +63,7 @@ def test_whole_files_are_read_and_truncated_ones_refused(suffix):
     with pytest.raises(InputError, match=r"truncated|not readable"):
         decode(data[: len(data) * 2 // 3], "x")
     for other, code in ((b"", "E-IMAGE-EMPTY"), (b"text", "E-IMAGE-UNREADABLE")):
-        with fails_with(code):
-            decode(other, f"x{suffix}")
+        refuses(code, decode, other, f"x{suffix}")
 
 
 def test_sixteen_bit_and_colour():
@@ -160,8 +159,7 @@ def test_most_images_state_the_size(tmp_path):
     assert common_size(files) == ((60, 40), "1.png")
     with fails_with("E-IMAGES-SIZES … 1 of 40×60 px, first 0.png and 1 of 60×40 px, first 1.png … turn one half back"):
         common_size(files[:2])
-    with fails_with("E-IMAGES-SIZES … leave one size out"):
-        common_size([files[0], files[4]])
+    refuses("E-IMAGES-SIZES … leave one size out", common_size, [files[0], files[4]])
     files[0].path.write_bytes(files[0].path.read_bytes()[:60])
     assert common_size(files[:2]) == ((60, 40), "1.png")  # the header of a file that cannot be read does not decide
     assert common_size(files[:1]) is None
@@ -193,8 +191,7 @@ def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path, monkeypa
     monkeypatch.setattr(images, "SUFFIXES", images.USUAL)
     for name in ("a.HEIC", "b.dng", "c.txt"):
         (tmp_path / name).write_bytes(b"x")
-    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … [heic]' … export it as JPEG"):
-        find_images(tmp_path)
+    refuses("E-IMAGES-NONE … a.HEIC: a HEIC photograph … [heic]' … export it as JPEG", find_images, tmp_path)
     cv2.imwrite(str(tmp_path / "d.png"), np.zeros((4, 4), np.uint8))
     reasons = {each.name: each.reason for each in find_images(tmp_path)[1]}
     assert "develop it to TIFF" in reasons["b.dng"]

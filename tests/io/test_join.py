@@ -12,7 +12,7 @@ from stcal.cli.main import app
 from stcal.geometry.rigid import Rigid
 from stcal.io.join import join_tables, stack_tables
 from stcal.register.registered import read_pairs
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 
 def written(path, text: str):
@@ -59,8 +59,7 @@ def test_pairs_of_two_files(tmp_path):
 def test_what_cannot_be_joined_says_why(tmp_path, second, key, said):
     a = written(tmp_path / "a.csv", "image,x_mm,y_mm,z_mm\np1,1,2,3\n")
     b = written(tmp_path / "b.csv", second)
-    with fails_with(said):
-        join_tables(a, b, key)
+    refuses(said, join_tables, a, b, key)
 
 
 def test_registration_of_two_files(tmp_path):
@@ -89,8 +88,7 @@ def test_files_of_one_kind_stand_below_each_other(tmp_path):
     assert "only" not in found
     assert np.allclose(found.points(), [[8, 8, 8], [7, 7, 7], [9, 9, 9]])
     assert np.allclose(found.points("commanded_"), [[1, 2, 3], [4, 5, 6], [1, 2, 3]])
-    with fails_with("E-TABLES-NAMES … after … set"):
-        stack_tables(joined, ["after", "after"], {})
+    refuses("E-TABLES-NAMES … after … set", stack_tables, joined, ["after", "after"], {})
 
 
 def test_names_that_are_numbers_stay_as_they_are_written(tmp_path):

@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
 from stcal.io.json import ByFace, Named, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 
 class Row(Part):
@@ -70,8 +70,7 @@ def test_a_key_that_is_no_part_of_the_file_is_not_written():
     ],
 )
 def test_the_place_and_the_reason_are_named(change, message):
-    with fails_with(message):
-        checked(WHOLE | change, Example)
+    refuses(message, checked, WHOLE | change, Example)
 
 
 def test_keys_of_later_versions_are_passed_over():
@@ -100,8 +99,7 @@ def test_a_file_that_is_no_object(tmp_path, content, reason):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with fails_with("E-FILE-UNREADABLE … some.json … make one"):
-        read_json(tmp_path / "some.json", "file", "make one")
+    refuses("E-FILE-UNREADABLE … some.json … make one", read_json, tmp_path / "some.json", "file", "make one")
 
 
 @pytest.mark.slow

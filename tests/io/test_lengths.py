@@ -12,7 +12,7 @@ from stcal.locate.layout import TargetLayout, layout_toml, load_layout
 from stcal.robot.descriptions import load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 
 TAGS = 'type = "tags"\n' + "".join(
     f'[[tag]]\ndictionary = "APRILTAG_36h11"\nid = {i}\nsize_mm = {{0}}\nx_mm = {{{i + 1}}}\ny_mm = 0.0\n'
@@ -41,8 +41,7 @@ def test_boards_in_another_unit_are_refused(tmp_path, kind, factor):
     text = BOARDS[kind]
     load_flat_board(written(tmp_path, text.format(30.0, 7.0)))
     wrong = text.format(30.0 * factor, 7.0 * factor)
-    with fails_with("E-LENGTH-UNIT … unusual_size"):
-        load_flat_board(written(tmp_path, wrong))
+    refuses("E-LENGTH-UNIT … unusual_size", load_flat_board, written(tmp_path, wrong))
     head = "unusual_size = true\n"
     load_flat_board(written(tmp_path, head + wrong))
 
@@ -70,8 +69,7 @@ def test_targets_in_metres(tmp_path):
         for i, (x, y) in enumerate([(0.01, 0.012), (0.078, 0.01), (0.014, 0.074), (0.046, 0.04)], 1)
     )
     text = f'polarity = "dark"\n[[face]]\nid = "1"\norigin = 1\nx = 2\ny = 3\ncircles = [{circles}]\n'
-    with fails_with("E-LENGTH-UNIT … 1:1 … 0.006"):
-        load_target(written(tmp_path, text))
+    refuses("E-LENGTH-UNIT … 1:1 … 0.006", load_target, written(tmp_path, text))
     small = load_target(written(tmp_path, "unusual_size = true\n" + text))
     assert load_target(written(tmp_path, target_toml(small))).faces[0].radius_mm[0] == 0.006
 
@@ -79,8 +77,7 @@ def test_targets_in_metres(tmp_path):
 def test_robots_in_metres_and_one_without_links(tmp_path):
     load_robot(written(tmp_path, ROBOT.format(0, -612.0)))
     for wrong in (-0.612, -612000.0):
-        with fails_with(f"E-LENGTH-UNIT … joint 2 … {wrong:g}"):
-            load_robot(written(tmp_path, ROBOT.format(0, wrong)))
+        refuses(f"E-LENGTH-UNIT … joint 2 … {wrong:g}", load_robot, written(tmp_path, ROBOT.format(0, wrong)))
     load_robot(written(tmp_path, ROBOT.format(0, 0)))  # axes that meet: zeros are meant
     rows = (DHRow(0.02, np.pi / 2, 0.0, 0.0), DHRow(0.0, 0.0, 0.01, 0.0))
     robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()}, unusual_size=True)
@@ -99,5 +96,4 @@ def test_urdf_in_millimetres(tmp_path):
         '<child link="b"/><origin xyz="{} 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint></robot>'
     )
     load_urdf(written(tmp_path, text.format(0.612), "r.urdf"))
-    with fails_with("E-LENGTH-UNIT … j … 612"):
-        load_urdf(written(tmp_path, text.format(612), "r.urdf"))
+    refuses("E-LENGTH-UNIT … j … 612", load_urdf, written(tmp_path, text.format(612), "r.urdf"))

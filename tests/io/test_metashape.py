@@ -7,7 +7,7 @@ from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera, written
 from tests.io.test_camera_forms import camera_of
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 SENSOR = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="1.5.0"><chunk label="c"><sensors next_id="2">
@@ -51,8 +51,7 @@ def test_of_several_sensors_one_is_chosen(tmp_path):
     other = '<sensor id="1" label="thermal" type="frame"><calibration type="frame" class="adjusted">'
     other += '<resolution width="640" height="512"/><f>700</f></calibration></sensor>'
     path = sensor_file(tmp_path / "doc.xml", more=other)
-    with fails_with("E-CAMERA-SEVERAL … DJI, thermal"):
-        read_camera(path)
+    refuses("E-CAMERA-SEVERAL … DJI, thermal", read_camera, path)
     assert read_camera(path, "thermal").covariance is None
     assert read_camera(path, "thermal").focal == pytest.approx([700, 700])
     assert read_camera(path, "DJI").covariance is not None
@@ -99,11 +98,9 @@ def test_what_has_no_place_is_said(tmp_path):
     ],
 )
 def test_covariances_that_are_none(tmp_path, names, coeffs, message):
-    with fails_with(message):
-        read_camera(sensor_file(tmp_path / "cameras.xml", names, coeffs))
+    refuses(message, read_camera, sensor_file(tmp_path / "cameras.xml", names, coeffs))
 
 
 def test_cameras_before_alignment(tmp_path):
     (tmp_path / "cameras.xml").write_text('<document><chunk><sensors><sensor id="0"/></sensors></chunk></document>')
-    with fails_with("E-CAMERA-NONE"):
-        read_camera(tmp_path / "cameras.xml")
+    refuses("E-CAMERA-NONE", read_camera, tmp_path / "cameras.xml")

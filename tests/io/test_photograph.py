@@ -7,7 +7,7 @@ from PIL import ExifTags, Image
 
 import stcal
 from stcal.io.cameras.read import SIGMA_FOCAL, camera_of_photograph, is_photograph
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 
 def photograph(path, **entries):
@@ -57,8 +57,7 @@ def test_a_lens_is_loaded_from_a_photograph_too(tmp_path):
     assert (found.told, found.fitted) == (camera_of_photograph(path).told, None)
     stcal.save_camera(tmp_path / "c.txt", found.camera, "colmap")
     assert stcal.load_lens(tmp_path / "c.txt").camera.same_as(found.camera)
-    with fails_with("E-FIELD-TYPE … size"):
-        stcal.load_lens(path, size="1200x800")
+    refuses("E-FIELD-TYPE … size", stcal.load_lens, path, size="1200x800")
 
 
 @pytest.mark.parametrize(
@@ -74,5 +73,4 @@ def test_a_lens_is_loaded_from_a_photograph_too(tmp_path):
 def test_a_photograph_that_tells_nothing_is_refused(tmp_path, entries, content, message):
     path = tmp_path / "p.jpg"
     path.write_bytes(content) if content else photograph(path, **entries)
-    with fails_with(message):
-        camera_of_photograph(path)
+    refuses(message, camera_of_photograph, path)

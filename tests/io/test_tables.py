@@ -8,7 +8,7 @@ import pytest
 import stcal
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, LENGTHS, csv_rows, csv_text, read_table
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 POINTS = np.array([[-594.288, -1.155, 162.397], [1616.584, -790.796, 506.870], [0.125, 2.0, -3.5]])
 
@@ -65,8 +65,7 @@ def test_names_of_columns(tmp_path, head, separator):
     ],
 )
 def test_what_is_no_table_is_said(tmp_path, text, error):
-    with fails_with(error):
-        table(tmp_path, text)
+    refuses(error, table, tmp_path, text)
 
 
 def test_cells_that_stay_as_they_are(tmp_path):
@@ -135,8 +134,7 @@ def test_a_row_of_units_below_the_header(tmp_path, units, separator):
 def test_a_covariance_is_whole_or_there_is_none(tmp_path):
     given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_z"]
     found = table(tmp_path, ",".join(given) + "\n" + ",".join(["1"] * len(given)) + "\n")
-    with fails_with("E-TABLE-COLUMN-MISSING … tool_cov_ry_z"):
-        found.pose_covariances("tool_")
+    refuses("E-TABLE-COLUMN-MISSING … tool_cov_ry_z", found.pose_covariances, "tool_")
     assert found.pose_covariances("other_") is None
 
 

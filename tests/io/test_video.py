@@ -25,7 +25,7 @@ from stcal.synthetic.body_scene import (
     write_body,
 )
 from stcal.synthetic.designs import tag_cube
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 WIDTH, STEP_PX = 480, 5
 PER_VIEW = int(np.ceil(MOVED * WIDTH / STEP_PX))
@@ -102,8 +102,7 @@ def test_chosen_frames_are_written_and_listed_and_replace_earlier_ones(tmp_path)
     ],
 )
 def test_mistakes_are_named(tmp_path, every, error):
-    with fails_with(error):
-        write_frames(clip_of(moving(20), tmp_path / "clip.mp4"), tmp_path / "frames", every)
+    refuses(error, write_frames, clip_of(moving(20), tmp_path / "clip.mp4"), tmp_path / "frames", every)
 
 
 def test_what_is_no_video_is_refused_and_touches_no_folder_of_others(tmp_path):
@@ -116,8 +115,7 @@ def test_what_is_no_video_is_refused_and_touches_no_folder_of_others(tmp_path):
         (video, other, None, "E-OUTPUT-EXISTS … other"),
         (tmp_path, tmp_path / "run", AUTO, "E-OPTION-VALUE … --every auto"),
     ):
-        with fails_with(error):
-            pipeline.run(source, None, out, tag_cube(60), every=every)
+        refuses(error, pipeline.run, source, None, out, tag_cube(60), every=every)
     assert [path.name for path in other.iterdir()] == ["mine.txt"]
 
 

@@ -13,7 +13,7 @@ from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, 
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.read import camera_of_photograph, is_photograph, read_lens, sized_camera
+from stcal.io.cameras.read import LoadedLens, camera_of_photograph, is_photograph, read_lens, sized_camera
 
 CELLS = 24  # number of grid points along the shorter side of the image
 STEPS, STEP_RAD = 10, 1e-6
@@ -160,24 +160,6 @@ class FittedLens:
     camera_from_lens: Rigid = field(default_factory=lambda: Rigid())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadedLens:
-    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
-
-    lens: Camera | SizedLens
-    told: str = ""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera; of a lens of another model the one that was fitted to it."""
-        return self.lens.near.camera if isinstance(self.lens, SizedLens) else self.lens
-
-    @property
-    def fitted(self) -> "FittedLens | None":
-        """Quality of the fit, None where the file's model is supported."""
-        return self.lens.near if isinstance(self.lens, SizedLens) else None
-
-
 @require_arguments
 def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> LoadedLens:
     """Load a camera from a file also of a model that is not supported, to which one is fitted, or from EXIF.
@@ -195,8 +177,7 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     Raises ConvergenceError, DegenerateError: no supported model comes near the lens.
     """
     if is_photograph(path):
-        found = camera_of_photograph(path)
-        return LoadedLens(found.camera, found.told)
+        return camera_of_photograph(path)
     lens, (across, up) = read_lens(path, name), size or (0, 0)
     width, height = lens.width or across, lens.height or up
     if isinstance(lens, CameraModel) or not (width and height):
@@ -208,23 +189,21 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
     """Return the supported camera model that is nearest to a lens over an image of this size, px."""
     rays, pixels, share = _rays(lens, width, height)
-    straight = _best(lens, rays, pixels, share, (width, height), False)
+
+    def best(turn: bool) -> FittedLens:
+        fits = []
+        for model in CANDIDATES:
+            camera, from_lens = _fitted(model, rays, pixels, lens, (width, height), turn)
+            off = np.linalg.norm(camera.project(from_lens @ rays) - pixels, axis=1)
+            if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
+                fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, from_lens))
+        return fits[-1]
+
+    straight = best(turn=False)
     if straight.most_px <= GOOD_PX:
         return straight
-    turned = _best(lens, rays, pixels, share, (width, height), True)
+    turned = best(turn=True)
     return turned if turned.rms_px < TURN_HELPS * straight.rms_px else straight
-
-
-def _best(
-    lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
-) -> FittedLens:
-    fits = []
-    for model in CANDIDATES:
-        camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)
-        off = np.linalg.norm(camera.project(camera_from_lens @ rays) - pixels, axis=1)
-        if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
-            fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, camera_from_lens))
-    return fits[-1]
 
 
 def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, float]:

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import yaml
@@ -33,6 +33,9 @@ from stcal.io.cameras.matlab import mat
 from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
+if TYPE_CHECKING:
+    from stcal.io.cameras.difference import FittedLens, SizedLens
+
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
 FILM_DIAGONAL_MM = 43.2666
 """Diagonal of 36 × 24 mm, by which CIPA DCG-001 states focal lengths; widths would differ by 4 % at 4 : 3."""
@@ -46,12 +49,21 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photograph:
-    """The camera of a photograph, OPENCV without distortion and with a covariance for what EXIF leaves open, and
-    ``told``, the EXIF entries that were used, in words."""
+class LoadedLens:
+    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
 
-    camera: Camera
-    told: str
+    lens: "Camera | SizedLens"
+    told: str = ""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; of a lens of another model the one that was fitted to it."""
+        return self.lens if isinstance(self.lens, Camera) else self.lens.near.camera
+
+    @property
+    def fitted(self) -> "FittedLens | None":
+        """Quality of the fit, None where the file's model is supported."""
+        return None if isinstance(self.lens, Camera) else self.lens.near
 
 
 def is_photograph(path: str | Path) -> bool:
@@ -64,8 +76,9 @@ def is_photograph(path: str | Path) -> bool:
         return False
 
 
-def camera_of_photograph(path: str | Path) -> Photograph:
-    """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes."""
+def camera_of_photograph(path: str | Path) -> LoadedLens:
+    """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes, OPENCV without distortion and with a
+    covariance for what EXIF leaves open."""
     where = f"camera file {path}"
     try:
         data = read_bytes(path, IMAGE_BYTES)
@@ -94,7 +107,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
-    return Photograph(Camera.of(camera, "OPENCV", covariance), told)
+    return LoadedLens(Camera.of(camera, "OPENCV", covariance), told)
 
 
 def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
