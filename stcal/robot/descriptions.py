@@ -369,7 +369,7 @@ def robot_urdf(robot: Robot) -> str:
         fix(f"link_{len(chain)}", FLANGE, chain.ends[-1])
     for name, tool in robot.tools.items():
         carrier = chain.carrier(name)
-        at = (FLANGE, tool) if robot.tree is None else (f"link_{carrier + 1}", chain.end(carrier) @ tool)
+        at = (FLANGE, tool) if robot.tree is None else (f"link_{carrier + 1}", chain.ends[carrier] @ tool)
         fix(at[0], link_of(name), at[1])
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'

@@ -12,7 +12,7 @@ from stcal.robot.kinematics.robot_model import Convention, DHRow, Elasticity, Jo
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
 TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
-"""Of :func:`seen_arm`."""
+"""Of :func:`seen_arm`; its tool is also that of :func:`modified`."""
 MARKERS = ("left", "right", "elbow")
 """Of :func:`two_arms`."""
 LEFT, RIGHT = Rigid.exp([0.5, 0.2, 0.1, 100, 250, 300]), Rigid.exp([-0.5, 0.3, -0.1, 100, -250, 300])
@@ -49,3 +49,30 @@ def two_arms(convention: Convention = "standard") -> Robot:
     base = Rigid.exp([0.1, 0.2, 0.9, 1500, -300, 200])
     rows, joints = (*torso, *arm_rows, *arm_rows), (*wide, *arm.joints, *arm.joints)
     return Robot("torso", arm.convention, rows, joints, world_from_base=base, tools=tools, tree=tree)
+
+
+def modified() -> Robot:
+    """A six-axis arm by Craig's convention with Hayati's β, its third joint coupled as Fanuc's."""
+    half = np.pi / 2
+    rows = [DHRow(0, 0, 400, 0), DHRow(150, -half, 0, -half), DHRow(700, 0, 0, 0)]
+    rows += [DHRow(120, -half, 720, 0), DHRow(0, half, 0, 0), DHRow(0, -half, 90, 0)]
+    rows[2] = replace(rows[2], beta=2e-4)
+    coupling = np.eye(6)
+    coupling[2, 1] = 1.0
+    limits = np.radians([170, 100, 130, 190, 120, 350])
+    joints = tuple(Joint("revolute", -v, v) for v in limits)
+    return Robot(
+        "modified",
+        "modified",
+        tuple(rows),
+        joints,
+        coupling,
+        tools={"": Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])},
+    )
+
+
+def scara() -> Robot:
+    """Four axes: shoulder, elbow, vertical travel, spindle."""
+    rows = (DHRow(350, 0, 400, 0), DHRow(300, np.pi, 0, 0), DHRow(0, 0, 0, 0), DHRow(0, 0, 50, 0))
+    joints = (Joint("revolute", -2.4, 2.4), Joint("revolute", -2.5, 2.5), Joint("prismatic", 0, 200), Joint())
+    return Robot("scara", "standard", rows, joints)

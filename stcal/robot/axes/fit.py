@@ -191,13 +191,11 @@ def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflect
     lever = about / np.sqrt((about**2).sum(axis=1).mean())
     carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
     row = np.repeat(np.arange(m), k)
-    at = row.tolist()
+    many = data[row]
     virtual = replace(
-        data,
-        lines=[data.lines[i] for i in at],
-        q=data.q[row],
-        targets=tuple(f"{data.targets[i]}{SEPARATOR}{n % k + 1}" for n, i in enumerate(at)),
-        positions=np.asarray(data.positions)[row] + carried,
+        many,
+        targets=tuple(f"{target}{SEPARATOR}{n % k + 1}" for n, target in enumerate(many.targets)),
+        positions=many.points() + carried,
         rotations=None,
         covariance=None,
         common=None,

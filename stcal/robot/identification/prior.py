@@ -78,7 +78,7 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Returns each link's usual moment (n, 3) N m, with what follows at the next joint, and its σ (n,)."""
     n = len(chain)
     following = [[k for k in range(n) if chain.after(k) == i] for i in range(n)]
-    ends = {i: chain.end(i).translation for i in range(n) if not following[i]}
+    ends = {i: chain.ends[i].translation for i in range(n) if not following[i]}
     length, above = np.array([np.linalg.norm(ends.get(i, np.zeros(3))) for i in range(n)]), np.ones(n)
     for i in range(n - 1, -1, -1):  # the longest way from base to an end, and the joints from each to its farthest end
         before = chain.after(i)

@@ -78,7 +78,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal,
         rows=tuple(rows),
         world_from_base=base,
-        tools={name: end(k := chain.carrier(name)) @ chain.end(k) @ tool for name, tool in tools.items()},
+        tools={name: end(k := chain.carrier(name)) @ chain.ends[k] @ tool for name, tool in tools.items()},
         elasticity=None,
         tree=tree,
     )

@@ -26,8 +26,9 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
     ``[i].matrix()`` one. Raises InputError: joint values of another shape or not finite; an unknown tool; a mass that
     no arm carries.
     """
-    values, flange_from_tool = _joint_vectors(q, robot), robot.tool(tool)
-    return flange_poses(_from_base(robot, tool), values, loaded(payload_kg, len(values))) @ flange_from_tool
+    values = _joint_vectors(q, robot)
+    chain, flange_from_tool = from_base(robot, tool)
+    return flange_poses(chain, values, loaded(payload_kg, len(values))) @ flange_from_tool
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
@@ -37,9 +38,20 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     origin, in the axes of the base (left perturbation), by rad or mm of each joint; the deflection of links is taken as
     constant. Raises InputError: joint values of another shape or not finite; an unknown tool.
     """
-    values, flange_from_tool, chain = _joint_vectors(q, robot), robot.tool(tool), _from_base(robot, tool)
+    values = _joint_vectors(q, robot)
+    return tool_jacobian(*from_base(robot, tool), values)
+
+
+def from_base(robot: Robot, tool: str) -> tuple[Chain, Rigid]:
+    """Returns the chain from the base to the flange that carries a tool, and flange_from_tool."""
+    flange_from_tool = robot.tool(tool)
+    return replace(robot, world_from_base=Rigid()).chain().branch(tool), flange_from_tool
+
+
+def tool_jacobian(chain: Chain, flange_from_tool: Rigid, q: np.ndarray) -> np.ndarray:
+    """Returns :func:`jacobian` of the chain's own base, at joint vectors (m, n)."""
     path = list(chain.path())
-    columns = joint_motions(chain, values, flange_poses(chain, values) @ flange_from_tool)
+    columns = joint_motions(chain, q, flange_poses(chain, q) @ flange_from_tool)
     return np.moveaxis(columns[path], 0, 2) @ chain.coupling[path]
 
 
@@ -296,11 +308,6 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
     # One step of Newton's iteration for the polar factor removes rounding errors.
     rotation = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
     return replace(chain, rotation=rotation, translation=translation)
-
-
-def _from_base(robot: Robot, tool: str) -> Chain:
-    """Returns the chain from the base to the flange that carries a tool."""
-    return replace(robot, world_from_base=Rigid()).chain().branch(tool)
 
 
 def _joint_vectors(q: ArrayLike, robot: Robot) -> np.ndarray:

@@ -11,7 +11,7 @@ from scipy.stats import qmc
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.kinematics.forward import forward, jacobian
+from stcal.robot.kinematics.forward import flange_poses, from_base, tool_jacobian
 from stcal.robot.kinematics.robot_model import Robot
 
 DONE_MM, DONE_RAD = 1e-10, 1e-13
@@ -156,7 +156,8 @@ class InverseProblem:
     ``middle`` (n,), 0 if unlimited; ``turns`` (n,) whether 2π more is the same; ``few`` : fewer than six joints."""
 
     def __init__(self, robot: Robot, tool: str = ""):
-        self.robot, self.tool, self.reach = robot, tool, reach_mm(robot, [tool])
+        self.robot, self.reach = robot, reach_mm(robot, [tool])
+        self.chain, self.flange_from_tool = from_base(robot, tool)
         self.unit = np.where(robot.prismatic, self.reach, 1.0)
         self.bounds = robot.limits() / self.unit[:, None]
         finite = np.isfinite(self.bounds)
@@ -166,7 +167,7 @@ class InverseProblem:
         coupling, sliding = robot.coupling, robot.prismatic
         whole = np.isclose(coupling, np.round(coupling)) & ~(sliding[:, None] & (coupling != 0))
         self.turns = ~sliding & whole.all(axis=0)
-        self.few = len(robot.chain().branch(tool).path()) < 6
+        self.few = len(self.chain.path()) < 6
 
     def refuse_redundant(self) -> None:
         if (n := len(self.unit)) > 6:
@@ -178,11 +179,15 @@ class InverseProblem:
 
     def errors(self, poses: Poses, q: np.ndarray) -> np.ndarray:
         """Returns (m, 6) differences from the poses that q reaches to ``poses``: rad, mm."""
-        return poses.difference(forward(self.robot, q * self.unit, self.tool))
+        return poses.difference(self.reached(q))
+
+    def reached(self, q: np.ndarray) -> Poses:
+        """Returns base_from_tool of joint vectors (m, n)."""
+        return flange_poses(self.chain, q * self.unit) @ self.flange_from_tool
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """Returns the unitless Jacobian, (m, 6, n)."""
-        derivative = jacobian(self.robot, q * self.unit, self.tool) * self.unit
+        derivative = tool_jacobian(self.chain, self.flange_from_tool, q * self.unit) * self.unit
         derivative[:, 3:] /= self.reach
         return derivative
 
@@ -269,7 +274,7 @@ class InverseProblem:
         one_turn = np.minimum(np.pi, half)  # of more than a turn one turn is enough
         half = np.where(self.turns, one_turn, np.where(np.isfinite(half), half, 1.0))
         pool = self.middle + (2 * qmc.Halton(n, scramble=False).random(POOL + 1)[1:] - 1) * half
-        tree = KDTree(self._embedded(forward(self.robot, pool * self.unit, self.tool)))
+        tree = KDTree(self._embedded(self.reached(pool)))
         chosen = tree.query(self._embedded(poses), k=STARTS)[1].ravel()
         found = self.solve(poses[np.repeat(np.arange(m), STARTS)], pool[chosen]).reshape(m, STARTS, n)
         return list(found if more is None else np.concatenate([more[:, None], found], axis=1))

@@ -217,8 +217,7 @@ def read_measurements(
             notes=said + unread(table, (*columns, *own)),
             conditions=conditions,
         )
-        for rows in data.by_station().values():
-            _in_reach(data[rows], robot)
+        _require_in_reach(data, robot)
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
         raise InputError(
@@ -255,23 +254,24 @@ def targets_of(table: Table) -> tuple[str, ...]:
     return tuple(table.text("target")) if "target" in table else ("",) * len(table)
 
 
-def _in_reach(data: Measurements, robot: Robot) -> None:
-    """Refuses positions farther from the middle one than arm and tool allow."""
-    away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
-    reach, worst = reach_mm(robot, robot.tools), int(away.argmax())
-    if away[worst] > 2 * reach + LONGEST_TOOL_MM:
-        raise InputError(
-            "E-MEASURED-REACH",
-            f"{data.where}: line {data.lines[worst]}: position is {away[worst]:.4g} mm from the middle of all (median "
-            f"{np.median(away):.4g} mm), robot {robot.name} reaches {reach:.4g} mm; correct it, or the unit of x, y, z",
-        )
+def _require_in_reach(data: Measurements, robot: Robot) -> None:
+    """Refuses positions farther from the middle one of their station than arm and tool allow."""
+    reach = reach_mm(robot, robot.tools)
+    for seen in (data[rows] for rows in data.by_station().values()):
+        away = np.linalg.norm(seen.points() - np.median(seen.points(), axis=0), axis=1)
+        worst = int(away.argmax())
+        if away[worst] > 2 * reach + LONGEST_TOOL_MM:
+            raise InputError(
+                "E-MEASURED-REACH",
+                f"{data.where}: line {seen.lines[worst]}: position is {away[worst]:.4g} mm from the middle of all "
+                f"(median {np.median(away):.4g} mm), robot {robot.name} reaches {reach:.4g} mm; correct it, or the "
+                "unit of x, y, z",
+            )
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
     """Removes ambiguous poses and copies of rows; a copy would count as an independent measurement."""
-    undecided = np.zeros(len(data), bool)
-    if STATUS in table:
-        undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])
+    undecided = np.array(table.text(STATUS) if STATUS in table else [""] * len(data)) == AMBIGUOUS
     names = np.unique(data.targets, return_inverse=True)[1]
     more = [each for each in (data.rotations, data.conditions.payload_kg) if each is not None]
     every = np.column_stack([data.q, names, data.points(), *(each.reshape(len(data), -1) for each in more)])

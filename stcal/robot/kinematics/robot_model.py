@@ -461,10 +461,6 @@ class Chain:
         """The joint that carries joint ``i``; −1 for the world."""
         return self.order.after(i)
 
-    def end(self, i: int) -> Rigid:
-        """End of the row of joint ``i`` in its frame; of a serial arm the flange."""
-        return self.ends[i]
-
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
         return self.order.carriers.get(target, len(self) - 1)

@@ -12,29 +12,17 @@ from stcal.robot.axes.fit import find_arcs, fit_axes, length_of, ring
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_file import load_robot
-from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses
 from tests.scripts import load_script
-from tests.support.arms import two_arms
+from tests.support.arms import modified, scara, two_arms
 
 SIGMA = 0.03
 WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])
 TOOLS = {"A": Rigid(np.eye(3), [180, 20, 150]), "B": Rigid(np.eye(3), [-120, 130, 90])}
 TOOLS["C"] = Rigid(np.eye(3), [-60, -170, 210])
-
-
-def scara() -> Robot:
-    rows = tuple(DHRow(*r) for r in ((325, 0, 400, 0), (225, np.pi, 0, 0), (0, 0, 0, 0), (0, 0, 60, 0)))
-    kinds = (Joint(), Joint(), Joint("prismatic", 0, 200), Joint())
-    return Robot("SCARA", "standard", rows, kinds)
-
-
-def craig() -> Robot:
-    rows = ((0, 0, 450, 0), (150, -90, 0, -90), (600, 0, 0, 0), (120, -90, 640, 0), (0, 90, 0, 0), (0, -90, 100, 0))
-    rows = tuple(DHRow(a, float(np.radians(alpha)), d, float(np.radians(theta))) for a, alpha, d, theta in rows)
-    return Robot("Craig", "modified", rows, (Joint("revolute", -2.0, 2.0),) * 6)
 
 
 def coupled() -> Robot:
@@ -43,7 +31,7 @@ def coupled() -> Robot:
     return replace(mh80(), name="coupled", coupling=coupling)
 
 
-NOMINALS = {"MH80": mh80, "Craig": craig, "SCARA": scara, "coupled": coupled}
+NOMINALS = {"MH80": mh80, "Craig": modified, "SCARA": scara, "coupled": coupled}
 QUICK_AND_SLOW = ["SCARA", pytest.param("coupled", marks=SLOW), *sampled(["Craig", "MH80"], kept=())]
 
 
@@ -290,7 +278,7 @@ def test_the_arms_that_cannot_be_had(swept, quick):
         ("E-TARGET-STILL … reflector B", replace(good, positions=fixed), nominal),
         ("E-AXES-STILL … joint 4", replace(swept, positions=still), nominal),
         ("E-AXES-MIRRORED … MH80", replace(good, positions=good.positions * [1, -1, 1]), nominal),
-        ("E-AXES-MIRRORED … SCARA", replace(slides, positions=slides.positions[:, [1, 0, 2]]), scara()),
+        ("E-AXES-MIRRORED … scara", replace(slides, positions=slides.positions[:, [1, 0, 2]]), scara()),
         ("E-ROBOT-TREE", good, two_arms()),
         ("E-AXES-SIGN … 3 … MH80", replace(good, q=good.q * [1, 1, -1, 1, 1, 1]), nominal),
         ("E-MEASURED-DISTANCES", replace(good, positions=None), nominal),

@@ -6,27 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import branches, inverse
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from tests.outcome import refuses
-
-TOOL = Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])
-
-
-def modified() -> Robot:
-    """A six-axis arm by Craig's convention with Hayati's β, its third joint coupled as Fanuc's."""
-    half = np.pi / 2
-    rows = [DHRow(0, 0, 400, 0), DHRow(150, -half, 0, -half), DHRow(700, 0, 0, 0)]
-    rows += [DHRow(120, -half, 720, 0), DHRow(0, half, 0, 0), DHRow(0, -half, 90, 0)]
-    rows[2] = replace(rows[2], beta=2e-4)
-    coupling = np.eye(6)
-    coupling[2, 1] = 1.0
-    limits = np.radians([170, 100, 130, 190, 120, 350])
-    joints = tuple(Joint("revolute", -v, v) for v in limits)
-    return Robot("modified", "modified", tuple(rows), joints, coupling, tools={"": TOOL})
+from tests.support.arms import modified, scara
 
 
 def gantry() -> Robot:
@@ -35,13 +21,6 @@ def gantry() -> Robot:
     rows = ((0, -half, 0, 0), (0, half, 0, half), (0, 0, 0, 0), (0, -half, 0, 0), (0, half, 0, 0), (0, 0, 80, 0))
     joints = (*(Joint("prismatic", 0, length) for length in (2000, 1500, 800)), *(Joint("revolute", -3, 3),) * 3)
     return Robot("gantry", "standard", tuple(DHRow(*row) for row in rows), joints)
-
-
-def scara() -> Robot:
-    """Four axes: shoulder, elbow, vertical travel, spindle."""
-    rows = (DHRow(350, 0, 400, 0), DHRow(300, np.pi, 0, 0), DHRow(0, 0, 0, 0), DHRow(0, 0, 50, 0))
-    joints = (Joint("revolute", -2.4, 2.4), Joint("revolute", -2.5, 2.5), Joint("prismatic", 0, 200), Joint())
-    return Robot("scara", "standard", rows, joints)
 
 
 def seven() -> Robot:
@@ -204,7 +183,7 @@ def test_singular_poses(name):
 
 def test_scara_reaches_what_four_joints_can():
     robot = scara()
-    q = joint_vectors(robot, 50, np.random.default_rng(3), 0.8)
+    q = joint_vectors(robot, 10, np.random.default_rng(3), 0.8)
     q[:, 2] = np.abs(q[:, 2])
     found = inverse(robot, forward(robot, q), q + np.array([0.05, -0.05, 3, 0.1]))
     assert set(found.status) <= {"reached"}
@@ -241,7 +220,7 @@ def test_redundant_arm_needs_a_reference_and_stays_near_it():
 def test_without_reference_a_path_stays_in_its_branch():
     robot = ARMS["made"]
     ends = np.array([[0.2, 0.3, -0.4, 0.5, 0.6, 0.7], [0.5, 0.5, -0.2, 0.8, 0.9, 0.4]])
-    q = ends[0] + np.linspace(0, 1, 25)[:, None] * (ends[1] - ends[0])
+    q = ends[0] + np.linspace(0, 1, 10)[:, None] * (ends[1] - ends[0])
     found = inverse(robot, forward(robot, q))
     assert set(found.status) == {"reached"}
     assert np.abs(np.diff(found.q, axis=0)).max() < 0.2
