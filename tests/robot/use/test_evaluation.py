@@ -16,7 +16,6 @@ from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate, read_measured, verify
 from tests.levels import sampled
 from tests.outcome import refuses
-from tests.robot.identification.test_solve import rokae
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
 SIGMA_MM = 0.05
@@ -206,10 +205,8 @@ def test_identify_and_verify_read_what_was_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_rokae_on_the_half_that_was_not_identified_from(shared_data, tmp_path):
-    robot, text = rokae(shared_data("rokae_tracker/data"))
-    (tmp_path / "rokae.csv").write_text(text)
-    data = read_measurements(tmp_path / "rokae.csv", robot)
+def test_rokae_on_the_half_that_was_not_identified_from(rokae):
+    robot, data = rokae
     half = np.random.default_rng(1).permutation(30)
     identified = identify(robot, data[np.sort(half[:15])], IdentifyOptions(folds=0)).robot
     result = evaluate({"nominal": robot, "identified": identified}, data[np.sort(half[15:])])
