@@ -15,7 +15,7 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
 from tests.levels import sampled
-from tests.robot.identification.test_solve import simulated
+from tests.robot.identification.test_solve import of_distances, simulated
 
 NOISE = Weighting(0.05, 2e-4)
 QUICK = IdentifyOptions(folds=0)
@@ -204,8 +204,6 @@ def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
     assert np.isfinite(base.sigma).all()
     assert np.isnan(tool.sigma[:3]).all()
     assert (tool.sigma[3:] > 0).all()
-    lengths = np.linalg.norm(data.positions - data.positions[0], axis=1)
-    distances = Measurements("d", data.lines, data.q, data.targets, distances=lengths, from_row=np.zeros(45, int))
-    base, tool = identify(mh80(), distances, QUICK).placed
+    base, tool = identify(mh80(), of_distances(data), QUICK).placed
     assert np.isnan(base.sigma).all()
     assert (tool.sigma[3:] > 0).all()

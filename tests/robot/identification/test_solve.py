@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identified_report import identified_report
 from stcal.robot.kinematics.forward import flange_poses
-from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.scripts import load_script
@@ -237,28 +236,9 @@ def test_an_arm_whose_rows_are_singular_is_identified():
     assert again.difference(tips(found.state, data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
-def rokae(folder: Path) -> tuple[Robot, str]:
-    """The data set in the form of our files; orientation as Euler angles xyz in degrees (its SOURCE.txt)."""
-    dh = np.loadtxt(folder / "dh.csv", delimiter=",", skiprows=1)
-    rows = tuple(DHRow(a, float(np.radians(alpha)), d, float(np.radians(theta))) for alpha, a, d, theta in dh)
-    numbers = re.compile(r"j:\{([^}]*)\}")
-    lines = [numbers.search(line) for line in (folder / "joint_angle.csv").read_text().splitlines()]
-    q = [[cell.strip() for cell in line.group(1).split(",")[:6]] for line in lines if line]
-    pose = [line.split()[7:13] for line in (folder / "laser_pos.csv").read_text().splitlines() if line.strip()]
-    wxyz = Rotation.from_euler("xyz", [[float(v) for v in p[3:]] for p in pose], degrees=True).as_quat()[
-        :, [3, 0, 1, 2]
-    ]
-    text = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
-    for joints, place, turn in zip(q, pose, wxyz, strict=True):
-        text += ",".join([*joints, *place[:3], *[repr(float(v)) for v in turn]]) + "\n"
-    return Robot("Rokae", "modified", rows, (Joint(),) * 6), text
-
-
 @pytest.mark.slow
-def test_rokae_held_out(shared_data, tmp_path):
-    robot, text = rokae(shared_data("rokae_tracker/data"))
-    (tmp_path / "rokae.csv").write_text(text)
-    data = read_measurements(tmp_path / "rokae.csv", robot)
+def test_rokae_held_out(rokae):
+    robot, data = rokae
     assert len(data) == 30
     found = identify(robot, data)
     # 0.115 mm asked; 0.06 would be below the noise of a coordinate times 1.6

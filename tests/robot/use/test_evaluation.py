@@ -16,7 +16,7 @@ from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate, read_measured, verify
 from tests.levels import sampled
 from tests.outcome import refuses
-from tests.robot.identification.test_solve import rokae
+from tests.robot.identification.test_solve import of_distances
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
 SIGMA_MM = 0.05
@@ -30,11 +30,6 @@ def seen(robot: Robot, seed: int, count: int = 40, poses: bool = False, **noise)
     rng = np.random.default_rng(1000 + seed)
     data = measured(robot, joint_vectors(robot, count, rng), rng, **{"sigma_mm": SIGMA_MM} | noise)
     return data if poses else replace(data, rotations=None)
-
-
-def by_distances(data: Measurements) -> Measurements:
-    lengths, m = np.linalg.norm(data.points() - data.points()[0], axis=1), len(data)
-    return Measurements("distances", data.lines, data.q, data.targets, distances=lengths, from_row=np.zeros(m, int))
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +156,7 @@ def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
 @pytest.mark.parametrize("refit", REFITS)
 def test_distances_have_their_own_errors(refit):
     true = arm()
-    data = by_distances(seen(true, 8, 50))
+    data = of_distances(seen(true, 8, 50))
     result = evaluate({"a": true, "nominal": replace(mh80(), tools={"": TOOL})}, data, refit)
     assert len(result.wrong) == 49
     # two positions, the first in all: σ of one distance is √2 times a coordinate's
@@ -198,7 +193,7 @@ def test_identify_and_verify_read_what_was_written(tmp_path):
     assert again.poses().difference(data.poses()) == pytest.approx(np.zeros((40, 6)), abs=1e-6)
     verified = verify(read_measured(tmp_path / "rows.csv")).sets[0]
     assert 0.5 * SIGMA_MM < verified.mean_mm < 3 * SIGMA_MM
-    distances = by_distances(data)
+    distances = of_distances(data)
     (tmp_path / "d.csv").write_text(evaluated_csv(evaluate({"a": true, "b": mh80()}, distances, "tool")))
     read = read_measurements(tmp_path / "d.csv", true)
     assert read.lengths()[0] == pytest.approx(distances.lengths()[0], abs=1e-6)
@@ -206,10 +201,8 @@ def test_identify_and_verify_read_what_was_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_rokae_on_the_half_that_was_not_identified_from(shared_data, tmp_path):
-    robot, text = rokae(shared_data("rokae_tracker/data"))
-    (tmp_path / "rokae.csv").write_text(text)
-    data = read_measurements(tmp_path / "rokae.csv", robot)
+def test_rokae_on_the_half_that_was_not_identified_from(rokae):
+    robot, data = rokae
     half = np.random.default_rng(1).permutation(30)
     identified = identify(robot, data[np.sort(half[:15])], IdentifyOptions(folds=0)).robot
     result = evaluate({"nominal": robot, "identified": identified}, data[np.sort(half[15:])])
