@@ -239,14 +239,13 @@ def freeze(
 
 def kept(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function, which then keeps results by the content of its arguments, arrays among them."""
-
     known: dict[tuple, R] = {}
 
     @wraps(function)
     def with_arrays(*given: P.args, **more: P.kwargs) -> R:
         content = tuple(
             (each.tobytes(), each.dtype.str, each.shape) if isinstance(each, np.ndarray) else each
-            for each in (*given, *more.items())
+            for each in (*given, *more, *more.values())
         )
         with suppress(KeyError):
             return known[content]

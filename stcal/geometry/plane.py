@@ -289,7 +289,6 @@ class Weighed:
     residual: np.ndarray  # (h, n, 2) to first order
     normal: np.ndarray  # (h, 6, 6)
     chi2: np.ndarray  # (h,)
-    moved2: np.ndarray  # (h,) squared lengths of the steps, in σ
 
 
 def generalised_equations(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray) -> NormalEquations:
@@ -306,9 +305,9 @@ def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, pos
     2); ``by_pose`` : (h, n, 2, 6) negative derivatives by left perturbations."""
     equations = generalised_equations(residual, by_pose, covariance)
     step = -np.linalg.solve(equations.normal, equations.gradient[..., None])
-    gain = -(step[..., 0] * equations.gradient).sum(1)
     remaining = residual - (by_pose.reshape(len(step), -1, 6) @ step).reshape(residual.shape)
-    return Weighed(poses.moved(step[..., 0]), remaining, equations.normal, equations.cost - gain, gain)
+    chi2 = equations.cost + (step[..., 0] * equations.gradient).sum(1)
+    return Weighed(poses.moved(step[..., 0]), remaining, equations.normal, chi2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

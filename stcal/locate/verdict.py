@@ -255,16 +255,12 @@ class PatentPose(Brief):
     same: bool = False
 
 
-def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
-    """Returns the indices of the exposures with the most tags (S5); ``corners`` : (k, 4, 2) px of each exposure."""
-    most = max(len(each) for each in corners)
-    return [i for i, each in enumerate(corners) if len(each) == most]
-
-
-def largest_area(corners: Sequence[np.ndarray], chosen: Sequence[int], share: float) -> list[int]:
-    """Returns the chosen exposures whose tags span more than ``share`` of the largest area (S5)."""
-    area = {i: triangulated_area(corners[i].reshape(-1, 2)) for i in chosen}
-    return [i for i in chosen if area[i] > share * max(area.values())]
+def largest_area(corners: Sequence[np.ndarray], share: float) -> tuple[dict[int, float], list[int]]:
+    """Returns the areas, px², that the exposures with the most tags span, and those of these exposures that span more
+    than ``share`` of the largest (S5); ``corners`` : (k, 4, 2) px of each exposure."""
+    most = max(map(len, corners))
+    area = {i: triangulated_area(each.reshape(-1, 2)) for i, each in enumerate(corners) if len(each) == most}
+    return area, [i for i in area if area[i] > share * max(area.values())]
 
 
 def triangulated_area(points: np.ndarray) -> float:
@@ -293,11 +289,8 @@ def locate_as_patent(
     corners = [tags.corners_px[of_layout] for tags, of_layout in zip(exposures, listed, strict=True)]
     if not any(listed):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
-    most = most_tags(corners)
-    chosen = largest_area(corners, most, options.area_share)
-    results = [PatentExposure(i, len(of_layout)) for i, of_layout in enumerate(listed)]
-    for i in most:
-        results[i] = replace(results[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
+    area, chosen = largest_area(corners, options.area_share)
+    results = [PatentExposure(i, len(of_layout), area.get(i), i in chosen) for i, of_layout in enumerate(listed)]
     best: PatentPose | None = None
     for i in chosen:
         xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in listed[i]]].reshape(-1, 2)

@@ -437,7 +437,7 @@ def test_weighed_by_what_is_common():
     for _ in range(4):
         xy, by_pose, _ = seen(poses, DOTS, 1.0)
         found = weigh(shifted - xy, by_pose, covariance[None], poses)
-        poses = found.poses
-    assert found.moved2[0] < 1e-12
+        step, poses = found.poses.difference(poses)[0], found.poses
+    assert step @ found.normal[0] @ step < 1e-12
     assert 5 < found.chi2[0] < 45  # χ² of 18: once in 2000 on either side
     assert found.residual.shape == (1, n, 2)

@@ -19,8 +19,6 @@ from stcal.locate.verdict import (
     judge,
     largest_area,
     locate_as_patent,
-    most_tags,
-    triangulated_area,
 )
 from tests.outcome import refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
@@ -172,11 +170,10 @@ def test_selection_by_number_and_area():
     large = np.stack([tag_at(0, 0), tag_at(90, 0)])
     single = tag_at(0, 0)[None]
     corners = [small, single, large, large + 1]
-    assert most_tags(corners) == [0, 2, 3]
-    assert largest_area(corners, [0, 2, 3], 0.8) == [2, 3]
-    assert largest_area(corners, [0, 2, 3], 0.2) == [0, 2, 3]
-    share = triangulated_area(small.reshape(-1, 2)) / triangulated_area(large.reshape(-1, 2))
-    assert largest_area(corners, [0, 2, 3], share) == [2, 3]  # more than S_dis, as written
+    area, chosen = largest_area(corners, 0.8)
+    assert (list(area), chosen) == ([0, 2, 3], [2, 3])
+    assert largest_area(corners, 0.2)[1] == [0, 2, 3]
+    assert largest_area(corners, area[0] / area[2])[1] == [2, 3]  # more than S_dis, as written
 
 
 def test_the_exposure_with_the_smallest_error_is_kept():
