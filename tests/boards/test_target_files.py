@@ -71,6 +71,7 @@ def assert_same_target(found: TargetDesign, expected: TargetDesign):
 
 
 def test_reference_target_round_trip(tmp_path):
+    # Faces 2 and 4 are mirror images, and all five share nine of ten circles.
     assert_same_target(target_of(tmp_path, target_toml(reference_target())), reference_target())
 
 
@@ -185,9 +186,7 @@ def test_a_target_without_rough_poses_has_the_key_in_a_comment(tmp_path):
     assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
 
 
-def test_mirror_images_and_small_likenesses_are_taken(tmp_path):
-    # The reference design has both: faces 2 and 4 are mirror images, and all five share nine of ten circles.
-    assert len(target_of(tmp_path, target_toml(reference_target())).faces) == 5
+def test_small_likenesses_are_taken(tmp_path):
     moved = changed("x_mm = 40, y_mm = 40, radius_mm = 4", "x_mm = 44, y_mm = 40, radius_mm = 4", FACE)
     two = target_of(tmp_path, TARGET + moved.replace('[[face]]\nid = "1"', '[[face]]\nid = "2"'))
     assert [face.id for face in two.faces] == ["1", "2"]  # 4 mm are more than half a radius
@@ -292,6 +291,5 @@ KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.03\ntagSp
 
 @pytest.mark.parametrize("text", [CHESSBOARD, KALIBR])
 def test_another_kind_of_board_is_named(tmp_path, text):
-    (tmp_path / "board").write_text(text)
     with fails_with("E-BOARD-TYPE … board of dots needed … calibrate-camera"):
-        load_dots(tmp_path / "board")
+        board_of(tmp_path, text)
