@@ -11,7 +11,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import load_layout, load_plan
 from stcal.locate.scenes import find_scenes, run
 from tests.boards.drawn import kalibr_tag
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 BUNDLE = """standalone_tags: []
 tag_bundles:
@@ -91,8 +91,7 @@ def test_standalone_tags_have_no_place(tmp_path):
     ],
 )
 def test_mistakes_in_bundles(tmp_path, text, error):
-    with fails_with(error):
-        load_layout(written(tmp_path, text))
+    refuses(error, load_layout, written(tmp_path, text))
 
 
 def test_names_of_families():

@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.workflows.board_views import find_board
 from tests.levels import sampled
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 CAMERA = Camera(800, 600, [900.0, 905.0], [390.0, 305.0], np.zeros(12))
 FINER, MARGIN_MM = 2, 25.0
@@ -64,8 +64,7 @@ def test_a_file_and_back(tmp_path, text, rings):
 )
 def test_mistakes_in_files(tmp_path, text, error):
     (tmp_path / "b.toml").write_text(text)
-    with fails_with(error):
-        load_flat_board(tmp_path / "b.toml")
+    refuses(error, load_flat_board, tmp_path / "b.toml")
 
 
 def test_six_neighbours_are_one_spacing_away():

@@ -47,7 +47,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import second_design, tag_body
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 from tests.support.circle_images import area_and_centroid
 
 PER_MM = 4
@@ -243,8 +243,7 @@ def test_a_design_is_drawn_like_its_file(files):
     draw(files / "target.toml", of_file)
     assert stcal.draw(stcal.load_target(files / "target.toml"), of_design).path == of_design
     assert of_design.read_bytes() == of_file.read_bytes()
-    with fails_with("E-OPTION-RANGE … -1"):
-        stcal.draw(files / "target.toml", of_design, margin_mm=-1.0)
+    refuses("E-OPTION-RANGE … -1", stcal.draw, files / "target.toml", of_design, margin_mm=-1.0)
 
 
 def test_svg_has_the_target_in_mm(files):
@@ -325,8 +324,7 @@ def test_the_lengths_to_check_are_said():
 )
 def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
     (files / "board.svg").write_text("mine")
-    with fails_with(said):
-        draw(files / "board.toml", files / name, paper)
+    refuses(said, draw, files / "board.toml", files / name, paper)
     assert (files / "board.svg").read_text() == "mine"
     assert len(list(files.iterdir())) == 3
 
@@ -390,8 +388,7 @@ def test_a_net_is_on_one_sheet(target, tmp_path):
     """400 × 200 mm and more."""
     drawn = draw(target, tmp_path / "net.pdf", net=True)
     assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
-    with fails_with("E-DRAW-SHEETS … --net … A3 … --paper A2"):
-        draw(target, tmp_path / "a3.pdf", paper="A3", net=True)
+    refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
     assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))
 
 
@@ -432,8 +429,7 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         pose = Rigid(turn, turn @ [50.0, 0, 0])
         pages.append(replace(reference_target().faces[number], outline_mm=outline, rough_target_from_face=pose))
-    with fails_with("E-DRAW-NET"):
-        net_part(TargetDesign("book", "dark", tuple(pages)))
+    refuses("E-DRAW-NET", net_part, TargetDesign("book", "dark", tuple(pages)))
 
 
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):

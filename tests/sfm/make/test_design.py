@@ -27,7 +27,7 @@ from stcal.sfm.make import (
 )
 from stcal.sfm.planning.session import PlanOptions, plan
 from stcal.synthetic.designs import second_design
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 SIZE = (130.0, 110.0, 100.0)
 
@@ -88,8 +88,7 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     options = DesignOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
     with monkeypatch.context() as once:
         once.setattr(make, "ATTEMPTS", 1)
-        with fails_with("E-MAKE-UNNAMED … 1 … 420 … 1"):
-            make_target(options)
+        refuses("E-MAKE-UNNAMED … 1 … 420 … 1", make_target, options)
     assert make_target(options).cases == 5 * 84
 
 
@@ -134,8 +133,7 @@ def test_faces_lie_on_the_box(made):
     ],
 )
 def test_what_cannot_be_made_is_refused(options, said):
-    with fails_with(said):
-        make_target(DesignOptions(SIZE, **options))
+    refuses(said, lambda: make_target(DesignOptions(SIZE, **options)))
 
 
 def test_some_sides_alone_have_circles():
@@ -166,8 +164,7 @@ def test_sizes_are_three_lengths(size):
 def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
     text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
     (tmp_path / "target.toml").write_text(text)
-    with fails_with(said):
-        load_target(tmp_path / "target.toml")
+    refuses(said, load_target, tmp_path / "target.toml")
 
 
 @pytest.mark.parametrize("angle_deg", [0, 50, 100])
@@ -202,5 +199,4 @@ def test_the_command_keeps_a_board_and_replaces_nothing(tmp_path, capsys):
     assert (tmp_path / "board.toml").read_text() == before
     assert load_board(tmp_path / "board.toml").rows == 5
     assert load_target(tmp_path / "target.toml").rough_poses().keys() == {"front", "right", "back", "left", "top"}
-    with fails_with("E-OUTPUT-EXISTS"):
-        command(tmp_path, "130,110,100")
+    refuses("E-OUTPUT-EXISTS", command, tmp_path, "130,110,100")
