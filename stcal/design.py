@@ -117,11 +117,9 @@ class FaceDesign(Brief):
         if abs(sine) < MIN_SINE:
             raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} on one line; choose others")
         if sine < 0:
-            raise InputError(
-                "E-TARGET-FRAME",
-                f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, "
-                "or give positions as seen from outside with y up",
-            )
+            fault = f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside"
+            remedy = "swap x and y, or give positions as seen from outside with y up"
+            raise InputError("E-TARGET-FRAME", f"{fault}; {remedy}")
 
     def labels(self) -> list[CircleLabel]:
         """Returns the label ``face:circle`` of every circle, in order."""
@@ -317,9 +315,8 @@ class BoardDesign(ByValue):
         if min(size) < 1:
             raise InputError("E-BOARD-SIZE", "board: {} rows and {} columns; 1 or more of each needed".format(*size))
         if not 0 < 2 * self.radius_mm < self.pitch_mm:
-            raise InputError(
-                "E-BOARD-RADIUS", f"board: radius {self.radius_mm:g}, under half the pitch {self.pitch_mm:g} mm needed"
-            )
+            fault = f"board: radius {self.radius_mm:g}"
+            raise InputError("E-BOARD-RADIUS", f"{fault}, under half the pitch {self.pitch_mm:g} mm needed")
         if corner is None:
             return
         if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):

@@ -170,7 +170,7 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     xy = apply_homography(image_from_grid, middle).astype(np.float32)
     level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
     bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-    return _scatter(_offsets(grey, _pieces(image_from_grid, bright, cells), outer, cells), cells)
+    return _scatter(cells, *_offsets(grey, _pieces(image_from_grid, bright, cells), outer, cells))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,19 +210,10 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
     return _Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Offsets:
-    """Offsets of lines from the grid, px, of both signs apart; NaN where a line is not seen."""
-
-    offset: np.ndarray  # (n, 2, lines, 2)
-    variance: np.ndarray  # (n, 2, lines, 2)
-    by_sampling: np.ndarray  # (n, 2, lines, 2, 2)
-    along: np.ndarray  # (n, 2, lines, 2) mean place on the line of the sides used
-    passed: np.ndarray  # (n, 2), by direction
-
-
-def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> _Offsets:
-    """Return the offsets of the lines between cells, with those of the outer edges, which the grid has."""
+def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> tuple[np.ndarray, ...]:
+    """Return the offsets of the lines between cells, and of the outer edges, from the grid, px, NaN where a line is not
+    seen; their variances, derivatives by sampling and mean places of the sides used, (2n, k) by tag and direction, k
+    lines of both signs apart; and what the blur passes, (2n,)."""
     n = len(outer.blur)
     shape = (n, 2, cells + 1, 2)
     group = np.ravel_multi_index((pieces.tag, pieces.axis, pieces.line, (pieces.sign > 0).astype(int)), shape)
@@ -257,7 +248,8 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
     along = np.bincount(group, pixels * pieces.along, len(value)) / np.bincount(group, pixels, len(value)).clip(1)
     direction = 2 * pieces.tag + pieces.axis
     passed = np.bincount(direction, passed_by_blur(rise, blur), 2 * n) / np.bincount(direction, minlength=2 * n).clip(1)
-    return _Offsets(offset, variance, by_sampling, along.reshape(shape), passed.reshape(n, 2))
+    flat = 2 * n, 2 * (cells + 1)
+    return offset.reshape(flat), variance.reshape(flat), by_sampling.reshape(*flat, 2), along.reshape(flat), passed
 
 
 def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -285,18 +277,15 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
     return level, distance, used.astype(float), pieces.normal[each, 1 - major]
 
 
-def _scatter(lines: _Offsets, cells: int) -> tuple[Displacement, Displacement]:
+def _scatter(cells: int, offset, variance, by_sampling, along, passed) -> tuple[Displacement, Displacement]:
     """Return what evenly spaced lines say by tag and direction: how they move with the phase, and scatter otherwise."""
-    n = len(lines.offset)
     place = 2 * np.arange(cells + 1) / cells - 1
     sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)
-    k = len(place)
-    along = lines.along.reshape(2 * n, k)
+    m, k = offset.shape
     fixed = np.stack([np.ones(k), place, place**2, sign], axis=-1)  # middle, spacing and its change, spread of black
     turned = np.stack([along, along * place], axis=-1)  # of the grid, whose corners have errors
-    design = np.concatenate([np.broadcast_to(fixed, (2 * n, *fixed.shape)), turned], axis=-1)
-    offset, variance = lines.offset.reshape(2 * n, k), lines.variance.reshape(2 * n, k)
-    pull = np.nan_to_num(lines.by_sampling.reshape(2 * n, k, 2))
+    design = np.concatenate([np.broadcast_to(fixed, (m, *fixed.shape)), turned], axis=-1)
+    pull = np.nan_to_num(by_sampling)
     there = np.isfinite(offset) & np.isfinite(variance) & (variance > 0)
     weight = np.where(there, 1 / np.where(there, variance, 1.0), 0.0)
     root = np.sqrt(weight)
@@ -322,9 +311,9 @@ def _scatter(lines: _Offsets, cells: int) -> tuple[Displacement, Displacement]:
     square = (rest - (freedom - 1)) / by_displacement
     good &= square < MOST_PX**2 + 3 * np.sqrt(2 * freedom.clip(1)) / by_displacement
     square[~good] = np.nan
-    passed, others = lines.passed.ravel(), np.maximum(freedom - 1, 0.0)
+    others = np.maximum(freedom - 1, 0.0)
     by_phase[~good] = np.nan
     return (
-        Displacement(by_phase, 1 / known, np.ones(2 * n), passed),
+        Displacement(by_phase, 1 / known, np.ones(m), passed),
         Displacement(square, others / by_displacement, others, passed),
     )

@@ -297,11 +297,9 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         following = np.roll(along, -1, axis=0)
         turn = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
         if turn.min() <= LEAST_AREA * (along**2).sum(1).max():
-            raise InputError(
-                "E-TAG-CORNERS",
-                f"{place_of_tag}: corners_mm turn the other way, cross or lie on a line; top left, top right, bottom "
-                "right, bottom left as printed needed, Y downwards",
-            )
+            fault = f"{place_of_tag}: corners_mm turn the other way, cross or lie on a line"
+            needed = "top left, top right, bottom right, bottom left as printed needed, Y downwards"
+            raise InputError("E-TAG-CORNERS", f"{fault}; {needed}")
     with named(where):
         tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
         return TagLayout(tags, np.array(corners), data.sigma_mm, data.unusual_size)

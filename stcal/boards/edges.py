@@ -197,19 +197,9 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
     return _Lines(value[..., 0], value[..., 1], (variance * count / points)[..., None, None] * spread, keep)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pixels:
-    """Pixels about m edges, (m, p, s) in p rows or columns; places from the edge's middle, px."""
-
-    level: np.ndarray
-    along: np.ndarray
-    across: np.ndarray
-    used: np.ndarray
-    rise: np.ndarray  # (m,) of ``across`` from one pixel to the next
-
-
-def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Pixels:
-    """Return the pixels within reach of the edges ``rough``, in the columns or rows of the profiles that are kept."""
+def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> tuple[np.ndarray, ...]:
+    """Return level, places along and across from the edge's middle, and use (m, p, s) of the pixels within reach of m
+    edges, in the p columns or rows of the profiles that are kept; and how ``across`` rises (m,) by pixel."""
     m, each = frame.length.size, np.arange(frame.length.size)
     middle, along, normal = (value.reshape(m, 2) for value in (frame.middle, frame.along, frame.normal))
     length, reach = frame.length.reshape(m, 1, 1), frame.reach.reshape(m, 1, 1)
@@ -229,7 +219,7 @@ def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Pixels:
     used = keep[..., None] & inside
     used &= np.abs(d - offset[..., None] - slope[..., None] * t) <= reach
     used &= np.abs(t) <= np.minimum((0.5 - ALONG[0]) * length, length / 2 - END_PX)
-    return _Pixels(level, t, d, used, normal[each, 1 - major])
+    return level, t, d, used.astype(float), normal[each, 1 - major]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,10 +248,9 @@ class _Area:
 
 
 def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
-    pixels = _pixels(grey, frame, rough)
-    m = len(pixels.level)
+    level, t, d, weight, per_pixel = _pixels(grey, frame, rough)
+    m = len(level)
     normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
-    weight, t, d = pixels.used.astype(float), pixels.along, pixels.across
     length = frame.length.reshape(m, 1, 1)
     relative = 2 * t / length
     distance = residual = d
@@ -278,9 +267,9 @@ def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
         step, slope, widening = integrated_step(distance, normal, value[:, 2])
         levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
         if not k:  # the levels follow linearly
-            value[:, 3:] = solved(levels, weight, pixels.level)[0]
+            value[:, 3:] = solved(levels, weight, level)[0]
         rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
-        residual = pixels.level - (levels @ value[:, None, 3:, None])[..., 0]
+        residual = level - (levels @ value[:, None, 3:, None])[..., 0]
         design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
         change, inverse = solved(design, weight, residual)
         if k < STEPS:
@@ -288,13 +277,13 @@ def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
             value = np.where(np.isfinite(value), value, 0.0)
     shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
-    sampling = of_sampling(distance, pixels.rise, design[..., 0])
+    sampling = of_sampling(distance, per_pixel, design[..., 0])
     explained = [solved(design, weight, column)[0] for column in np.moveaxis(sampling, -1, 0)]
     harmonic = sampling - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
     scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
     noise = _noise_of(scatter, distance, weight)
     factor = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
-    passed = passed_by_blur(pixels.rise, value[:, 2])
+    passed = passed_by_blur(per_pixel, value[:, 2])
     pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)

@@ -168,11 +168,9 @@ def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
     if kind == "circlegrid":
         data = validated(content, _CircleGrid, where)
         if not data.asymmetricGrid:
-            raise InputError(
-                "E-BOARD-RADIUS",
-                f"{where}: asymmetricGrid false: a grid whose circles have no radius; write a board.toml with rows, "
-                "columns, pitch_mm, radius_mm and polarity",
-            )
+            fault = f"{where}: asymmetricGrid false: a grid whose circles have no radius"
+            remedy = "write a board.toml with rows, columns, pitch_mm, radius_mm and polarity"
+            raise InputError("E-BOARD-RADIUS", f"{fault}; {remedy}")
         spacing = METRE_MM * data.spacingMeters
         return AsymmetricCirclesDesign(data.targetRows, data.targetCols, spacing, None, "dark")
     raise InputError("E-BOARD-TYPE", f"{where}: target_type {kind!r}; one of {', '.join(KALIBR_KINDS)} needed")

@@ -164,11 +164,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
     for face in faces:
         for tag in tags_on(face.printed):
             if tag in face_of_tag:
-                raise InputError(
-                    "E-TAG-REPEATED",
-                    f"{where}: tag {tag[1]} of {tag[0]} is on faces {face_of_tag[tag]} and {face.id}, each tag once "
-                    "needed; correct first_id or id",
-                )
+                fault = f"{where}: tag {tag[1]} of {tag[0]} is on faces {face_of_tag[tag]} and {face.id}"
+                raise InputError("E-TAG-REPEATED", f"{fault}, each tag once needed; correct first_id or id")
             face_of_tag[tag] = face.id
     return replace(target, distances=distances)
 
@@ -239,11 +236,9 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
         direction /= length
     angle = float(np.degrees(np.arccos(np.clip(x @ z, -1, 1))))
     if abs(angle - 90) > MAX_SKEW_DEG:
-        raise InputError(
-            "E-TARGET-ROUGH-POSE",
-            f"{where}: rough_pose: {angle:.0f}° between x and normal, 90° needed (to {MAX_SKEW_DEG:g}°); x is the "
-            "direction of the drawing's X along the face, normal points out of it",
-        )
+        askew = f"{where}: rough_pose: {angle:.0f}° between x and normal, 90° needed (to {MAX_SKEW_DEG:g}°)"
+        remedy = "x is the direction of the drawing's X along the face, normal points out of it"
+        raise InputError("E-TARGET-ROUGH-POSE", f"{askew}; {remedy}")
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     return Rigid(np.column_stack([x, np.cross(z, x), z]), pose.origin_mm)

@@ -163,9 +163,8 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     split = [min(_ways(part, paper), key=lambda way: (way.cuts, way.count, way.bare)) for part in parts]
     total = sum(way.count for way in split)
     if total > MOST_SHEETS:
-        raise InputError(
-            "E-DRAW-SHEETS", f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none"
-        )
+        fault = f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}"
+        raise InputError("E-DRAW-SHEETS", f"{fault}; take a larger paper, or none")
     return [
         sheet
         for part, way in zip(parts, split, strict=True)
@@ -448,11 +447,9 @@ def draw(
         fitting = paper_for(parts) or OWN
         paper = paper if given or paper == OWN else fitting
         if paper != OWN and len(paper_sheets(parts, paper, "")) > 1:
-            raise InputError(
-                "E-DRAW-SHEETS",
-                f"--net: {_size(parts[0])}, and a sheet of {paper} has room for {_room(paper)}; take --paper "
-                f"{fitting}, or draw the plates one by one without --net",
-            )
+            fault = f"--net: {_size(parts[0])}, and a sheet of {paper} has room for {_room(paper)}"
+            remedy = f"take --paper {fitting}, or draw the plates one by one without --net"
+            raise InputError("E-DRAW-SHEETS", f"{fault}; {remedy}")
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     if paper != OWN:
         sheets = paper_sheets(parts, paper, title)
@@ -461,15 +458,12 @@ def draw(
     else:
         sheets = [one_sheet(parts, title)]
     if not is_pdf and len(sheets) > 1:
-        raise InputError(
-            "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
-        )
+        fault = f"{path}: {len(sheets)} sheets, an SVG holds one"
+        raise InputError("E-DRAW-SHEETS", f"{fault}; take .pdf, a larger --paper, or none")
     largest = max(max(sheet.width, sheet.height) for sheet in sheets)
     if is_pdf and largest > MOST_MM:
-        raise InputError(
-            "E-DRAW-SHEETS",
-            f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg",
-        )
+        fault = f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF"
+        raise InputError("E-DRAW-SHEETS", f"{fault}; take --paper or .svg")
     save(path, pdf(sheets) if is_pdf else svg(sheets[0]))
     return Drawn(path, parts, sheets, paper)
 
@@ -493,9 +487,8 @@ def _room(paper: str) -> str:
 def load_design(path: str | Path) -> Design:
     """Read a target, or a board or boards of any kind."""
     if not Path(path).exists():
-        raise InputError(
-            "E-DRAW-DESIGN", f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)"
-        )
+        fault = f"{path}: no such file"
+        raise InputError("E-DRAW-DESIGN", f"{fault}; give a target.toml or a board file (`stcal-sfm init` writes both)")
     content = board_content(path)
     return load_target(path) if content is not None and "face" in content else load_boards(path)
 
@@ -515,9 +508,8 @@ def _paper(path: Path, paper: str) -> str:
     """Return the listed name of a paper, or the default for the suffix; refuse combinations that do not work."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(
-            "E-OUTPUT-SUFFIX", f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(SUFFIXES)} needed"
-        )
+        fault = f"{path}: suffix {path.suffix or 'missing'}"
+        raise InputError("E-OUTPUT-SUFFIX", f"{fault}; one of {', '.join(SUFFIXES)} needed")
     names = {name.lower(): name for name in (*PAPERS, OWN)}
     if paper and paper.lower() not in names:
         raise InputError("E-OPTION-VALUE", f"--paper {paper}: unknown; one of {', '.join(names.values())} needed")

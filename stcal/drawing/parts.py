@@ -18,7 +18,7 @@ from stcal.boards.board_designs import (
     black_areas,
     clear_mm,
 )
-from stcal.boards.target_file import ROUGH_KEYS
+from stcal.boards.target_file import INWARDS, ROUGH_KEYS
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
@@ -158,9 +158,8 @@ def as_seen(face: FaceDesign) -> FaceDesign:
     """Return a face with outline and pose in the frame of its drawing; the Y and Z of printed faces are inverted."""
     if face.printed is None:
         return face
-    turn, pose = Rigid(np.diag([1.0, -1.0, -1.0])), face.rough_target_from_face
-    outline = None if face.outline_mm is None else face.outline_mm * [1, -1]
-    return replace(face, outline_mm=outline, rough_target_from_face=None if pose is None else pose @ turn)
+    pose, outline = face.rough_target_from_face, None if face.outline_mm is None else face.outline_mm * [1, -1]
+    return replace(face, outline_mm=outline, rough_target_from_face=None if pose is None else pose @ INWARDS)
 
 
 def parts_of(design: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
@@ -288,11 +287,9 @@ def net_part(target: TargetDesign) -> Part:
     one plane."""
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
-            raise InputError(
-                "E-DRAW-NET",
-                f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}; add it to "
-                "the target file, or draw plates one by one without --net",
-            )
+            fault = f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}"
+            remedy = "add it to the target file, or draw plates one by one without --net"
+            raise InputError("E-DRAW-NET", f"{fault}; {remedy}")
     faces = {face.id: _against_the_clock(as_seen(face)) for face in target.faces}
     shared = _shared_edges(faces.values())
     first = max(faces, key=lambda face: sum(face == own for own, _ in shared))
@@ -309,11 +306,9 @@ def net_part(target: TargetDesign) -> Part:
                 free -= {partner[0]}
                 folds |= {edge, partner}
     if free:
-        raise InputError(
-            "E-DRAW-NET",
-            f"--net: the plate of face {min(free)} shares no edge with the others, or would lie on one; correct "
-            "outline_mm and rough_pose, or draw plates one by one without --net",
-        )
+        fault = f"--net: the plate of face {min(free)} shares no edge with the others, or would lie on one"
+        remedy = "correct outline_mm and rough_pose, or draw plates one by one without --net"
+        raise InputError("E-DRAW-NET", f"{fault}; {remedy}")
     return _folded(plates, target.polarity, shared, folds)
 
 

@@ -27,7 +27,7 @@ from stcal.io.cameras.read import camera_model
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, images_px
 from stcal.sfm.detect.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
-from stcal.sfm.detect.face_patterns import MIN_NAMING, FaceFinder, in_common
+from stcal.sfm.detect.face_patterns import MIN_NAMING, find_faces, in_common
 from stcal.sfm.planning.advise import expected_noise
 from stcal.sfm.planning.session import Plan, PlanOptions, plan
 from stcal.synthetic.designs import Body, face_of_drawing, tag_body
@@ -108,23 +108,14 @@ CORNER_SHARE = 0.15
 """Size of the area at each corner in which a circle of the frame lies, as a share of the plate's sides."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MadeTarget:
-    """A target, and its ``likeness`` : most circles that a face has in common with another reading, 0 if under four."""
-
-    target: TargetDesign
-    likeness: int
-
-
 def make_pattern(
     sides: list[Side], circles: int, radius_mm: float, polarity: Polarity, seed: int | list[int], name: str
-) -> MadeTarget:
-    """Returns a face for each side, named by its circles with any :data:`HIDDEN` of them hidden."""
+) -> tuple[TargetDesign, int]:
+    """Returns a face for each side, named by its circles with any :data:`HIDDEN` of them hidden; and the most circles
+    that a face has in common with another reading, 0 if under four."""
     if circles < LEAST_CIRCLES:
-        raise InputError(
-            "E-MAKE-CIRCLES",
-            f"--circles {circles}: {LEAST_CIRCLES} needed, {MIN_NAMING} name a face and {HIDDEN} may be hidden",
-        )
+        fault = f"--circles {circles}: {LEAST_CIRCLES} needed"
+        raise InputError("E-MAKE-CIRCLES", f"{fault}, {MIN_NAMING} name a face and {HIDDEN} may be hidden")
     rng = np.random.default_rng(seed)
     faces: list[FaceDesign] = []
     likeness = 0
@@ -151,7 +142,7 @@ def make_pattern(
             )
         faces.append(best)
         likeness = max(likeness, least)
-    return MadeTarget(TargetDesign(name, polarity, tuple(faces)), likeness)
+    return TargetDesign(name, polarity, tuple(faces)), likeness
 
 
 def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) -> FaceDesign | None:
@@ -194,12 +185,11 @@ def unnamed_cases(
     target: TargetDesign, camera: Camera, distance_mm: float, hidden: int, progress: Callable[[int, int], None] | None
 ) -> tuple[list[tuple[str, tuple[str, ...]]], int]:
     """Cases (face, hidden circles) whose visible circles the finder does not read, and the number of all."""
-    finder = FaceFinder(target)
     failed, cases = [], [(face, rows) for face in target.faces for rows in combinations(range(len(face.ids)), hidden)]
     ellipses = {face.id: _seen(face, target, camera, distance_mm) for face in target.faces}
     for done, (face, hidden_rows) in enumerate(cases, 1):
         visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
-        readings = finder.find(Candidates.of(ellipses[face.id].select(visible), camera)).faces
+        readings, _ = find_faces(Candidates.of(ellipses[face.id].select(visible), camera), target)
         right = [reading for reading in readings if reading.face == face.id and len(readings) == 1]
         named = {pair for r in right for pair in zip(r.circles.tolist(), r.rows.tolist(), strict=True)}
         if named != {(circle, row) for row, circle in enumerate(visible.tolist())}:
@@ -293,11 +283,8 @@ class DesignOptions(Brief):
             if self.faces.count(name) > 1:
                 raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
         if len(self.faces) < 2 or set(self.faces) in ({"front", "back"}, {"left", "right"}):
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; use such as "
-                "front,right,top",
-            )
+            fault = f"--faces {text}: two sides with a common edge needed, so that one photograph shows both"
+            raise InputError("E-OPTION-VALUE", f"{fault}; use such as front,right,top")
 
     def ideal_camera(self) -> Camera:
         """Returns the camera without its distortion, or a default camera if none is given."""
@@ -306,9 +293,8 @@ class DesignOptions(Brief):
             model = camera_model(self.camera)
             width, height, focal = model.width, model.height, model.focal
             if not (width and height):
-                raise InputError(
-                    "E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file"
-                )
+                fault = f"camera file {model.source} states no image size"
+                raise InputError("E-CAMERA-SIZE", f"{fault}; add it to the file")
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
     def least_radius_mm(self) -> float:
@@ -324,7 +310,8 @@ class Made:
     """The designed target and board."""
 
     options: DesignOptions
-    pattern: MadeTarget
+    target: TargetDesign
+    likeness: int  # of :func:`make_pattern`
     board: BoardDesign
     radius_mm: float  # of the smaller circles
     least_mm: float  # smallest radius that the camera sees well
@@ -356,16 +343,13 @@ def make_target(options: DesignOptions, progress: Callable[[int, int], None] | N
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):
         seed = [options.seed, attempt] if attempt else options.seed
-        pattern = make_pattern(sides, options.circles, radius, options.polarity, seed, name)
-        failed, cases = unnamed_cases(pattern.target, camera, options.distance_mm, HIDDEN, progress)
+        target, likeness = make_pattern(sides, options.circles, radius, options.polarity, seed, name)
+        failed, cases = unnamed_cases(target, camera, options.distance_mm, HIDDEN, progress)
         if not failed:
-            return Made(options, pattern, _board(options, least), radius, least, cases)
+            return Made(options, target, likeness, _board(options, least), radius, least, cases)
     face, hidden_ids = failed[0]
-    raise InputError(
-        "E-MAKE-UNNAMED",
-        f"face {face}: not named with circles {', '.join(hidden_ids)} hidden, as in {len(failed)} of {cases} cases; "
-        f"{ATTEMPTS} patterns tried; another --seed or more --circles needed",
-    )
+    fault = f"face {face}: not named with circles {', '.join(hidden_ids)} hidden, as in {len(failed)} of {cases} cases"
+    raise InputError("E-MAKE-UNNAMED", f"{fault}; {ATTEMPTS} patterns tried; another --seed or more --circles needed")
 
 
 def _up_to(step: float, value: float) -> float:
@@ -385,7 +369,7 @@ def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
 
 def made_text(made: Made) -> str:
     """Returns a text that describes the target and how well its faces are told apart."""
-    options, target, alike = made.options, made.pattern.target, made.pattern.likeness
+    options, target, alike = made.options, made.target, made.likeness
     return (
         f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
         f"{LARGE * made.radius_mm:g} mm, {target.polarity}\n"
@@ -447,12 +431,12 @@ def design_target(
     kept = folder / "board.toml" if folder and os.path.lexists(folder / "board.toml") else None
     board = load_dots(kept) if kept else None
     made = make_target(options, progress and partial(progress, "patterns"))
-    target, noise, source = made.pattern.target, *expected_noise()
+    noise, source = expected_noise()
     same = {name: getattr(options, name) for name in ("distance_mm", "width", "camera", "seed")}
     session = PlanOptions(images=images, noise=noise, **same)
-    forecast = plan(session, target, board or made.board, target.rough_poses())
-    files = _saved(folder, target, None if kept else made.board)
-    return DesignedTarget(target, board or made.board, forecast, "", source, made, files)
+    forecast = plan(session, made.target, board or made.board, made.target.rough_poses())
+    files = _saved(folder, made.target, None if kept else made.board)
+    return DesignedTarget(made.target, board or made.board, forecast, "", source, made, files)
 
 
 @require_arguments
@@ -512,9 +496,8 @@ def design_tag_body(
 def _free(out: str | Path | None) -> Path | None:
     """Returns the folder for the files, in which there must be no target yet."""
     if out is not None and os.path.lexists(Path(out) / "target.toml"):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"{Path(out) / 'target.toml'}: exists; move it away, or give another folder"
-        )
+        fault = f"{Path(out) / 'target.toml'}: exists"
+        raise InputError("E-OUTPUT-EXISTS", f"{fault}; move it away, or give another folder")
     return None if out is None else Path(out)
 
 
@@ -523,7 +506,6 @@ def _saved(folder: Path | None, target: TargetDesign, board: BoardDesign | None)
     if folder is None:
         return ()
     save_target(folder / "target.toml", target)
-    if board is None:
-        return (folder / "target.toml",)
-    save_board(folder / "board.toml", board)
-    return folder / "target.toml", folder / "board.toml"
+    if board is not None:
+        save_board(folder / "board.toml", board)
+    return (folder / "target.toml", *([] if board is None else [folder / "board.toml"]))

@@ -53,11 +53,8 @@ class ThinLens:
             if (value := getattr(self, name)) <= 0:
                 raise InputError("E-SIMULATE-OPTIONS", f"lens: {name} {value:g}, a positive number needed")
         if self.focus_mm <= self.focal_mm:
-            raise InputError(
-                "E-SIMULATE-OPTIONS",
-                f"lens: focused at {self.focus_mm:g} mm, within its focal length of {self.focal_mm:g} mm, so that it "
-                "forms no image; focus farther away",
-            )
+            fault = f"lens: focused at {self.focus_mm:g} mm, within its focal length of {self.focal_mm:g} mm"
+            raise InputError("E-SIMULATE-OPTIONS", f"{fault}, so that it forms no image; focus farther away")
 
     def confusion_px(self, camera: Camera, depth_mm: np.ndarray) -> np.ndarray:
         """Returns the radius of the circle of confusion of points at these depths (...), in px, (...)."""

@@ -326,11 +326,8 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid], marg
                     if face.outline_mm is None
                     else "simulated targets must be convex;"
                 )
-                raise DegenerateError(
-                    "E-SCENE-FACES",
-                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may hide it: "
-                    f"{plate} check the rough poses",
-                )
+                fault = f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may hide it"
+                raise DegenerateError("E-SCENE-FACES", f"{fault}: {plate} check the rough poses")
 
 
 PLACED_FOCAL = 0.39

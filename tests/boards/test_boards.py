@@ -22,6 +22,13 @@ def turn(degrees: float) -> np.ndarray:
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM
 
 
+def errors_px(board: ChessboardDesign, view, image_from_mm: np.ndarray, first: float) -> list[float]:
+    """Largest errors by each numbering that looks the same, the smallest first."""
+    flat = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
+    numberings = [flat[:, :2]] + [(turned @ flat)[:, :2] for turned in board.symmetries()]
+    return sorted(np.abs(apply_homography(image_from_mm, xy + first) - view.xy_px).max() for xy in numberings)
+
+
 @pytest.mark.parametrize(
     ("rows", "columns", "degrees"),
     sampled(
@@ -34,12 +41,10 @@ def test_chessboard_corners_are_numbered(rows, columns, degrees):
     sheet, first = chessboard_mm(rows, columns, 20.0)
     image_from_mm = turn(degrees)
     view = find_chessboard(photograph(sheet, 4, image_from_mm), "a", board)
-    flat = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
-    numberings = [flat[:, :2]] + [(turned @ flat)[:, :2] for turned in board.symmetries()]
-    errors = sorted(np.abs(apply_homography(image_from_mm, xy + first) - view.xy_px).max() for xy in numberings)
+    errors = errors_px(board, view, image_from_mm, first)
     assert errors[0] < CORNER_PX
     assert all(error > 20 for error in errors[1:])  # another numbering, not the same
-    assert len(numberings) == {(5, 8): 1, (6, 7): 1, (7, 7): 2, (6, 6): 4, (6, 8): 2}[rows, columns]
+    assert len(errors) == {(5, 8): 1, (6, 7): 1, (7, 7): 2, (6, 6): 4, (6, 8): 2}[rows, columns]
 
 
 def spoiled(grey: np.ndarray, blur_px: float, contrast: float, noise: float) -> np.ndarray:
@@ -86,16 +91,7 @@ def test_a_steep_chessboard_is_found():
     eye = np.column_stack([turned, np.array([0, 0, away]) - turned @ middle])
     image_from_mm = np.array([[1500.0, 0, 599.5], [0, 1500.0, 449.5], [0, 0, 1]]) @ eye
     view = find_chessboard(photograph(sheet, 4, image_from_mm), "a", board)
-    flat = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
-    numberings = [flat[:, :2]] + [(half @ flat)[:, :2] for half in board.symmetries()]
-    errors = [np.abs(apply_homography(image_from_mm, xy + first) - view.xy_px).max() for xy in numberings]
-    assert min(errors) < 3 * CORNER_PX
-
-
-@pytest.mark.slow
-def test_noise_is_no_chessboard():
-    grey = np.random.default_rng(2).integers(0, 255, (480, 640)).astype(np.uint8)
-    assert find_chessboard(grey, "a", ChessboardDesign(5, 8, 20.0)) is None
+    assert errors_px(board, view, image_from_mm, first)[0] < 3 * CORNER_PX
 
 
 def test_tags_of_two_families_and_sizes():
@@ -129,8 +125,9 @@ def test_a_tag_that_is_seen_twice_is_left_out():
     assert found.repeated == (("DICT_4X4_50", 7),)
 
 
-def test_nothing_in_an_empty_image():
-    grey = np.full((400, 600), 128, np.uint8)
+@pytest.mark.parametrize("spread", [1, pytest.param(200, marks=pytest.mark.slow)])
+def test_nothing_in_an_empty_or_noisy_image(spread):
+    grey = np.random.default_rng(2).integers(40, 40 + spread, (400, 600)).astype(np.uint8)
     assert find_chessboard(grey, "a", ChessboardDesign(5, 8, 20.0)) is None
     assert find_charuco(grey, "a", CharucoDesign(7, 5, 30.0, 20.0, "DICT_6X6_250")) is None
     assert len(find_tags(grey, ["DICT_6X6_250"])) == 0
@@ -138,13 +135,11 @@ def test_nothing_in_an_empty_image():
 
 @pytest.mark.slow
 def test_all_corners_of_a_real_charuco_board(shared_data):
-    """24 corners in each of 16 real images; OpenCV's own settings lose 28 % of them."""
+    """24 corners in each of 16 real images, of which every fourth is read here; OpenCV's own settings lose 28 %."""
     board = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
-    seen = []
-    for path in sorted(shared_data("charuco_handeye/test_set_charuco/images").glob("*.png")):
-        view = find_charuco(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), path.name, board)
-        seen.append(len(view))
-    assert seen == [24] * 16
+    images = sorted(shared_data("charuco_handeye/test_set_charuco/images").glob("*.png"))[::4]
+    views = [find_charuco(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), path.name, board) for path in images]
+    assert list(map(len, views)) == [24] * 4
 
 
 def test_a_tag_stands_where_the_file_puts_it(tmp_path):

@@ -75,29 +75,32 @@ def test_both_kinds_of_tags_are_read_in_one_image():
     np.testing.assert_allclose(found["DICT_4X4_50", 7][0], [229.5, 49.5], atol=0.1)
 
 
-@pytest.mark.parametrize("family", ["tagStandard41h12", "TAGCIRCLE21H7", "tag_standard_41h12"])
-def test_without_the_package_its_extra_is_offered(monkeypatch, tmp_path, family):
-    monkeypatch.setattr(dictionaries, "find_spec", lambda _: None)
+@pytest.fixture
+def installed(monkeypatch):
+    """Function that says whether the package for these families is there."""
     known_dictionary.cache_clear()
+    yield lambda there: monkeypatch.setattr(dictionaries, "find_spec", lambda _: there)
+    known_dictionary.cache_clear()
+
+
+@pytest.mark.parametrize("family", ["tagStandard41h12", "TAGCIRCLE21H7", "tag_standard_41h12"])
+def test_without_the_package_its_extra_is_offered(installed, tmp_path, family):
+    installed(None)
     (tmp_path / "b.toml").write_text(LAYOUT.replace("TagStandard41h12", family))
     with fails_with("E-KEY-VALUE … dictionary … pip install 'stereo-target-calibration[apriltag]' … tag36h11"):
         load_flat_board(tmp_path / "b.toml")
-    known_dictionary.cache_clear()
 
 
-def test_tags_of_a_bundle_of_such_a_family_stand_as_printed(monkeypatch, tmp_path):
-    monkeypatch.setattr(dictionaries, "find_spec", lambda _: True)
-    known_dictionary.cache_clear()
+def test_tags_of_a_bundle_of_such_a_family_stand_as_printed(installed, tmp_path):
+    installed(True)
     bundle = "tag_bundles: [{name: one, layout: [{id: 3, size: 0.04, x: 0.1, y: 0.02, z: 0, qw: 1}]}]\n"
     (tmp_path / "tags.yaml").write_text("tag_family: tagStandard41h12\n" + bundle)
     layout = load_flat_board(tmp_path / "tags.yaml")  # Y of apriltag_ros goes up
     np.testing.assert_allclose(layout.corners_mm[0], [[80, -40], [120, -40], [120, 0], [80, 0]], atol=1e-9)
-    known_dictionary.cache_clear()
 
 
-def test_families_are_known_by_name(monkeypatch, tmp_path):
-    monkeypatch.setattr(dictionaries, "find_spec", lambda _: True)
-    known_dictionary.cache_clear()
+def test_families_are_known_by_name(installed, tmp_path):
+    installed(True)
     (tmp_path / "b.toml").write_text(LAYOUT)
     assert load_flat_board(tmp_path / "b.toml").tags == (("tagStandard41h12", 3),)
     (tmp_path / "b.toml").write_text(LAYOUT.replace("id = 3", "id = 2115"))
@@ -105,10 +108,13 @@ def test_families_are_known_by_name(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match="only a layout of tags"):
         of_opencv("tagStandard41h12")
     refuses("E-TAG-DICTIONARY … tagStandard41h12 … not drawn here", dictionary_of, "tagStandard41h12")
-    known_dictionary.cache_clear()
 
 
-@pytest.mark.parametrize("name", ["tagStandard52h13", "tagCircle49h12", "tagCustom48h12"])
-def test_families_with_huge_tables_are_refused(name):
-    with pytest.raises(ValueError, match="gigabyte"):
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [(name, "gigabyte") for name in ("tagStandard52h13", "tagCircle49h12", "tagCustom48h12")]
+    + [(name, "OpenCV does not detect this family") for name in ("tag52h13", "tagStandard36h11")],
+)
+def test_families_that_are_not_read_are_refused(name, why):
+    with pytest.raises(ValueError, match=why):
         known_dictionary(name)

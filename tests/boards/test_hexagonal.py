@@ -10,7 +10,8 @@ from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.workflows.board_views import find_board
-from tests.outcome import fails_with
+from tests.levels import sampled
+from tests.outcome import refuses
 
 CAMERA = Camera(800, 600, [900.0, 905.0], [390.0, 305.0], np.zeros(12))
 FINER, MARGIN_MM = 2, 25.0
@@ -36,15 +37,34 @@ def view_of(board: HexagonalCirclesDesign, tilt, hidden_from_mm=(np.inf, np.inf)
     return np.clip(cv2.GaussianBlur(small, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8), pose
 
 
-def test_a_file_and_back(tmp_path):
-    (tmp_path / "b.toml").write_text(TEXT)
+DOTS = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "rings"),
+    [(TEXT, ()), (f"{TEXT}rings = [[1, 2], [0, 3]]\n", ((0, 3), (1, 2))), (f"{DOTS}rings = [[0, 3]]\n", ((0, 3),))],
+)
+def test_a_file_and_back(tmp_path, text, rings):
+    (tmp_path / "b.toml").write_text(text)
     board = load_flat_board(tmp_path / "b.toml")
-    assert board == HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
+    assert board.rings == rings
+    if text == TEXT:
+        assert board == HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
     (tmp_path / "again.toml").write_text(board_toml(load_board(tmp_path / "b.toml")))
     assert load_flat_board(tmp_path / "again.toml") == board
-    (tmp_path / "b.toml").write_text(TEXT.replace("6.0", "10.5"))
-    with fails_with("E-BOARD-RADIUS … 10.5 mm, under 10 mm … neighbours"):
-        load_flat_board(tmp_path / "b.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (TEXT.replace("6.0", "10.5"), "E-BOARD-RADIUS … 10.5 mm, under 10 mm … neighbours"),
+        (f"{DOTS}rings = [[5, 0]]\n", "E-BOARD-RINGS … [5, 0]"),
+        (f"{DOTS}rings = [[0, 0], [4, 6]]\n", "E-BOARD-RINGS … 2 rings that look the same after a turn"),
+    ],
+)
+def test_mistakes_in_files(tmp_path, text, error):
+    (tmp_path / "b.toml").write_text(text)
+    refuses(error, load_flat_board, tmp_path / "b.toml")
 
 
 def test_six_neighbours_are_one_spacing_away():
@@ -58,14 +78,7 @@ def test_six_neighbours_are_one_spacing_away():
     np.testing.assert_allclose(lattice.places_mm(lattice.labels())[:, :2], lattice.xy_mm(), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("rows", "tilt"),
-    [
-        pytest.param(rows, tilt, marks=[] if (rows, tilt) in [(7, TILTS[1]), (8, TILTS[3])] else pytest.mark.slow)
-        for rows in (7, 8)
-        for tilt in TILTS
-    ],
-)
+@pytest.mark.parametrize(("rows", "tilt"), sampled([(r, t) for r in (7, 8) for t in TILTS], kept=(0, 1, 6, 7)))
 def test_a_view_has_its_circles_where_they_are(rows, tilt):
     """An even number of rows looks the same after half a turn, an odd one does not."""
     board = HexagonalCirclesDesign(rows, 8, 20.0, 6.0, "dark")
@@ -110,9 +123,7 @@ def with_holes(board: HexagonalCirclesDesign, rings, share: float, tilt, hidden_
     return cv2.resize(fine, image.shape[::-1], interpolation=cv2.INTER_AREA), pose
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.35, 0.6])
-@pytest.mark.parametrize("tilt", TILTS[1:])
+@pytest.mark.parametrize(("share", "tilt"), sampled([(s, t) for s in (0.35, 0.6) for t in TILTS[1:]], kept=(0, 2, 4)))
 def test_rings_tell_the_ends_of_a_board(share, tilt):
     """The board has an even number of rows and looks the same turned, but for its rings."""
     rings = ((1, 2), (1, 3), (4, 6))
@@ -133,17 +144,3 @@ def test_rings_tell_which_columns_are_seen():
     assert view is not None, why
     assert 40 < len(view) < 56
     assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
-
-
-def test_rings_in_files(tmp_path):
-    dots = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
-    for text in (f"{TEXT}rings = [[1, 2], [0, 3]]\n", f"{dots}rings = [[0, 3], [1, 2]]\n"):
-        (tmp_path / "b.toml").write_text(text)
-        board = load_flat_board(tmp_path / "b.toml")
-        assert board.rings == ((0, 3), (1, 2))
-        (tmp_path / "again.toml").write_text(board_toml(load_board(tmp_path / "b.toml")))
-        assert load_flat_board(tmp_path / "again.toml").rings == board.rings
-    for rings, named in (("[[5, 0]]", "[5, 0]"), ("[[0, 0], [4, 6]]", "2 rings that look the same after a turn")):
-        (tmp_path / "b.toml").write_text(f"{dots}rings = {rings}\n")
-        with fails_with(f"E-BOARD-RINGS … {named}"):
-            load_flat_board(tmp_path / "b.toml")

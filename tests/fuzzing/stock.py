@@ -109,7 +109,7 @@ def _of_runs(folder: Path) -> None:
     sealed = marker.sealed({"detections.csv": digest_of(folder / "detected/detections.csv")})
     (folder / "detected/.stcal/run.json").write_text(json.dumps(sealed.content()))
     (folder / "no-colmap").write_text("no program\n")
-    own = make_pattern(sides_of((90.0, 80.0, 70.0))[:2], 9, 3.0, "dark", 1, "two plates").target
+    own, _ = make_pattern(sides_of((90.0, 80.0, 70.0))[:2], 9, 3.0, "dark", 1, "two plates")
     (folder / "own.toml").write_text(target_toml(own))
 
 

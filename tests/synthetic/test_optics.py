@@ -12,8 +12,8 @@ from stcal.sfm.detect.image import detect_image
 from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.optics import ThinLens, blur_evenly
 from stcal.synthetic.render import RenderOptions, _add_circles, check_lens, render
-from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene
-from tests.outcome import fails_with, refuses
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
+from tests.outcome import refuses
 
 OPTIONS = SceneOptions(seed=1, width=972, height=648, images_per_group=2, groups=(("1", "2"), ("1", "5")))
 PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0, bit_depth=16)
@@ -37,7 +37,7 @@ def _pupil(diameter_mm: float) -> np.ndarray:
 def _traced(camera, box, centre, normal, radius, lens, rim_mm):
     """Share of light in each pixel of a box: rays from the lens through the plane of focus, one by one."""
     x0, y0, x1, y1 = box
-    side = 60 if lens is None else 10  # rays per pixel's side; many points of the lens average, too
+    side = 40 if lens is None else 10  # rays per pixel's side; many points of the lens average, too
     step = (np.arange(side) + 0.5) / side - 0.5
     x = (np.arange(x0, x1)[:, None] + step).ravel()
     y = (np.arange(y0, y1)[:, None] + step).ravel()
@@ -68,7 +68,6 @@ def _moments(share, box):
     [
         (None, 0.4),
         (None, -0.4),
-        (ThinLens(2.8, 24.0, 1200.0), 0.0),
         (ThinLens(1.4, 24.0, 850.0), 0.0),
         (ThinLens(2.8, 24.0, 1200.0), 0.4),
     ],
@@ -117,23 +116,14 @@ def test_centroids_move_by_half_the_gradient_of_the_variance(straight):
     none, shifts = np.zeros(1), []
     on_face = [i for i, label in enumerate(seen.labels) if not label.startswith("board:")]
     for i in on_face:
-        one = ImageCircles(
-            (seen.labels[i],),
-            *(getattr(seen, name)[i : i + 1] for name in ("xyz_camera", "normal_camera", "radius_mm", "tilt_rad")),
-            seen.centre_px[i : i + 1],
-            seen.must_find[i : i + 1],
-        )
+        one = seen.rows(np.array([i]))
         (x0, y0), (x1, y1) = (np.rint(seen.centre_px[i] + sign * 40).astype(int) for sign in (-1, 1))
         box = (max(x0, 0), max(y0, 0), min(x1, dark.shape[1]), min(y1, dark.shape[0]))
-        sharp, blurred = (
-            _moments(
-                _add_circles(dark, straight.camera, one, none + 1, none, none[:, None], options)[
-                    box[1] : box[3], box[0] : box[2]
-                ],
-                box,
-            )
+        pictures = (
+            _add_circles(dark, straight.camera, one, none + 1, none, none[:, None], options)
             for options in (PLAIN, replace(PLAIN, lens=lens))
         )
+        sharp, blurred = (_moments(picture[box[1] : box[3], box[0] : box[2]], box) for picture in pictures)
         shifts.append((blurred - sharp)[1:])
     shifts, gradient = np.array(shifts), gradient[on_face]
     assert np.abs(gradient).max() > 0.005
@@ -209,5 +199,4 @@ def test_refusals(scene):
     refuses("E-FIELD-TYPE … rim_mm", RenderOptions, rim_mm=float("nan"))
     refuses("E-SIMULATE-OPTIONS … 100 mm … at most 20", check_lens, scene, ThinLens(2.0, 24.0, 100.0))
     wide = make_scene(replace(OPTIONS, distance_mm=500, groups=(("1", "2"),), fisheye_deg=120.0))
-    with fails_with("E-SIMULATE-OPTIONS … equidistant"):
-        check_lens(wide, ThinLens(4.0, 24.0, 500.0))
+    refuses("E-SIMULATE-OPTIONS … equidistant", check_lens, wide, ThinLens(4.0, 24.0, 500.0))

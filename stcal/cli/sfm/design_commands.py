@@ -154,11 +154,8 @@ def _lens(
                 raise InputError("E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number")
         return None
     if focal_mm is None and camera is not None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"--f-number {f_number:g}: camera file {camera} states no length in mm, which the aperture's diameter "
-            "needs; add --focal-mm",
-        )
+        fault = f"--f-number {f_number:g}: camera file {camera} states no length in mm"
+        raise InputError("E-OPTION-NEEDS", f"{fault}, which the aperture's diameter needs; add --focal-mm")
     usual_mm = round(float(scene.camera.focal.mean()) * SENSOR_WIDTH_MM / scene.camera.width, 6)
     return ThinLens(f_number, usual_mm if focal_mm is None else focal_mm, distance_mm if focus_mm is None else focus_mm)
 
@@ -182,11 +179,9 @@ def _scene(
 
     designs = scene.second_design()[:2] if second_design else (target_of(target, printed=False), board_of(board))
     if isinstance(designs[1], CornerBoard):
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"--board {board}: squares or tags, which are not drawn beside a target; a board of dots, asymmetric "
-            "or hexagonal circles needed here (`run` takes this one)",
-        )
+        fault = f"--board {board}: squares or tags, which are not drawn beside a target"
+        needed = "a board of dots, asymmetric or hexagonal circles needed here (`run` takes this one)"
+        raise InputError("E-BOARD-TYPE", f"{fault}; {needed}")
     poses = nominal_poses(designs[0], None)
     if groups:
         options = replace(options, groups=pairs_of_faces(groups, designs[0]))

@@ -377,8 +377,3 @@ class ImageDetection:
     def board(self) -> BoardSighting | None:
         """The only board of the image; None if there is none, or a second one of similar size."""
         return None if not self.boards or BOARD in self.repeated else self.boards[0]
-
-    def single_faces(self) -> tuple[FaceSighting, ...]:
-        """Returns the faces that are in view exactly once."""
-        ids = [sighting.face for sighting in self.faces]
-        return (*(sighting for sighting in self.faces if ids.count(sighting.face) == 1), *self.printed)

@@ -55,15 +55,10 @@ class _Blurs:
     @classmethod
     def of(cls, image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> "_Blurs":
         """Returns the circles with a blur, of planes that have enough of them for a pose."""
-        planes = np.array(
-            [label.plane if blur > 0 else "" for label, blur in zip(image.labels, image.blur_px, strict=True)]
-        )
+        planes = np.where(image.blur_px > 0, np.array([label.plane for label in image.labels], str), "")
         rows, inverse_depth, gradient = [np.zeros(0, int)], [np.zeros(0)], [np.zeros((0, 2))]
         for plane in (plane for plane in dict.fromkeys(planes.tolist()) if plane in patterns):
-            members, place = (
-                np.flatnonzero(planes == plane),
-                {label: k for k, label in enumerate(patterns[plane].labels)},
-            )
+            members, place = np.flatnonzero(planes == plane), {x: k for k, x in enumerate(patterns[plane].labels)}
             xy_mm, xy = patterns[plane].xy_mm[[place[image.labels[i]] for i in members]], image.centre[members]
             pose = planar_pose(xy_mm, xy) if len(members) >= MIN_PLANE else None
             if pose is not None:
@@ -128,9 +123,8 @@ class _Law:
         if spread > TOLD_PX and (odd or self.scatter > MAX_UNEXPLAINED * self.plain):
             why = "motion, a curved plane of focus or dirt on the lens; centres may be off by more than their σ"
             note = f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: {why}"
-        sharpest = (
-            self.about - self.unit * slope / (2 * curvature) if self.significant and curvature > 3 * sigma else 0.0
-        )
+        determined = self.significant and curvature > 3 * sigma
+        sharpest = self.about - self.unit * slope / (2 * curvature) if determined else 0.0
         focused_mm = float(1 / sharpest) if sharpest > 0 else None
         return Focus(image, focused_mm, (1 / float(near), 1 / float(far)), (first, last), shift_px, note)
 
@@ -161,19 +155,14 @@ def _laws(views: Sequence[_Blurs]) -> list[_Law | None]:
     curvature = np.array([law.coefficients[2] for law in laws.values()])
     variance = np.array([law.covariance[2, 2] for law in laws.values()])
     if len(enough) >= 3 and (variance > 0).all():
-        prior = _mean_and_variance(curvature, variance)
+        weight = 1 / variance
+        mean = float((weight * curvature).sum() / weight.sum())
+        excess = float((weight * (curvature - mean) ** 2).sum()) - (len(curvature) - 1)
+        between = max(0.0, excess / (weight.sum() - (weight**2).sum() / weight.sum()))
+        weight = 1 / (variance + between)
+        prior = float((weight * curvature).sum() / weight.sum()), between + 1 / float(weight.sum())
         laws = {i: _Law.of(circles, unit, prior) for i, circles in enough.items()}
     return [laws.get(i) for i in range(len(views))]
-
-
-def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float, float]:
-    """Returns mean and variance of the distribution that values with these variances are drawn from."""
-    weight = 1 / variances
-    mean = float((weight * values).sum() / weight.sum())
-    excess = float((weight * (values - mean) ** 2).sum()) - (len(values) - 1)
-    between = max(0.0, excess / (weight.sum() - (weight**2).sum() / weight.sum()))
-    weight = 1 / (variances + between)
-    return float((weight * values).sum() / weight.sum()), between + 1 / float(weight.sum())
 
 
 def _fitted(

@@ -218,10 +218,8 @@ def by_rings(
         found = seen[kept[0]]
         if found.sum() == rings.sum():
             where = ", ".join(str(cell) for cell in cells[found].tolist())
-            raise DetectionError(
-                "E-RINGS-ELSEWHERE",
-                f"board: dots with a hole are at [row, column] {where}, other than in its file; correct rings",
-            )
+            fault = f"board: dots with a hole are at [row, column] {where}, other than in its file"
+            raise DetectionError("E-RINGS-ELSEWHERE", f"{fault}; correct rings")
         return reading
     return replace(reading, numberings=reading.numberings[kept])
 
@@ -265,6 +263,9 @@ def _placements(
     if board.corner is not None and board.corner_radius_mm is not None:
         ratio = candidates.radius[index] / _step(homography, board.flat(uv))
         large = ratio / np.median(ratio) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
+    edge = np.roll(image_corners, -1, axis=0) - image_corners
+    normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]
+    normal *= np.sign((image_corners.mean(0) - image_corners[0]) @ normal[0])
     placements = []
     for turn in range(directions(board)):
         turned = uv @ _turn(board, turn).T
@@ -280,7 +281,9 @@ def _placements(
             occupied[tuple(column_row[inside, ::-1].T)] = True
             missing = ~occupied[tuple(all_cells[:, ::-1].T)]
             absent = board.flat((all_cells - offset)[missing] @ _turn(board, -turn).T)
-            expected = _inside_image(homography, absent, image_corners)
+            apart = apply_homography(homography, absent)[:, None] - image_corners
+            distance = np.einsum("ned,ed->ne", apart, normal)  # with their whole rim, and some margin
+            expected = (distance > 0.35 * _step(homography, absent)[:, None]).all(1)
             placements.append((int(expected.sum() + outside_count), inside, column_row[:, ::-1]))
     return sorted(placements, key=lambda each: each[0])
 
@@ -297,13 +300,3 @@ def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
 def _step(homography: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Returns the mean length of a step at the places ``uv``, in normalised coordinates."""
     return np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
-
-
-def _inside_image(homography: np.ndarray, uv: np.ndarray, image_corners: np.ndarray) -> np.ndarray:
-    """Returns the mask of the predicted dots that lie in the image with their whole rim and some margin."""
-    xy = apply_homography(homography, uv)
-    edge = np.roll(image_corners, -1, axis=0) - image_corners
-    normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]
-    normal *= np.sign((image_corners.mean(0) - image_corners[0]) @ normal[0])
-    distance = np.einsum("ned,ed->ne", xy[:, None] - image_corners, normal)
-    return (distance > 0.35 * _step(homography, uv)[:, None]).all(1)

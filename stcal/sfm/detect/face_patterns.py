@@ -2,7 +2,7 @@
 which is extended to all circles of a face. A face is named only if one reading explains more circles than every other.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -28,14 +28,6 @@ MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MAX_SIZE_RATIO = 1.25
 """Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FaceFinding:
-    """Faces in one image, by their candidates; a face in view twice occurs twice."""
-
-    faces: tuple[FaceSighting, ...]  # unambiguously named
-    refused: tuple[OpenFace, ...]  # patterns without a name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,80 +123,78 @@ def _pairs(target: TargetDesign) -> _Pairs:
     )
 
 
-class FaceFinder:
-    """Finder of the faces of one design."""
+def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceSighting], list[OpenFace]]:
+    """Finds all faces of a design among the candidates: those that are unambiguously named, and patterns without a
+    name. A face in view twice occurs twice; the mirror image of a face may look like another one."""
+    readings: list[FaceSighting] = []
+    if len(candidates) < MIN_NAMING or not target.faces:
+        return _decide(readings, target)
+    starts, tries = _hypotheses(candidates, target), np.zeros(len(candidates), int)
+    is_open, explained = np.ones(len(starts.origin), bool), np.zeros(len(candidates), bool)
+    grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
+    for rank, first in enumerate(starts.origin.tolist()):
+        if rank == FIRST_HYPOTHESES:
+            for reading in readings:
+                explained[reading.rows] |= len(reading.rows) >= needed_circles(target.face(reading.face))
+        if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
+            continue
+        tries[first] += rank >= FIRST_HYPOTHESES
+        if rank not in grown:
+            wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
+            wanted[list(grown)] = False
+            grown |= _grown(candidates, target, starts, starts.unlike(rank, wanted))
+        match, number = grown[rank], int(starts.face[rank])
+        face = target.faces[number]
+        if match is None:
+            continue
+        depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
+        if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
+            index = _of_one_size(candidates, face, *match)
+            readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
+            is_open[starts.agree(number, index)] = False
+    return _decide(readings, target)
 
-    def __init__(self, target: TargetDesign):
-        self.target = target
 
-    def find(self, candidates: Candidates) -> FaceFinding:
-        """Finds all faces among the candidates; the mirror image of a face may look like another one."""
-        readings: list[FaceSighting] = []
-        if len(candidates) < MIN_NAMING or not self.target.faces:
-            return _decide(readings, self.target)
-        starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
-        is_open, explained = np.ones(len(starts.origin), bool), np.zeros(len(candidates), bool)
-        grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
-        for rank, first in enumerate(starts.origin.tolist()):
-            if rank == FIRST_HYPOTHESES:
-                for reading in readings:
-                    explained[reading.rows] |= len(reading.rows) >= needed_circles(self.target.face(reading.face))
-            if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
-                continue
-            tries[first] += rank >= FIRST_HYPOTHESES
-            if rank not in grown:
-                wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
-                wanted[list(grown)] = False
-                grown |= self._grown(candidates, starts, starts.unlike(rank, wanted))
-            match, number = grown[rank], int(starts.face[rank])
-            face = self.target.faces[number]
-            if match is None:
-                continue
-            depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
-            if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
-                index = _of_one_size(candidates, face, *match)
-                readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
-                is_open[starts.agree(number, index)] = False
-        return _decide(readings, self.target)
+def _grown(candidates: Candidates, target: TargetDesign, starts: _Starts, ranks: list[int]):
+    """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
+    circles, face = _pairs(target), starts.face[ranks]
+    index = starts.index(ranks, circles.face_radius.shape[1])
+    found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
+    size = [len(target.faces[number].ids) for number in face.tolist()]
+    grown = zip(ranks, *found, size, strict=True)
+    return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
-    def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
-        """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
-        circles, face = _pairs(self.target), starts.face[ranks]
-        index = starts.index(ranks, circles.face_radius.shape[1])
-        found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
-        size = [len(self.target.faces[number].ids) for number in face.tolist()]
-        grown = zip(ranks, *found, size, strict=True)
-        return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
-    def find_mirrored(self, candidates: Candidates, named: tuple[FaceSighting, ...]) -> tuple[str, ...]:
-        """Returns the ids of faces that appear mirrored; none if a ``named`` face shows that the image is not."""
-        alike = mirror_images(self.target)
-        if any(each.face not in alike for each in named):
-            return ()
-        return tuple(each.face for each in self.find(candidates.mirrored()).faces if each.face not in alike)
+def find_mirrored(candidates: Candidates, target: TargetDesign, named: Sequence[FaceSighting]) -> tuple[str, ...]:
+    """Returns the ids of faces that appear mirrored; none if a ``named`` face shows that the image is not."""
+    alike = mirror_images(target)
+    if any(each.face not in alike for each in named):
+        return ()
+    return tuple(each.face for each in find_faces(candidates.mirrored(), target)[0] if each.face not in alike)
 
-    def _hypotheses(self, candidates: Candidates) -> _Starts:
-        """Returns all pairs of neighbouring outlines that may be a pair of the design, with their support."""
-        pairs = _pairs(self.target)
-        first, step, ratio = _candidate_pairs(candidates)
-        every = np.arange(len(pairs.second))
-        neighbour, own_radius = pairs.offset[every, pairs.second], pairs.radius[:, 0]
-        length, distance = np.linalg.norm(step, axis=1), np.linalg.norm(neighbour, axis=1)
-        ok = np.abs(length * (own_radius / distance)[:, None] - 1) < PAIR_TOLERANCE
-        ok &= np.abs(ratio * (own_radius / pairs.radius[every, pairs.second])[:, None] - 1) < PAIR_TOLERANCE
-        pair, row = np.nonzero(ok)
-        linear = candidates.shape[first[row]] @ _turn(neighbour[pair] * [1, -1], step[row]) * [1, -1]
-        support = _support(candidates, pairs, pair, candidates.xy[first[row]], linear)
-        hits = (support >= 0).sum(1)
-        supported = np.flatnonzero(hits >= 2 + MIN_SUPPORT)
-        origin = first[row[supported]]
-        best = np.lexsort((-candidates.contrast[origin], -hits[supported]))
-        supported, origin = supported[best], origin[best]
-        begin, count = pairs.uses[pair[supported]], np.diff(pairs.uses)[pair[supported]]
-        use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
-        return _Starts.of(
-            np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[supported], count, axis=0)
-        )
+
+def _hypotheses(candidates: Candidates, target: TargetDesign) -> _Starts:
+    """Returns all pairs of neighbouring outlines that may be a pair of the design, with their support."""
+    pairs = _pairs(target)
+    first, step, ratio = _candidate_pairs(candidates)
+    every = np.arange(len(pairs.second))
+    neighbour, own_radius = pairs.offset[every, pairs.second], pairs.radius[:, 0]
+    length, distance = np.linalg.norm(step, axis=1), np.linalg.norm(neighbour, axis=1)
+    ok = np.abs(length * (own_radius / distance)[:, None] - 1) < PAIR_TOLERANCE
+    ok &= np.abs(ratio * (own_radius / pairs.radius[every, pairs.second])[:, None] - 1) < PAIR_TOLERANCE
+    pair, row = np.nonzero(ok)
+    linear = candidates.shape[first[row]] @ _turn(neighbour[pair] * [1, -1], step[row]) * [1, -1]
+    support = _support(candidates, pairs, pair, candidates.xy[first[row]], linear)
+    hits = (support >= 0).sum(1)
+    supported = np.flatnonzero(hits >= 2 + MIN_SUPPORT)
+    origin = first[row[supported]]
+    best = np.lexsort((-candidates.contrast[origin], -hits[supported]))
+    supported, origin = supported[best], origin[best]
+    begin, count = pairs.uses[pair[supported]], np.diff(pairs.uses)[pair[supported]]
+    use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+    return _Starts.of(
+        np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[supported], count, axis=0)
+    )
 
 
 def _candidate_pairs(candidates: Candidates):
@@ -258,7 +248,7 @@ def needed_circles(face: FaceDesign) -> int:
     return min(MIN_NAMING, len(face.ids))
 
 
-def _decide(readings: list[FaceSighting], target: TargetDesign) -> FaceFinding:
+def _decide(readings: list[FaceSighting], target: TargetDesign) -> tuple[list[FaceSighting], list[OpenFace]]:
     """Keeps the readings that explain more circles than every other reading of the same candidates."""
     readings = [r for r in readings if len(r.rows) >= needed_circles(target.face(r.face))]
     readings.sort(key=lambda r: -len(r.rows))
@@ -266,21 +256,17 @@ def _decide(readings: list[FaceSighting], target: TargetDesign) -> FaceFinding:
     refused: list[OpenFace] = []
     settled: set[int] = set()
     for reading in readings:
-        used = set(reading.rows)
+        used, read = set(reading.rows), (reading.face, list(reading.rows), list(reading.circles))
         if settled & used:
             continue
         settled |= used
         rivals = [r for r in readings if used & set(r.rows) and len(r.rows) >= len(reading.rows)]
-        ambiguous = [r for r in rivals if _read(r) != _read(reading)]
+        ambiguous = [r for r in rivals if (r.face, *map(list, (r.rows, r.circles))) != read]
         if ambiguous or not is_named(target.face(reading.face), reading.circles.tolist(), target):
             refused.append((reading, *ambiguous))
         else:
             named.append(reading)
-    return FaceFinding(tuple(named), tuple(refused))
-
-
-def _read(reading: FaceSighting) -> tuple[str, list[int], list[int]]:
-    return reading.face, reading.rows.tolist(), reading.circles.tolist()
+    return named, refused
 
 
 def confusable(face: FaceDesign, target: TargetDesign) -> set[frozenset[int]]:

@@ -21,11 +21,12 @@ from stcal.sfm.detect.candidates import (
     Ellipses,
     FaceSighting,
     ImageDetection,
+    OpenFace,
     find_ellipses,
 )
 from stcal.sfm.detect.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.dot_grid import as_stated, by_rings, find_boards
-from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding
+from stcal.sfm.detect.face_patterns import find_faces, find_mirrored
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 NO_CENTRES = Centres.without_rims(*np.zeros((2, 0, 2)), *np.zeros((2, 0, 2, 2)))
@@ -40,14 +41,15 @@ class ImageReading:
     found: dict[Polarity, Ellipses]
     boards: tuple[BoardSighting, ...]  # the one with the most dots first
     free: Ellipses  # the largest ``MAX_FREE`` outlines of the target's polarity outside of boards
-    faces: FaceFinding
+    faces: list[FaceSighting]
+    unnamed: list[OpenFace]
     mirrored: tuple[str, ...]  # ids of faces
     untried: int = 0  # number of outlines beyond ``MAX_FREE``
     misstated: str = ""  # what of the board's file its dots contradict
 
     def face_ids(self) -> set[str]:
         """Returns the ids of the named faces."""
-        return {each.face for each in self.faces.faces}
+        return {each.face for each in self.faces}
 
 
 def read_image(
@@ -88,10 +90,12 @@ def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
         misstated = "" if boards else as_stated(dots, board, image_corners(camera))
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
-    finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
-    faces = finder.find(candidates)
-    mirrored = finder.find_mirrored(candidates, faces.faces)
-    return ImageReading(outlines, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses), misstated)
+    candidates = Candidates.of(ellipses, camera)
+    faces, unnamed = find_faces(candidates, target)
+    mirrored = find_mirrored(candidates, target, faces)
+    return ImageReading(
+        outlines, tuple(boards), ellipses, faces, unnamed, mirrored, len(all_free) - len(ellipses), misstated
+    )
 
 
 def detect_target(
@@ -131,7 +135,9 @@ def detect_image(
     parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
     for face, view in views.items():
         assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
-        parts.append(_corners(view.xy_px, view.covariance_px2, camera))
+        extent = np.zeros((len(view), 2, 2))
+        centre = camera.normalised_from_pixel(view.xy_px)
+        parts.append(Centres.without_rims(view.xy_px, centre, extent, view.covariance_px2))
         rows = first + np.arange(len(view))
         if face == BOARD and corners is not None:
             board_sightings.append(BoardSighting(rows, corners.numberings(view.ids)))
@@ -148,12 +154,6 @@ def detect_image(
     )
 
 
-def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> Centres:
-    """Returns corners as centres of ellipses without extent."""
-    flat, centre = np.zeros((len(xy_px), 2, 2)), camera.normalised_from_pixel(xy_px)
-    return Centres.without_rims(xy_px, centre, flat, covariance_px2)
-
-
 def _detect_circles(
     image: np.ndarray,
     camera: Camera,
@@ -165,7 +165,7 @@ def _detect_circles(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
-    free, named, refused = reading.free, reading.faces.faces, reading.faces.refused
+    free, named, refused = reading.free, reading.faces, reading.unnamed
     of_board = board.polarity if board else target.polarity
     patterns: list[_Pattern] = []
     for face in named:

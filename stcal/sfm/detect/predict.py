@@ -265,21 +265,17 @@ def outlying_circles(
         for k, pattern in enumerate(patterns[plane] for plane in planes)
         for label, xyz, radius in zip(pattern.labels, pattern.xyz_mm(), pattern.radius_mm, strict=True)
     }
-    labels: list[Label] = []
-    table: list[tuple[float, ...]] = []
-    for i, seen_in in enumerate(images):
-        for label, centre, sigma in zip(seen_in.labels, seen_in.centre, seen_in.sigma_px(), strict=True):
-            if label in design:
-                labels.append(label)
-                table.append((i, *design[label], *centre, sigma))
+    seen_in = [(i, *row) for i, o in enumerate(images) for row in zip(o.labels, o.centre, o.sigma_px(), strict=True)]
+    table = [(label, i, *design[label], *centre, sigma) for i, label, centre, sigma in seen_in if label in design]
     start, found = (cameras, Poses.of(planes.values())), [{} for _ in images]
-    if not labels:
+    if not table:
         return *start, found
-    numbers = np.array(table, float)
+    labels, numbers = [row[0] for row in table], np.array([row[1:] for row in table], float)
     (image, plane), xyz, sigma_px = numbers[:, :2].astype(int).T, numbers[:, 2:5], numbers[:, 8]
     poses = start
-    xyz_camera, rotation = _placed(*poses, image, plane, xyz)
-    offset = circle_image_offset(xyz_camera, rotation[:, :, 2], numbers[:, 5])
+    camera_from_plane = cameras[image] @ start[1][plane]
+    xyz_camera = camera_from_plane @ xyz
+    offset = circle_image_offset(xyz_camera, camera_from_plane.rotation[:, :, 2], numbers[:, 5])
     seen = focal_px * (numbers[:, 6:8] - perspective(offset)[0] + perspective(xyz_camera)[0])  # of the circles' centres
     shown = np.array([len(np.unique(image[plane == p])) for p in range(len(planes))])
     enough = np.bincount(plane)[plane] >= MIN_USUAL
@@ -288,9 +284,9 @@ def outlying_circles(
     for _ in range(MAX_ROUNDS):
         if (use := keep & enough).any():
             poses = adjusted_planes(*poses, image[use], plane[use], xyz[use], seen[use], focal_px)
-        xyz_camera, rotation = _placed(*poses, image, plane, xyz)
-        ideal, by_point = perspective(xyz_camera)
-        shift, by_place = seen - focal_px * ideal, focal_px * (by_point @ rotation[:, :, :2])
+        camera_from_plane = poses[0][image] @ poses[1][plane]
+        ideal, by_point = perspective(camera_from_plane @ xyz)
+        shift, by_place = seen - focal_px * ideal, focal_px * (by_point @ camera_from_plane.rotation[:, :, :2])
         off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * sigma_px)
         usual = np.full(len(off_px), np.median(off_px[keep]))
         for p in np.unique(plane[keep & enough]):
@@ -312,12 +308,6 @@ def outlying_circles(
             for k in own if alone[worst] else [worst]:
                 keep[k], found[i][labels[k]] = False, reason
     return *(start if keep.all() else poses), found
-
-
-def _placed(cameras: Poses, planes: Poses, image, plane, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points of planes in the cameras' frames, (n, 3), and the rotations camera_from_plane, (n, 3, 3)."""
-    camera_from_plane = cameras[image] @ planes[plane]
-    return camera_from_plane @ xyz, camera_from_plane.rotation
 
 
 SEARCH = 5.0  # search range about the predicted places, in mean radii of the circles, to each side

@@ -60,16 +60,14 @@ class Seen:
         face = next(each for each in self.faces if each.face == face_id)
         self.faces.remove(face)
         own = np.isin(face.circles, circles)
-        self.open_faces.append(
-            tuple(FaceSighting(x, face.rows[own], face.circles[own]) for x in sorted({face_id, *others}))
-        )
+        ids = sorted({face_id, *others})
+        self.open_faces.append(tuple(FaceSighting(x, face.rows[own], face.circles[own]) for x in ids))
         return self
 
     def detection(self, mirrored=()) -> ImageDetection:
         centres = centres_of(self.centre * FOCAL_PX, self.centre)
-        return ImageDetection(
-            centres, tuple(self.faces), tuple(self.boards), mirrored, open_faces=tuple(self.open_faces)
-        )
+        faces, boards, unnamed = map(tuple, (self.faces, self.boards, self.open_faces))
+        return ImageDetection(centres, faces, boards, mirrored, open_faces=unnamed)
 
 
 def plane_centres(camera_from_plane: Rigid, xy_mm) -> np.ndarray:
@@ -78,7 +76,9 @@ def plane_centres(camera_from_plane: Rigid, xy_mm) -> np.ndarray:
 
 
 def labelled(scene, detections):
-    named = [(f"12/{i}", "12", d) for i, d in enumerate(detections)]
+    """Labels of what was detected, or of :class:`Seen` images, and the arrangement."""
+    found = [d.detection() if isinstance(d, Seen) else d for d in detections]
+    named = [(f"12/{i}", "12", d) for i, d in enumerate(found)]
     return label_groups([named], scene.target, scene.board, FOCAL_PX)[0]
 
 
@@ -88,7 +88,7 @@ def poses(scene):
 
 def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group):
     """Everything that fits is kept. The circles are 0.02 mm off the design: 0.06 px here."""
-    results, arrangement = labelled(scene, [Seen(o).detection() for o in group])
+    results, arrangement = labelled(scene, map(Seen, group))
     assert all(set(r.observations.labels) == set(o.labels) for r, o in zip(results, group, strict=True))
     assert set(arrangement.group_from_plane) == {"1", "2", "board"}
     assert all(r.notes == () for r in results)
@@ -96,11 +96,8 @@ def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group)
         pose, planes = arrangement.camera_from_group[i], arrangement.group_from_plane
         predicted = predict_circles(pose, planes, [], patterns_of(scene.target, scene.board), scene.camera)
         truth = dict(zip(image.labels, image.centre_px, strict=True))
-        own = [
-            np.linalg.norm(at - truth[x])
-            for x, at in zip(predicted.labels, predicted.centre_px, strict=True)
-            if x in truth
-        ]
+        places_px = zip(predicted.labels, predicted.centre_px, strict=True)
+        own = [np.linalg.norm(at - truth[x]) for x, at in places_px if x in truth]
         assert len(own) == sum(x.plane != "board" for x in truth) or len(own) >= 0.4 * len(truth)
         assert 0.005 < np.median(own) < 0.2
         assert max(own) < 0.6
@@ -113,7 +110,7 @@ def test_a_phantom_that_does_not_stand_still_goes_out(scene, group, count):
     for i in range(count):
         pose = Rigid.exp([2.8 + 0.1 * i, 0.2, 0.1, -300 + 90 * i, 200 - 60 * i, 1100 + 40 * i])
         seen[i].face("5", plane_centres(pose, TARGET.face("5").xy_mm))
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     for r, o in zip(results, group, strict=True):
         assert {x for x in r.observations.labels if x.plane != "5"} == set(o.labels)
     kept = sum("5" in r.observations.face_ids() for r in results)
@@ -130,7 +127,7 @@ def test_a_face_or_a_board_in_view_twice_is_neither(scene, group):
         own.face("1", plane_centres(behind, TARGET.face("1").xy_mm))
     cells = np.stack(np.meshgrid(np.arange(7), np.arange(9), indexing="ij"), -1).reshape(-1, 2)
     seen[2].board(plane_centres(Rigid.exp([0.1, 0.2, 0, -100, 150, 1500]), 30.0 * cells[:, ::-1]), cells)
-    results, arrangement = labelled(scene, [s.detection() for s in seen])
+    results, arrangement = labelled(scene, seen)
     assert "1" in arrangement.group_from_plane
     for i, (r, o) in enumerate(zip(results, group, strict=True)):
         twice = {"1"} if i else set()
@@ -152,7 +149,7 @@ def test_a_reflection_as_bright_as_the_face_goes_out(scene, group):
     for own, pose in zip(seen, poses(scene), strict=True):
         xyz = pose @ image[order]
         own.face("4", xyz[:, :2] / xyz[:, 2:])
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     for r, o in zip(results, group, strict=True):
         assert set(r.observations.labels) == set(o.labels)
         assert any("a pattern like face 4: not where" in note for note in r.notes)
@@ -163,7 +160,7 @@ def test_one_bad_first_image_does_not_speak_for_the_group(scene, group):
     seen = [Seen(o) for o in group]
     wrong = seen[0].boards[0]
     seen[0].boards[0] = BoardSighting(wrong.rows[9:], wrong.numberings[:1, 9:] - [1, 0])
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     for r, o in list(zip(results, group, strict=True))[1:]:
         dots, truth = places(r.observations, "board"), places(o, "board")
         turned = [dots.get(x) == truth[x] for x in truth]
@@ -183,7 +180,7 @@ def test_faces_without_a_name_are_named_by_the_group(scene, group):
     for own in seen[1:]:
         for face_id in [each.face for each in own.faces]:
             own.unnamed(face_id)
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     for r, o in zip(results[1:], group[1:], strict=True):
         found, truth = places(r.observations), places(o)
         assert {x.plane for x in found} == {x.plane for x in truth}
@@ -199,7 +196,7 @@ def test_a_face_that_no_image_names_is_what_the_images_have_in_common(scene, gro
         for i, own in enumerate(seen):
             if any(each.face == "2" for each in own.faces):
                 own.unnamed("2", others[i % len(others)])
-        results, arrangement = labelled(scene, [s.detection() for s in seen])
+        results, arrangement = labelled(scene, seen)
         assert set(arrangement.group_from_plane) == planes
         for r, o in zip(results, group, strict=True):
             assert set(r.observations.face_ids()) == set(o.face_ids()) & planes
@@ -236,9 +233,8 @@ def is_numbered(image, result, half_a_turn=False) -> bool:
     return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_all_images_agree_on_one_numbering(scene, group, seed):
-    turns = np.random.default_rng(seed).integers(0, 2, len(group)).astype(bool)
+@pytest.mark.parametrize("turns", [(0, 1, 1, 0, 1), (1, 0, 1, 1, 0)])
+def test_all_images_agree_on_one_numbering(scene, group, turns):
     detections = [numbered(o, turned) if turn else Seen(o).detection() for o, turn in zip(group, turns, strict=True)]
     results, _ = labelled(scene, detections)
     for o, r in zip(group, results, strict=True):
@@ -262,7 +258,7 @@ def test_one_image_with_other_numberings_is_seen_through(scene, group, image, ot
 def test_an_image_without_a_face_keeps_no_uncertain_board(scene, group):
     seen = [Seen(o) for o in group]
     seen[1].faces = []
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     assert len(results[1].observations) == 0
     assert any("left out: 2 numberings fit" in note for note in results[1].notes)
 
@@ -273,7 +269,7 @@ def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
     moved = group[2].centre.copy()
     moved[face] = (moved[face] - moved[face].mean(0)) * 0.8 + moved[face].mean(0)
     seen = [Seen(replace(o, centre=moved) if i == 2 else o) for i, o in enumerate(group)]
-    results, _ = labelled(scene, [s.detection() for s in seen])
+    results, _ = labelled(scene, seen)
     assert not any(label.plane == "board" for label in results[2].observations.labels)
     assert any("was moved" in note for note in results[2].notes)
 

@@ -13,7 +13,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.images import MAJORITY, find_images
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, detect_files, sized_by
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 IMAGE = "12/IMG_1000.jpg"
 
@@ -99,8 +99,7 @@ def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch, in
     elif in_its_place != "nothing":
         shutil.rmtree((folder / IMAGE).parent)
         (folder / IMAGE).parent.write_bytes(b"x")
-    with fails_with(f"E-IMAGES-GONE … {IMAGE}"):
-        detect()
+    refuses(f"E-IMAGES-GONE … {IMAGE}", detect)
 
 
 def test_a_camera_found_in_the_photographs_is_not_called_a_file():

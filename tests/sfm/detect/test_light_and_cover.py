@@ -30,7 +30,7 @@ def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench, face)
     photo = bench.groups("12").photographs[0]
     (dark,) = [plane for plane in photo.faces if plane.name == face]
     reading = read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
-    assert {each.face: len(each.rows) for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
     assert [len(board.rows) for board in reading.boards] == [63]
 
 
@@ -45,7 +45,7 @@ def test_an_image_alone_reads_a_board_in_other_light_than_the_target(bench, fact
     darker = float(np.percentile(pixels[target], 99) / np.percentile(photo.grey[target], 99))
     assert after / before / darker == pytest.approx(factor, rel=0.02)  # light, not exposure
     reading = read(bench, pixels)
-    assert {each.face: len(each.rows) for each in reading.faces.faces} == {"1": 10, "2": 10}
+    assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
     assert [len(board.rows) for board in reading.boards] == [63]
 
 

@@ -9,7 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.sfm.detect import image as stage
 from stcal.sfm.detect.candidates import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 CAMERA = Camera(480, 360, np.array([500.0, 500.0]), np.array([240.0, 180.0]), np.zeros(8))
 
@@ -28,8 +28,7 @@ def checkerboard(side: int = 6) -> np.ndarray:
     ],
 )
 def test_an_array_that_is_no_grey_image_of_the_camera_is_refused(image, error):
-    with fails_with(error):
-        stage.detect_image(image, CAMERA, reference_target(), None, EllipseOptions())
+    refuses(error, stage.detect_image, image, CAMERA, reference_target(), None, EllipseOptions())
 
 
 @pytest.mark.slow
@@ -48,5 +47,4 @@ def test_of_a_fine_pattern_the_largest_outlines_are_tried_and_it_is_said(monkeyp
     ("options", "name"), [*((EllipseOptions, name) for name in OPTION_RANGES), (PairOptions, "max_angle_rad")]
 )
 def test_options_have_ranges(options, name, value):
-    with fails_with(f"{'E-OPTION-RANGE' if np.isfinite(value) else 'E-FIELD-TYPE'} … {name}"):
-        options(**{name: value})
+    refuses(f"{'E-OPTION-RANGE' if np.isfinite(value) else 'E-FIELD-TYPE'} … {name}", options, **{name: value})

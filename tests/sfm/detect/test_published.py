@@ -9,7 +9,7 @@ import pytest
 from stcal.design import TargetDesign, reference_target
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX, PublishedPattern, detect_published
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.sfm.detect.test_identity import CAMERA, TARGET, face_ellipses, pose
 
 BITS = 8
@@ -88,5 +88,4 @@ def test_a_design_of_another_form_is_refused():
     xy = face.xy_mm.copy()
     xy[face.ids.index("6")] = (50.0, 30.0)
     other = TargetDesign("other", "bright", (replace(face, xy_mm=xy), TARGET.face("2")))
-    with fails_with("E-TARGET-NOT-PUBLISHED … other"):
-        PublishedPattern.of(other)
+    refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern.of, other)
