@@ -276,9 +276,9 @@ def test_faces_that_are_hardly_seen_are_named():
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
     target, near = tag_cube(60), 145.0
-    options = PlanOptions(images=4, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    options = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
     forecast, _, _ = planned_photographs(options, target)
-    simulated = make_body_scene(target, body_camera(900), BodyOptions(4, near, seed=3, print_errors=1.0))
+    simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
     assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())
