@@ -23,9 +23,9 @@ from tests.shared import own_copy
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
-    """The reference design in clutter, at half the paper's width."""
+    """The reference design in clutter, at a third of the paper's width."""
     folder = tmp_path_factory.mktemp("pipeline")
-    scene = make_scene(SceneOptions(seed=11, width=1944, height=1296, images_per_group=4))
+    scene = make_scene(SceneOptions(seed=11, width=1620, height=1080, images_per_group=4))
     write_dataset(folder / "data", scene, RenderOptions(clutter=True, seed=11))
     data = folder / "data"
     result = run(data / "images", data / "cameras.txt", folder / "run", data / "target.toml", data / "board.toml")

@@ -13,7 +13,7 @@ from tests.shared import own_copy
 SFM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()")
 SFM_SAYING_ON = (*SFM[:-1], "from stcal.cli.entry import main_sfm; print('on', flush=True); main_sfm()")
 ENDS = [(signal.SIGTERM, "terminated", 143), (signal.SIGINT, "interrupted", 130)]
-PROGRESS = ("detect: ", "overlays: ", "map: ", "faces: ", "check: ", "report: ")
+PROGRESS = ("detect: ", "overlays: ", "map: ", "faces: ", "check: ", "report: ", "working: ")
 
 
 def ended(process, number) -> tuple[int, list[str]]:

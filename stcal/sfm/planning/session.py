@@ -216,8 +216,8 @@ def plan(
     better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
     if isinstance(setup.board, ScaleReference):
         away = np.linalg.norm(models[0].xyz_model[:, None] - models[0].xyz_model, axis=2)
-        ends = circle_labels(models[0].labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
-        known = KnownDistance(*ends, float(away.max()), DISTANCE_SIGMA_MM)
+        one, two = circle_labels(models[0].labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
+        known = KnownDistance(one, two, float(away.max()), DISTANCE_SIGMA_MM)
         size = replace(setup.board, distances=(*setup.board.distances, known))
         better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = replace(setup, board=size)
     remedies = (

@@ -202,11 +202,8 @@ def _scale(report: dict) -> list[Block]:
             boards[group["name"]] = scale
             mm, off = cells(scale, "mm_per_unit_rows:6 difference_ppm:1")
             by_rows = [mm, " and ".join(str(row) for row in scale["rows"]), off]
-        (least, *own), vectors = (
-            cells(scale, "mm_per_unit:6 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1"),
-            scale["board_residuals_um"].values(),
-        )
-        most = max((math.hypot(*vector) for vector in vectors), default=None)
+        least, *own = cells(scale, "mm_per_unit:6 sigma_ppm:1 dots board_mean_um:1 board_spread_um:1 board_rms_um:1")
+        most = max((math.hypot(*vector) for vector in scale["board_residuals_um"].values()), default=None)
         rows.append([group["name"], least, *by_rows, *own, number(most, 1)])
     heads = ["<Group", "λ, least squares (mm/unit)", "λ, by rows (mm/unit)", "Rows", "Difference (ppm)", "σ (ppm)",
              "Points", "Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]  # fmt: skip
@@ -247,15 +244,10 @@ def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
             board.setdefault(f"Board, group {row['group']}", []).append(shown)
         else:
             target.setdefault(f"Face {plane}", []).append(shown)
-    images = [
-        [
-            i,
-            row["image"],
-            swatch(row["group"], colours.get(row["group"], "")),
-            *cells(row, "observations rms_px:4 max_px:4 worst"),
-        ]
-        for i, row in enumerate(report["residuals_by_image"], 1)
-    ]
+    images: list[list] = []
+    for i, row in enumerate(report["residuals_by_image"], 1):
+        coloured = swatch(row["group"], colours.get(row["group"], ""))
+        images.append([i, row["image"], coloured, *cells(row, "observations rms_px:4 max_px:4 worst")])
     worst = max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None)
     named = ""
     if worst:

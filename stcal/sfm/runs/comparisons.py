@@ -235,9 +235,9 @@ class Compared(Part):
     """Differences of two results; the keys that were not given are not in the file."""
 
     faces: dict[ByFace, FaceDifference | None]
-    circles_um: dict[ByLabel, float] = Field({})
-    circles_sigmas: dict[ByLabel, float] = Field({})
-    cameras: list[CameraDifference] = Field([])
+    circles_um: dict[ByLabel, float] = Field(default={})
+    circles_sigmas: dict[ByLabel, float] = Field(default={})
+    cameras: list[CameraDifference] = Field(default=[])
 
 
 class Crosscheck(Part):

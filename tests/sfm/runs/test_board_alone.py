@@ -49,6 +49,7 @@ def test_the_board_alone_gives_scale_and_residuals(hidden, stcal_sfm):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
 def test_the_published_method_knows_the_board_alone(hidden, stcal_sfm):
     code, text, _ = stcal_sfm(*hidden.arguments("--solve", "paper", "--no-strict"))
     assert code == 0
@@ -56,6 +57,7 @@ def test_the_published_method_knows_the_board_alone(hidden, stcal_sfm):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
 def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
     """Dark circles are sought and bright ones in view: the file is wrong, unless that does not matter."""
     small = small_set("12", detected=False)

@@ -18,6 +18,7 @@ from stcal.workflows import cluster
 from tests.levels import sampled
 from tests.outcome import fails_with
 
+pytestmark = pytest.mark.usefixtures("no_page")
 RESULTS = ("faces.json", "labels.csv")
 CLUSTER = """
 from distributed import LocalCluster

@@ -134,9 +134,10 @@ def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
 def test_sparse_gives_the_same_faces_as_all_pairs(crowd, tmp_path):
     """Both end in the minimum of the same adjustment: the difference is what stopping leaves, 1e-8 px in 2592."""
     scene, observations = crowd
-    mapped_all, every = solve(scene, observations, "all", tmp_path / "all")
-    mapped_sparse, sparse = solve(scene, observations, "sparse", tmp_path / "sparse")
-    assert sum(len(s.model.images) for s in mapped_all) == sum(len(s.model.images) for s in mapped_sparse) == 100
+    some = [image for image in observations if int(image.name[-4:]) < 30]  # of each group
+    mapped_all, every = solve(scene, some, "all", tmp_path / "all")
+    mapped_sparse, sparse = solve(scene, some, "sparse", tmp_path / "sparse")
+    assert sum(len(s.model.images) for s in mapped_all) == sum(len(s.model.images) for s in mapped_sparse) == 60
     for face_id, pose in every.target.target_from_face.items():
         other = sparse.target.target_from_face[face_id]
         assert np.abs(pose.matrix() - other.matrix()).max() < 1e-6

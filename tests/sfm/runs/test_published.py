@@ -45,6 +45,7 @@ def test_each_step_is_worth_something(compared, small_result):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
 def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
     data = small_set("12", "14")
     code, text, _ = stcal_sfm(*data.arguments("--solve", "paper", "--no-strict"))
@@ -79,6 +80,7 @@ def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
 def test_another_design_is_compared_without_the_published_row(tmp_path, shared_data):
     data = shared_data("stereo_target/white_block")
     designs = data / "target.toml", data / "board.toml"

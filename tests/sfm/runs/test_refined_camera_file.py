@@ -15,6 +15,7 @@ from stcal.sfm.mapping.body import unknown_lens
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions
 
+pytestmark = pytest.mark.usefixtures("no_page")
 CHI2_8_999 = 26.1
 """Of the squares of eight parameters' errors over their σ, once in a thousand draws more."""
 
