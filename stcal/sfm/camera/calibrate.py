@@ -412,7 +412,12 @@ def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera
         views, _ = correct_defocus(views, camera, pattern_of_board(board))
     shown, repeated = {view.name for view in views}, "the board is in view more than once"
     without = (
-        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
+        Skipped(
+            each.file.name,
+            repeated
+            if "board" in each.detection.repeated
+            else "; ".join(["no board recognised", *each.detection.notes[:1]]),
+        )
         for each in detection.images
         if each.file.name not in shown
     )

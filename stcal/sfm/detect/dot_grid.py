@@ -1,6 +1,7 @@
 """Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered. A
 plain board looks the same after half a turn: a reading carries every numbering that fits the image."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -25,8 +26,8 @@ CORNER_MARGIN = 0.4
 """A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
 PITCHES = 2.2, 3.1, 4.3, 6.0, 8.4
 """Pitches in radii that are tried where a board is not found; each stands for those within the tolerance of a step."""
-MOST_OF_IT = 0.8
-"""Smallest share of a board's dots by which another pitch than stated is believed."""
+HALF, MOST_OF_IT = 0.55, 0.8
+"""Shares of a board's dots: above what its diagonals alone can be, and the smallest by which another pitch is believed."""
 MAX_UNEXPLAINED = 2
 """Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
@@ -59,16 +60,23 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
     return sorted(readings, key=lambda r: -len(r.rows))
 
 
-def as_stated(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> str:
-    """Returns a note if there is a grid of the board's dots with another ratio of pitch and radius; else nothing."""
+def contradiction(
+    candidates: Candidates, board: BoardDesign, image_corners: np.ndarray, found: Sequence[BoardSighting]
+) -> str:
+    """Returns a note if most of the board's dots are a grid of another ratio of pitch and radius than stated; none if
+    most of them were ``found`` as stated. Half of a grid passes for one of a wider pitch, along its diagonals."""
+    if any(len(each.rows) >= HALF * len(board.cells()) for each in found):
+        return ""
+    stated = board.pitch_mm / board.radius_mm
     for ratio in PITCHES:
         other = replace(board, radius_mm=board.pitch_mm / ratio, corner=None, rings=())
-        for found in find_boards(candidates, other, image_corners)[:1]:
-            if len(found.rows) >= MOST_OF_IT * len(board.cells()):
-                cells = board.flat(found.numberings[0][:, ::-1].astype(float))
-                slope = homography_jacobian(fit_homography(cells, candidates.xy[found.rows]), cells)
-                radii = singular_values(np.linalg.solve(slope, candidates.shape[found.rows]))
-                measured, stated = 1 / float(np.median(radii)), board.pitch_mm / board.radius_mm
+        for grid in find_boards(candidates, other, image_corners)[:1]:
+            cells = board.flat(grid.numberings[0][:, ::-1].astype(float))
+            slope = homography_jacobian(fit_homography(cells, candidates.xy[grid.rows]), cells)
+            radii = singular_values(np.linalg.solve(slope, candidates.shape[grid.rows]))
+            measured = 1 / float(np.median(radii))
+            most = len(grid.rows) >= MOST_OF_IT * len(board.cells())
+            if most and max(measured / stated, stated / measured) > 1 + STEP_TOLERANCE:
                 return (
                     f"a grid of the board's dots is there, its pitch {measured:.2f} times their radius, in the board "
                     f"file {stated:.2f} times: correct pitch_mm or radius_mm"

@@ -25,7 +25,7 @@ from stcal.sfm.detect.candidates import (
     find_ellipses,
 )
 from stcal.sfm.detect.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.dot_grid import as_stated, by_rings, find_boards
+from stcal.sfm.detect.dot_grid import by_rings, contradiction, find_boards
 from stcal.sfm.detect.face_patterns import find_faces, find_mirrored
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
@@ -84,10 +84,11 @@ def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
         dots = Candidates.of(outlines[board.polarity], camera)
-        for found in find_boards(dots, board, image_corners(camera)):
+        sightings = find_boards(dots, board, image_corners(camera))
+        misstated = contradiction(dots, board, image_corners(camera), sightings)
+        for found in sightings if not misstated else ():
             boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
             free[board.polarity][found.rows] = False
-        misstated = "" if boards else as_stated(dots, board, image_corners(camera))
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     candidates = Candidates.of(ellipses, camera)
