@@ -27,7 +27,7 @@ CORNER_MARGIN = 0.4
 PITCHES = 2.2, 3.1, 4.3, 6.0, 8.4
 """Pitches in radii that are tried where a board is not found; each stands for those within the tolerance of a step."""
 HALF, MOST_OF_IT = 0.55, 0.8
-"""Shares of a board's dots: above what its diagonals alone can be, and the smallest by which another pitch is believed."""
+"""Shares of a board's dots: above that of its diagonals alone, and the smallest by which another pitch is believed."""
 MAX_UNEXPLAINED = 2
 """Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
