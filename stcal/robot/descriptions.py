@@ -81,13 +81,6 @@ class UrdfJoint:
         """True if it is not fixed."""
         return self.kind != "fixed"
 
-    def limited(self) -> Joint:
-        """Returns its type and range."""
-        kind = MOVING[self.kind]
-        most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
-        low, high = self.limit or (-np.inf, np.inf)
-        return Joint(kind, low if low > -most else -np.inf, high if high < most else np.inf)
-
 
 @require_arguments
 def load_urdf(
@@ -184,15 +177,19 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
             if not tool and (joint.moves or joint.child == FLANGE):
                 flange = Rigid() if joint.moves else passed
         carriers[tool], tools[tool] = last, passed
-    joints, n, placed = tuple(joint.limited() for joint in moving), len(moving), Poses.of(gaps)
+    joints, n, placed = [], len(moving), Poses.of(gaps)
+    for each in moving:
+        kind, (low, high) = MOVING[each.kind], each.limit or (-np.inf, np.inf)
+        most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
+        joints.append(Joint(kind, low if low > -most else -np.inf, high if high < most else np.inf))
     sliding = np.array([joint.type == "prismatic" for joint in joints])
     ends, tree = (*(Rigid(),) * (n - 1), flange), None if "" in paths else Tree(mounts, carriers)
     chain = Chain(placed.rotation, placed.translation, ends, sliding, np.eye(n), None, tree)
     if tree is None:
         tools = {tool: flange.inverse() @ pose for tool, pose in tools.items()}
-        robot = robot_between(chain, tools, name, convention, joints)
+        robot = robot_between(chain, tools, name, convention, tuple(joints))
     else:
-        bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=tree)
+        bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, tuple(joints), tools=tools, tree=tree)
         robot = robot_from_chain(chain, tools, bare)
     q = fixed_values(n)
     for tool, pose in tools.items():

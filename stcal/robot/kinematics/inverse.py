@@ -78,7 +78,7 @@ class Inverse(Brief):
     @property
     def usable(self) -> np.ndarray:
         """Mask (m,) of poses with the tool at the wanted place: reached, singular, or orientation."""
-        return np.array([s in (REACHED, SINGULAR_POSE, ORIENTATION) for s in self.status], bool)
+        return np.isin(np.array(self.status, str), (REACHED, SINGULAR_POSE, ORIENTATION))
 
 
 @require_arguments

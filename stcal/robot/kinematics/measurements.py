@@ -454,21 +454,22 @@ def read_targets(
     """
     table = read_table(path, "targets", quaternions)
     has_joints = any(name.startswith("q1_") for name in table.columns)
-    has_poses = table.has("x", LENGTHS)
-    if not has_poses and not has_joints:
+    poses, columns, how_oriented = None, (), ()
+    if table.has("x", LENGTHS):
+        poses, columns, how_oriented = oriented(table, rotation)
+        if poses is None:
+            raise InputError(
+                "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTED_BY} needed"
+            )
+    elif not has_joints:
         raise InputError(
             "E-TARGETS-NO-POSES",
             f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
             f"the header is {table.header()}",
         )
-    poses, columns, how_oriented = oriented(table, rotation) if has_poses else (None, (), ())
-    if rotation is not None and not has_poses:
+    elif rotation is not None:
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out"
-        )
-    if has_poses and poses is None:
-        raise InputError(
-            "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTED_BY} needed"
         )
     tools = targets_of(table)
     table.refuse(
