@@ -12,7 +12,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml, load_layout
-from tests.boards.drawn import photograph
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.outcome import ended
 from tests.support.tags import random_pose
@@ -134,16 +133,14 @@ def with_board() -> np.ndarray:
 def test_calibrate_with_a_board_of_dots(locate, tmp_path):
     printed, rng = with_board(), np.random.default_rng(1)
     (tmp_path / "images").mkdir()
-    matrix = np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
     for k in range(5):
         turn = random_pose(rng, tilt_deg=(15, 40)).rotation
         # Looked at in its middle, upright enough for the image's shape.
         spin = np.arctan2(turn[1, 0], turn[0, 0]) - np.pi / 2
         c, s = np.cos(-spin), np.sin(-spin)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
-        shift = np.array([0, 0, 620.0]) - turn @ np.array([SHEET_MM[0] / 2, 160.0, 0])
-        image = photograph(printed, PER_MM, matrix @ np.column_stack([turn[:, :2], shift]), (1200, 900))
-        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), image)
+        place = Rigid(turn, np.array([0, 0, 620.0]) - turn @ [0, 160 - SHEET_MM[1] / 2, 0])
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), photo(place, printed))
     (tmp_path / "board.toml").write_text(BOARD)
     entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
     (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
