@@ -37,6 +37,7 @@ from stcal.sfm.runs.comparisons import (
     Compared,
     Crosscheck,
     FaceDifference,
+    FacesCompared,
     ImagesRegistered,
     ResidualRms,
     Tolerances,
@@ -368,7 +369,7 @@ def _compared(
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
         mapping=mapping,
         result=result,
-        plain=Compared(faces=face_differences(of_native.target, run)),
+        plain=FacesCompared(faces=face_differences(of_native.target, run)),
         notes=list(of_native.notes),
         differences=_differences(images, mapping, result, tolerances),
     )

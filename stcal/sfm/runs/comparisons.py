@@ -231,12 +231,18 @@ class CameraDifference(Part):
     sigmas: float
 
 
-class Compared(Part):
-    """Differences of two results; the keys that were not given are not in the file."""
-
+class FacesCompared(Part):
     faces: dict[ByFace, FaceDifference | None]
+
+
+class ResultCompared(FacesCompared):
     circles_um: dict[ByLabel, float] = Field(default={})
     circles_sigmas: dict[ByLabel, float] = Field(default={})
+
+
+class Compared(ResultCompared):
+    """Differences of two results; the keys that were not given are not in the file."""
+
     cameras: list[CameraDifference] = Field(default=[])
 
 
@@ -264,11 +270,11 @@ class Crosscheck(Part):
         "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
         "with that of the camera in its group, circles held together"
     )
-    result: Compared = Field(
+    result: ResultCompared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
         "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
-    plain: Compared = Field(
+    plain: FacesCompared = Field(
         description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
         "`sigmas`; no tolerance applies"
     )
