@@ -14,15 +14,19 @@ from PIL import Image
 
 import stcal
 from stcal import robot
+from stcal.boards.board_designs import TagLayout
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.robot_model import mh80
 from tests.levels import FULL, SLOW
-from tests.locate.test_arrays import CAMERA, LAYOUT, TRUTH
 from tests.support.areas import homography, rendered
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^## (\d+)\. .*?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SCRIPTS = dict(BLOCK.findall((ROOT / "docs" / "howto" / "python.md").read_text(encoding="utf-8")))
+CAMERA = Camera(320, 240, [500.0, 500.0], [159.5, 119.5], np.zeros(8))
+LAYOUT = TagLayout.from_tags("4X4_50", [3, 7], [[0.0, 0.0], [50.0, 0.0]], [30.0, 25.0], [0.0, 90.0])
+TRUTH = Rigid.exp([0.3, 0.2, 0.1, -25.0, 5.0, 300.0])
 FLANGE_FROM_CAMERA = Rigid.exp([0.1, 0.2, -0.3, 30.0, -20.0, 90.0])
 B_FROM_A = Rigid.exp([0.3, -0.2, 0.5, 1000.0, 50.0, -200.0])
 WRONG = [4, 11]  # rows of `points.npz` that are off by 20 mm

@@ -183,9 +183,13 @@ class Solution:
     problem: Adjustment
     values: dict[str, Any]
 
-    @cached_property
+    @property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
+        return self._cost
+
+    @cached_property
+    def _cost(self) -> float:
         of_priors = sum(prior.cost(self.values) for prior in self.problem.priors)
         return sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in self.rows) + of_priors
 

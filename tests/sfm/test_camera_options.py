@@ -7,7 +7,7 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.errors import InputError
-from stcal.io.cameras import read
+from stcal.io.cameras import foreign_lenses
 from tests.commands import CALLS, COMMANDS, Call
 from tests.fuzzing.judged import lay_out
 from tests.outcome import assert_error, ended
@@ -71,6 +71,6 @@ def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
         taken.append(choice)
         raise InputError("E-CAMERA-SEVERAL", f"chosen: {choice}")
 
-    monkeypatch.setattr(read, "one_of", chosen)
+    monkeypatch.setattr(foreign_lenses, "one_of", chosen)
     assert_error(call(each, "--camera-name", "2", change=two_cameras(each)), 2, "chosen: 2")
     assert taken == ["2"]

@@ -191,7 +191,7 @@ class Tracker:
         labels, pose_now = seen.observations.labels, pose.camera_from_target
         near = self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD)
         wrong = predict.contradictions(near, seen.observations, camera)
-        seen = seen.without(wrong, predict.notes_by_plane(wrong, predict.CONTRADICTED))
+        seen = seen.without(wrong)
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen

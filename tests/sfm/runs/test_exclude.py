@@ -79,6 +79,21 @@ def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch)
         chosen_images(small.images, [each.name for each in chosen_images(small.images)[0]])
 
 
+def test_of_failed_checks_those_that_name_an_image_come_first():
+    def check(key, verdict, *names):
+        return Check(key, key, verdict, "", (), 1, names, "")
+
+    checks = [
+        check("dull", "suspicious", "b.jpg"),
+        check("passed", "passed"),
+        check("camera", "failed", "camera"),
+        check("centre", "suspicious", "b.jpg 1:1"),
+        check("image", "failed", "a.jpg"),
+    ]
+    order = [each.key for each in ranked(checks, frozenset({"a.jpg", "b.jpg"}))]
+    assert order == ["image", "camera", "dull", "centre", "passed"]
+
+
 @pytest.mark.parametrize(("later", "why"), [("radius-design", "rim"), ("groups", "board"), ("loops", "flatness")])
 def test_a_check_that_another_one_explains_comes_after_it(later, why):
     checks = [Check(key, key, "failed", "", (), 1, (key,), "") for key in (later, why, "agreement")]
