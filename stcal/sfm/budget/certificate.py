@@ -116,10 +116,10 @@ def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
     axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
     for tip, colour, name in zip(tips, AXIS_COLOURS, "XY", strict=False):
         axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
-        axes.words(1.12 * tip[0], 1.12 * tip[1], name, colour=colour, weight="bold")
+        axes.words(1.12 * tip[0], 1.12 * tip[1], name, colour=colour, size=11, weight="bold")
     axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
     for (x, y), name in zip(xy, xyz, strict=True):
-        axes.words(x, y, name, (0, 9))
+        axes.words(x, y, name, (0, 11), size=10)
     return drawing
 
 
