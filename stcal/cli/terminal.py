@@ -7,6 +7,7 @@ may go to standard output.
 import json
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -74,6 +75,8 @@ class _Beat(threading.Thread):
             self.stage, self.began = stage, time.perf_counter()
 
     def run(self) -> None:
+        if os.name == "posix":  # signals are for the main thread, which makes them wait while COLMAP's bindings load
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         while not self.over.wait(LINE_EVERY_S / 2):
             if not self.said:
                 with suppress(ValueError, OSError):  # nobody reads the stream any more

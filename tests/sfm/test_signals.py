@@ -1,5 +1,6 @@
 """SIGINT and SIGTERM end every command with one line, 130 and 143; earlier results stay."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -68,6 +69,25 @@ def test_colmaps_bindings_leave_the_signals_as_they_were():
     process = subprocess.Popen([sys.executable, "-P", "-c", begin], stdout=-1, stderr=-1, text=True)
     assert process.stdout.readline() == "on\n"
     assert ended(process, signal.SIGTERM) == (7, [])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_thread_that_says_what_a_command_is_at_takes_no_signal(number):
+    """While COLMAP's bindings load, they wait in the main thread, and any other that took one would end the process."""
+    begin = (
+        "import os, signal, time; from stcal.cli.terminal import _Beat\n"
+        f"signal.signal({int(number)}, signal.SIG_DFL); _Beat().start(); time.sleep(0.3)\n"
+        f"signal.pthread_sigmask(signal.SIG_BLOCK, [{int(number)}]); os.kill(os.getpid(), {int(number)})\n"
+        "time.sleep(0.3); print('on', flush=True); os._exit(7)"
+    )
+    found = subprocess.run(
+        [sys.executable, "-P", "-c", begin],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )
+    assert (found.returncode, found.stdout) == (7, "on\n")
 
 
 @pytest.mark.parametrize(
