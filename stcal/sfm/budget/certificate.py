@@ -2,8 +2,8 @@
 
 from functools import partial
 
+import cv2
 import numpy as np
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
@@ -34,13 +34,17 @@ STATED = {
 """Words for what is stated of board and target."""
 DIRECTIONS = 200
 """Number of directions among which that of the drawing is chosen."""
+MOST_NAMES = 40
+"""Number of points of a face up to which all are named in its drawing; of more, the outermost are."""
+SAME_PLANE_MM = 0.1
+"""Distance of a face from the middle of all within which the item is one plane."""
 
 
 def certificate(file: BudgetFile) -> Document:
     """Returns the certificate of a budget for which all is stated that it needs."""
     images, groups = sum(each.images for each in file.views), len(file.views)
     how = (
-        f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the centres of all circles and the "
+        f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the points of all faces and the "
         f"poses of the camera were adjusted together (bundle adjustment by stcal {file.run.version}, uncertainties by "
         f"stcal {file.version})"
     )
@@ -54,7 +58,7 @@ def certificate(file: BudgetFile) -> Document:
             Section("Results", [*results(file), "End of the results; the annex follows"], terminal=True),
             Section("Annex: test of lengths", tests, terminal=True),
             Section("Annex: uncertainty budget", [method(file), inputs(file), *contributions(file)], terminal=True),
-            Section("Annex: data", [hashes(file), photographs(file), "End of the certificate"]),
+            Section("Annex: data", [hashes(file), *photographs(file), "End of the certificate"]),
         ],
         banner=[facts(_head(file)), RELATES],
     )
@@ -78,9 +82,11 @@ def _conditions(file: BudgetFile) -> Table:
     return Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
 
 
-def photographs(file: BudgetFile) -> Table:
+def photographs(file: BudgetFile) -> list[Block]:
     """Returns the photographs with their hashes."""
-    return Table(["<photograph", "<SHA-256"], list(file.run.photographs_sha256.items()), css="text")
+    found, every = file.run.photographs_sha256, sum(each.images for each in file.views)
+    said = f"{len(found)} of {every} photographs, as they were in their folder when this certificate was made"
+    return [said, Table(["<photograph", "<SHA-256"], list(found.items()), css="text")]
 
 
 def drawings(file: BudgetFile) -> Block:
@@ -94,44 +100,50 @@ def drawings(file: BudgetFile) -> Block:
         for name, each in file.faces.items()
         if each.position_mm is not None
     }
-    figures = [plot(partial(_item, circles, poses), "The item: its faces with the axes of their frames", css="")]
+    middle = np.mean([np.mean(list(own.values()), axis=0) for own in circles.values()], axis=0)
+    # Z of a face leads out of the body or, of a printed one, into it; of one face alone, towards who looks at it.
+    out = {
+        face: -1.0 if (pose.translation - middle) @ pose.rotation[:, 2] < -SAME_PLANE_MM else 1.0
+        for face, pose in poses.items()
+    }
+    figures = [plot(partial(_item, circles, poses, out), "The item: its faces with the axes of their frames", css="")]
     for face, own in circles.items():
         xyz = dict(zip(own, poses[face].inverse() @ np.array(list(own.values())), strict=True))
-        out = float(np.sign((poses[face].translation - _middle(circles)) @ poses[face].rotation[:, 2])) or 1.0
-        figures.append(plot(partial(_face, xyz, out), f"Face {face}, seen from outside", css=""))
+        figures.append(plot(partial(_face, xyz, out[face]), f"Face {face}, seen from outside", css=""))
     return columns(*([figure] for figure in figures), css="columns thumbs")
 
 
-def _middle(circles: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
-    return np.mean([np.mean(list(own.values()), axis=0) for own in circles.values()], axis=0)
+def _outermost(xy: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.convexHull(xy.astype(np.float32), returnPoints=False), int).ravel()
 
 
 def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
-    """Draws the circles of a face in its own frame; ``out`` : -1 where its Z axis leads into the body, so that X is
-    drawn to the left."""
+    """Draws the circles of a face in its own frame; ``out`` : -1 where its Z axis leads into the body, so that Y is
+    drawn downwards."""
     drawing = Drawing(3.3, 2.6)
-    xy = np.array(list(xyz.values()))[:, :2] * [out, 1.0]
+    xy = np.array(list(xyz.values()))[:, :2] * [1.0, out]
     reach = 0.25 * float(np.ptp(np.vstack([xy, [[0, 0]]]), axis=0).max())
-    tips = reach * np.array([[out, 0.0], [0.0, 1.0]])
+    tips = reach * np.array([[1.0, 0.0], [0.0, out]])
     axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
     for tip, colour, name in zip(tips, AXIS_COLOURS, "XY", strict=False):
         axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
         axes.words(1.12 * tip[0], 1.12 * tip[1], name, colour=colour, size=11, weight="bold")
     axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
-    for (x, y), name in zip(xy, xyz, strict=True):
-        axes.words(x, y, name, (0, 11), size=10)
+    names = list(xyz)
+    for i in range(len(xy)) if len(xy) <= MOST_NAMES else _outermost(xy):
+        axes.words(xy[i, 0], xy[i, 1], names[i], (0, 11), size=10)
     return drawing
 
 
-def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid]) -> Drawing:
+def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid], out: dict[str, float]) -> Drawing:
     """Draws the faces with their frames from where most of them are seen; Y of the reference frame is up. Faces that
     look away are pale."""
-    drawing, middle = Drawing(3.3, 2.6), _middle(circles)
-    normals = {}
-    for face in circles:
-        normal = poses[face].rotation[:, 2]
-        normals[face] = normal * (np.sign((poses[face].translation - middle) @ normal) or 1.0)
-    turn, height = np.pi * (1 + 5**0.5) * np.arange(DIRECTIONS), np.linspace(-1, 1, DIRECTIONS)  # evenly on a sphere
+    drawing = Drawing(3.3, 2.6)
+    normals = {face: out[face] * poses[face].rotation[:, 2] for face in circles}
+    turn, height = (
+        np.pi * (1 + 5**0.5) * np.arange(DIRECTIONS),
+        np.linspace(-0.95, 0.95, DIRECTIONS),
+    )  # evenly on a sphere
     across = np.sqrt(1 - height**2)
     towards = np.column_stack([across * np.cos(turn), height, across * np.sin(turn)])
     facing = np.clip(towards @ np.array(list(normals.values())).T, 0, None)
@@ -140,13 +152,12 @@ def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid]) ->
     right /= np.linalg.norm(right)
     onto = np.array([right, np.cross(viewer, right)])
     places = {face: np.array(list(own.values())) @ onto.T for face, own in circles.items()}
-    reach = 0.16 * float(np.ptp(np.vstack(list(places.values())), axis=0).max())
-    axes = Axes.equal(
-        drawing, drawing.panels(left=14, right=14, top=14, bottom=14)[0], np.vstack(list(places.values()))
-    )
+    together = np.vstack(list(places.values()))
+    reach = 0.16 * float(np.ptp(together, axis=0).max())
+    axes = Axes.equal(drawing, drawing.panels(left=14, right=14, top=14, bottom=14)[0], together)
     for face in sorted(circles, key=lambda face: normals[face] @ viewer):
         seen, xy = normals[face] @ viewer > 0, places[face]
-        outline = xy[ConvexHull(xy).vertices] if len(xy) > 2 else xy
+        outline = xy[_outermost(xy)]
         ink = INK if seen else FAINT
         axes.lines([outline.T], AXIS if seen else FAINT, 1.0, fill="#eef2f6" if seen else "#ffffff")
         axes.marks(xy[:, 0], xy[:, 1], "ring", 4, ink)

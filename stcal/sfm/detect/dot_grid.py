@@ -69,7 +69,7 @@ def contradiction(
         return ""
     stated = board.pitch_mm / board.radius_mm
     for ratio in PITCHES:
-        other = replace(board, radius_mm=board.pitch_mm / ratio, corner=None, rings=())
+        other = replace(board, radius_mm=board.pitch_mm / ratio, corner=None, rings=(), unusual_size=True)
         for grid in find_boards(candidates, other, image_corners)[:1]:
             cells = board.flat(grid.numberings[0][:, ::-1].astype(float))
             slope = homography_jacobian(fit_homography(cells, candidates.xy[grid.rows]), cells)

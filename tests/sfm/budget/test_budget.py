@@ -2,26 +2,31 @@
 
 import json
 import re
+from base64 import b64decode
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from stcal.boards.board_file import board_toml, load_board
 from stcal.design import KnownDistance, ScaleReference, StatedSize
 from stcal.errors import StcalError
+from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.report import document as pdf
+from stcal.report.document import html
 from stcal.report.text import significant
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.budget import combine
 from stcal.sfm.budget.budget_file import SHARED, BudgetFile, _unusual, against_run, against_stated
 from stcal.sfm.budget.budget_page import budget_report
 from stcal.sfm.budget.budget_tables import as_exact
-from stcal.sfm.budget.certificate import REQUIRED
+from stcal.sfm.budget.certificate import REQUIRED, drawings
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run, load_run, verify
@@ -93,7 +98,7 @@ def test_contributions_add_up_as_squares(saved, plain):
         assert min(row.contributions.values()) >= 0
         assert np.hypot.reduce(list(row.contributions.values())) == pytest.approx(row.standard)
         # Student's k for 95.45 %; up to 99.3 % for three numbers alike; of 100 000 draws.
-        assert row.expanded == pytest.approx(student.ppf(0.97725, row.freedom) * row.standard, rel=1e-5)
+        assert row.expanded == pytest.approx(student.ppf(norm.cdf(2), row.freedom) * row.standard)
         assert 0.952 < row.coverage < 0.995
 
 
@@ -375,7 +380,7 @@ def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,le
         length = float(np.linalg.norm(plain.joint.xyz_model[i] - plain.joint.xyz_model[j]))
         own = next(r for r in plain.of_kind("distance") if r.measurand.circles == (a, b))
         u = np.hypot(own.standard, sigma_mm)
-        k = student.ppf(0.977249868, own.freedom * (u / own.standard) ** 4)
+        k = student.ppf(norm.cdf(2), own.freedom * (u / own.standard) ** 4)
         cells = [a, b, f"{length - off_u * k * u:.9f}", str(sigma_mm)]
         lines.append(",".join(cells[: head.count(",") + 1]))
     path.write_text("\n".join(lines) + "\n")
@@ -406,15 +411,16 @@ def test_lengths_without_sigma_are_exact(plain, tmp_path):
 
 
 def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, plain, tmp_path):
-    """U of the difference is √2 that of one run; a pitch that both share leaves it as it is, another board's does
-    not."""
+    """u of the difference is √2 that of one run, with twice the degrees of freedom; a pitch that both share leaves it
+    as it is, another board's does not."""
     alike = against_run(plain, plain, saved.folder, (saved.board_design, saved.board_design))
     assert alike.agrees
     assert "cannot be seen here" in alike.notes[0]
     longest = plain.of_kind("distance")[0]
     assert alike.lengths[0].circles == longest.measurand.circles
     assert alike.lengths[0].error_um == 0
-    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * np.sqrt(2) * longest.expanded, rel=1e-3)
+    k = student.ppf(norm.cdf(2), 2 * longest.freedom)
+    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * k * np.sqrt(2) * longest.standard)
     path = tmp_path / "lab.toml"
     path.write_text(PITCH)
     stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
@@ -560,3 +566,23 @@ def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():
     assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
     assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
     assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]
+
+
+@pytest.mark.parametrize("of", ["many points", "edge on", "one plane"])
+def test_a_drawing_of_any_item_has_all_its_faces(of):
+    """Faces of Z into the body have Y downwards; of many points the outermost are named."""
+    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0), np.zeros(1)), -1).reshape(-1, 3)
+    turns = {"many points": [0, 0.5], "edge on": [0, 1.0], "one plane": [0]}[of]
+    circles, faces = {}, {}
+    for name, turn in zip("12", turns, strict=False):
+        pose = Rigid(Rotation.from_rotvec([np.pi * turn, 0, 0]), [0, 0, 20.0 * turn])
+        circles |= {f"{name}:{i}": {"position_mm": xyz} for i, xyz in enumerate((pose @ grid).tolist())}
+        turned = pose.as_scipy().as_rotvec(degrees=True).tolist()
+        faces[name] = SimpleNamespace(position_mm=pose.translation.tolist(), rotation_vector_deg=turned)
+    del faces["1"]
+    points = {label: SimpleNamespace(**each) for label, each in circles.items()}
+    drawn = html(drawings(SimpleNamespace(circles=points, faces=faces, reference_face="1")))
+    pictures = [b64decode(each).decode() for each in re.findall(r"base64,([^\"]+)", drawn)]
+    assert len(pictures) == 1 + len(turns)
+    assert "nan" not in "".join(pictures)
+    assert [f">{i}<" in pictures[1] for i in (0, 8, 40, 72, 80)] == [True, True, False, True, True]

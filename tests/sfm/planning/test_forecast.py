@@ -170,7 +170,7 @@ def test_what_a_rim_tells_is_the_integral_around_it(tilt_deg):
         np.zeros((4, 2)), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)),
     )  # fmt: skip
     found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
-    np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
 
 
 def test_centre_noise_is_found_again(exact):
