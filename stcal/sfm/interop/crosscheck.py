@@ -34,12 +34,13 @@ from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_mo
 from stcal.sfm.report.judgement import with_judgement
 from stcal.sfm.runs.comparisons import (
     CameraDifference,
-    Compared,
     Crosscheck,
     FaceDifference,
     FacesCompared,
     ImagesRegistered,
+    MappingCompared,
     ResidualRms,
+    ResultCompared,
     Tolerances,
     allowed_text,
 )
@@ -430,11 +431,11 @@ def _off(difference: np.ndarray) -> tuple[float, float]:
     return MICRO * shift, MICRO * turn
 
 
-def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> Compared:
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> MappingCompared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    return Compared(
+    return MappingCompared(
         faces=face_differences(target, run, faces),
         circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
         circles_sigmas={
@@ -522,7 +523,9 @@ def comparison_text(check: Crosscheck) -> str:
     return "\n".join([*check.notes, *lines])
 
 
-def _differences(images: ImagesRegistered, mapping: Compared, result: Compared, limits: Tolerances) -> list[str]:
+def _differences(
+    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
+) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:

@@ -240,7 +240,7 @@ class ResultCompared(FacesCompared):
     circles_sigmas: dict[ByLabel, float] = Field(default={})
 
 
-class Compared(ResultCompared):
+class MappingCompared(ResultCompared):
     """Differences of two results; the keys that were not given are not in the file."""
 
     cameras: list[CameraDifference] = Field(default=[])
@@ -263,7 +263,7 @@ class Crosscheck(Part):
     residual_rms_px: ResidualRms = Field(
         description="per coordinate, of the `native` model, of `pycolmap`'s, and of the `run`'s final one"
     )
-    mapping: Compared = Field(
+    mapping: MappingCompared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
         "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
         "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
