@@ -2,8 +2,8 @@
 
 from functools import partial
 
-import cv2
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
@@ -114,7 +114,10 @@ def drawings(file: BudgetFile) -> Block:
 
 
 def _outermost(xy: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.convexHull(xy.astype(np.float32), returnPoints=False), int).ravel()
+    try:
+        return ConvexHull(xy).vertices
+    except QhullError:  # a line
+        return np.arange(len(xy))
 
 
 def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
