@@ -43,12 +43,12 @@ from stcal.io.images import (
     without_excluded,
 )
 from stcal.labels import parse_label, parse_labels
-from stcal.sfm.data.group_model import Centres
+from stcal.sfm.data.group_model import Centres, Note
 from stcal.sfm.detect.candidates import BoardSighting, EllipseOptions, FaceSighting, ImageDetection
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 
-CACHE_VERSION = 11
+CACHE_VERSION = 12
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 PHOTOGRAPHS = "the photographs"  # where a camera that was found is from, for messages
@@ -274,7 +274,8 @@ def look_again(
             paths.append(path)
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
-            keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": look.missed})
+            missed = {a: {"words": n.words, "code": n.code, "remedy": n.remedy} for a, n in look.missed.items()}
+            keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": missed})
             looks[pending[k][0].name] = look
     return looks
 
@@ -285,7 +286,9 @@ def _look_again(file: ImageFile, camera: Camera, *searched) -> SecondLook | None
 
 
 def _stored_look(stored, meta) -> SecondLook:
-    missed = {parse_label(label): reason for label, reason in meta["missed"].items()}
+    missed = {
+        parse_label(label): Note(words, code, "", remedy) for label, (words, code, remedy) in meta["missed"].items()
+    }
     return SecondLook(parse_labels(meta["labels"]), _part(stored, "centres", 0, Centres), missed)
 
 

@@ -81,7 +81,7 @@ class LabelledImage:
         more = labelled_image(self.observations.name, self.observations.group, labels, centres)
         return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
 
-    def without(self, reasons: Mapping[Label, str]) -> "LabelledImage":
+    def without(self, reasons: Mapping[Label, Note]) -> "LabelledImage":
         """Returns the image without circles that contradict others, with notes on the ``reasons``."""
         if not reasons:
             return self

@@ -15,7 +15,7 @@ from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.group_model import Centres, ImageObservations
+from stcal.sfm.data.group_model import Centres, ImageObservations, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
 from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
@@ -33,6 +33,8 @@ MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
 """Smallest contrast, in σ of a pixel's noise around the rim. A single pixel of clutter or noise has less."""
+CUT = "cut off"
+"""Code of the reason that a circle is smaller than expected in one direction."""
 REMEDIES = {
     "small": "come closer, use a longer lens, or give a smaller --min-diameter",
     "large": "step back, use a shorter lens, or give a larger --max-diameter",
@@ -41,6 +43,7 @@ REMEDIES = {
     "sigma": "light it, expose longer, or come closer",
     "blur": "focus on it, close the aperture, or hold the camera still",
     "place": "something else is there, or a part of the circle: uncover it; is its place in the target file right?",
+    CUT: "uncover it; is its radius in the target file right?",
     "shape": "something else is there, or a part of the circle: uncover it; is its radius in the target file right?",
     "face": "show one whole with the white about it, less obliquely, sharper, closer, evenly lit; cover other dots",
     "board": "show more of its dots and those between them, sharper, evenly lit; cover what is like a dot",
@@ -69,11 +72,11 @@ class PredictedCircles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondLook:
-    """Result of a second look: the measured circles, and reasons of the others."""
+    """Result of a second look: the measured circles, and reasons of the others with their kinds as codes."""
 
     labels: tuple[Label, ...]
     centres: Centres
-    missed: dict[Label, str]
+    missed: dict[Label, Note]
 
 
 def predict_circles(
@@ -103,7 +106,7 @@ def predict_circles(
     return PredictedCircles(tuple(labels), np.concatenate(centre), np.concatenate(shape), tuple(polarity), wanted)
 
 
-def contradictions(predicted: PredictedCircles, observed: ImageObservations, camera: Camera) -> dict[Label, str]:
+def contradictions(predicted: PredictedCircles, observed: ImageObservations, camera: Camera) -> dict[Label, Note]:
     """Returns circles, with reasons, whose size contradicts others of their plane: partly hidden, or something else. A
     common size ratio of a plane's circles is attributed to the design and accepted."""
     place = {label: i for i, label in enumerate(predicted.labels)}
@@ -112,14 +115,15 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     shapes_px = predicted.shape_px[np.array([place[label] for label in labels], int)]
     widest, narrowest = _stretch(shapes_px, observed.select(rows), camera)
     planes = np.array([label.plane for label in labels], str)
-    reasons: dict[Label, str] = {}
+    reasons: dict[Label, Note] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
-            if reason := _disagreement(shapes_px[k], 0.0, stretch, blur)[1]:
-                reasons[labels[k]] = reason
+            kind, reason = _disagreement(shapes_px[k], 0.0, stretch, blur)
+            if reason:
+                reasons[labels[k]] = Note(reason, kind)
     return reasons
 
 
@@ -137,6 +141,8 @@ def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, flo
         return "blur", f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
     if off_px > allowed_px:
         return "place", f"{off_px:.3g} px from its place, {allowed_px:.3g} allowed"
+    if most > max(limit, stretch[0]) and stretch[0] > 1 / limit:
+        return CUT, f"cut off to {1 / most:.2g} of its size along one direction, {1 / limit:.2g} allowed"
     if most > limit:
         return "shape", f"{most:.3g} times its size along one direction, {limit:.3g} allowed"
     return "", ""
@@ -151,8 +157,8 @@ def measure_predicted(
     diameter, missed = 2 * everything.radius_px(), {}
     admitted = (diameter >= low) & (diameter <= high)
     for i in np.flatnonzero(predicted.wanted & ~admitted):
-        remedy = REMEDIES["small" if diameter[i] < low else "large"]
-        missed[predicted.labels[i]] = f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; {remedy}"
+        kind, reason = "small" if diameter[i] < low else "large", f"{diameter[i]:.1f} px across"
+        missed[predicted.labels[i]] = Note(f"{reason}, {low:g} to {high:g} px asked for", kind, remedy=REMEDIES[kind])
     wanted = np.flatnonzero(predicted.wanted & admitted)
     expected = everything.select(wanted)
     found = measure_centres(grey_fine(image), camera, expected, everything)
@@ -170,7 +176,7 @@ def measure_predicted(
             if not reason and sigma[k] > MAX_SIGMA_PX:
                 kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
         if reason:
-            missed[predicted.labels[i]] = f"{reason}; {REMEDIES[kind]}"
+            missed[predicted.labels[i]] = Note(reason, kind, remedy=REMEDIES[kind])
         else:
             accepted.append(k)
     labels = tuple(predicted.labels[i] for i in wanted[accepted])
@@ -187,14 +193,14 @@ MISSED = "should be in view and not measured"
 CONTRADICTED = "left out, partly hidden or something else"
 
 
-def notes_by_plane(reasons: Mapping[Label, str], what: str) -> list[str]:
-    """Returns one note for each face, and one for the board, on circles with the reason of the first one; ``what`` :
-    :data:`MISSED` or :data:`CONTRADICTED`."""
+def notes_by_plane(reasons: Mapping[Label, Note], what: str) -> list[Note]:
+    """Returns one note for each face, and one for the board, on circles with the reason of the first one and its code;
+    ``what`` : :data:`MISSED` or :data:`CONTRADICTED`."""
     notes = []
     for plane in dict.fromkeys(label.plane for label in reasons):
         first, *more = [label for label in reasons if label.plane == plane]
         place, others = "board" if plane == BOARD else f"face {plane}", f" and {len(more)} more" if more else ""
-        notes.append(f"{place}: {first}{others} {what}; {first}: {reasons[first]}")
+        notes.append(Note(f"{place}: {first}{others} {what}; {first}: {reasons[first]}", reasons[first].code))
     return notes
 
 
@@ -257,7 +263,7 @@ def outlying_circles(
     images: Sequence[ImageObservations],
     patterns: Mapping[str, Pattern],
     focal_px: float,
-) -> tuple[Poses, Poses, list[dict[Label, str]]]:
+) -> tuple[Poses, Poses, list[dict[Label, Note]]]:
     """Finds circles that contradict the others of their group; returns the poses of images and planes adjusted without
     them, the given ones if there are none, and the reasons by label for each image."""
     design = {
@@ -306,7 +312,7 @@ def outlying_circles(
             if alone[worst]:
                 reason = f"{labels[worst]} is {reason}, and no other image of the group tells which circles are right"
             for k in own if alone[worst] else [worst]:
-                keep[k], found[i][labels[k]] = False, reason
+                keep[k], found[i][labels[k]] = False, Note(reason, "place")
     return *(start if keep.all() else poses), found
 
 

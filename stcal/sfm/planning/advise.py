@@ -22,12 +22,8 @@ from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import (
-    BLUR_PX,
-    CONTRAST,
     FORECAST,
-    IMAGE_NOISE,
     MICRO,
-    PRACTICE,
     CentreNoise,
     Forecast,
     ForecastPart,
@@ -39,6 +35,7 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
     worst_of,
 )
+from stcal.sfm.runs.conditions import BLUR_PX, CONTRAST, IMAGE_NOISE, PRACTICE
 from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
 from stcal.synthetic.placement import look_along
 from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, SceneOptions, image_circles, made_group

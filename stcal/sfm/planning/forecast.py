@@ -25,6 +25,7 @@ from stcal.sfm.adjust.joint import Adjusted, Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.group_model import ImageObservations, MetricModel, assemble, by_group
+from stcal.sfm.runs.conditions import BLUR_PX, CONTRAST, IMAGE_NOISE, PRACTICE
 from stcal.synthetic.scene import Scene, image_circles
 
 
@@ -89,12 +90,6 @@ def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list
     return models
 
 
-IMAGE_NOISE = 0.01  # standard deviation of the grey values, as a fraction of full scale
-CONTRAST = 0.7  # contrast between circle and surroundings, as a fraction of full scale
-BLUR_PX = 0.76  # blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px
-PRACTICE = 1.3
-"""Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
-gradients, quantisation and neighbouring edges."""
 CORNER_SIGMA_PX = 0.02  # σ of a corner of a tag or square in a good photograph, of cells 6 to 14 px wide
 ONE_PLATE = 0.99  # share of the board's variance that all groups have in common if the same plate is in all of them
 ENOUGH = 10_000  # number of observations from which the parameters of their noise are estimated

@@ -64,6 +64,27 @@ SOURCES = {
     "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
 }
 """Name and remedy of each source of σ beside the photographs."""
+MATTERS = 1.25
+"""Factor on σ from which a condition of the photographs is named."""
+HARMS = 3.0
+"""The same from which it is to be changed."""
+CONDITIONS = {
+    "number": ("{:.0f} images in a group, 10 are usual", "take more photographs"),
+    "distance": ("faces and board cover {:.0f} % of a picture's diagonal, 70 % if they fill it", "go nearer"),
+    "angles": (
+        "the cameras of a group stand within {:.0f}° as seen from the target, within 80° is usual",
+        "photograph from farther to the sides, from above and below",
+    ),
+    "blur": (
+        "rims are blurred by {:.1f} px (one σ), sharp ones by 0.8 px",
+        "focus on the middle of the target and close the aperture",
+    ),
+    "light": (
+        "a pixel's noise is {:.1f} % of the contrast, 1.4 % is usual",
+        "give more light, or expose longer at a lower gain",
+    ),
+}
+"""What is said of each condition of the photographs with its measured value, and the remedy."""
 
 
 class Judgement(Part):
@@ -380,12 +401,26 @@ class _Run:
         if not photographs:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
         fewer, share = math.sqrt(max(sigma**2 - photographs * (1 - 1 / MORE), 0.0)), 100 * photographs / sigma**2
+        limit, remedy = self._by_conditions()
         centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
-            f"{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands out.",
-            f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these "
-            f"{number(sigma, 1)} µm, and {advice}",
+            f"{limit}{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands "
+            "out.",
+            f"{remedy} four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} µm, and "
+            f"{advice}",
         )
+
+    def _by_conditions(self) -> tuple[str, str]:
+        """Returns what of the photographs makes σ larger than usual, and the beginning of the remedy."""
+        conditions = self.report.get("conditions", {})
+        worst = max(conditions, key=lambda name: conditions[name][1], default="")
+        value, factor = conditions.get(worst, (0.0, 1.0))
+        if factor < MATTERS:
+            good = [name for name in CONDITIONS if name in conditions and name != "number"]
+            return f"Number alone: {join(good)} are good. " if good else "", "Nothing has to be done;"
+        words, remedy = CONDITIONS[worst]
+        limit = f"{worst.capitalize()}: {words.format(value)}; σ are up to {factor:.1f} times larger by it. "
+        return limit, f"{sentence(remedy)} Or" if factor > HARMS else f"Nothing has to be done. To be better, {remedy};"
 
     def further(self, verdict: Use) -> list[str]:
         """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""

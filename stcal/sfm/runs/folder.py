@@ -53,11 +53,11 @@ from stcal.report.document import (
 )
 from stcal.report.text import join, wrapped
 from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.data.group_model import detections_csv
+from stcal.sfm.data.group_model import Note, detections_csv
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
-from stcal.sfm.detect.predict import REMEDIES
+from stcal.sfm.detect.predict import CUT, REMEDIES
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
@@ -434,6 +434,9 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
             alike.setdefault(kind, []).append(note)
     most = max(alike.values(), key=len, default=[])
     reason = f"; in {len(most)} of {count}: {most[0]}" if most else ""
+    cut = sum(any(isinstance(note, Note) and note.code == CUT for note in each.notes) for each in labelled)
+    if cut > 1 and 2 * cut >= faces:
+        reason = f"; circles cut off on one side in {cut} of {count} images: behind a rim?{reason}"
     return f"a face in {faces} of {count} images, the board in {dots}{reason}"
 
 

@@ -21,6 +21,7 @@ from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.comparisons import Comparison, Crosscheck
+from stcal.sfm.runs.conditions import conditions
 from stcal.sfm.runs.saved import ImageRow, RunResult
 from stcal.sfm.runs.stages import GroupSolution
 
@@ -159,6 +160,13 @@ class ReportFile(ResultFile):
         "there, `blur_px` (σ); `shift_px`: largest correction of a centre for blur that varies across its circle, 0 "
         "where none is needed; `note`",
     )
+    conditions: dict[str, tuple[float, float]] = Field(
+        {},
+        description="what of the photographs limits σ: `number` of images of a group; `distance` as the share of a "
+        "picture's diagonal that faces and board cover, in %; `angles` between the outermost cameras of a group, in °; "
+        "`blur` of the rims, σ in px; `light` as a pixel's noise in % of the contrast; each with the factor by which "
+        "the σ of faces are larger, at most, than in good photographs (docs/howto/photograph.md)",
+    )
     scene: Space = Field(
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
         "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
@@ -207,6 +215,7 @@ def report_of(result: RunResult) -> ReportFile:
             for i, image in enumerate(result.observations, start=1)
         ],
         "focus": [image.focus for image in result.labelled if image.focus is not None],
+        "conditions": conditions(result),
         "scene": _scene(result),
     }
     return ReportFile.model_validate(content | ({} if result.comparison is None else {"comparison": result.comparison}))

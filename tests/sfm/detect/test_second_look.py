@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.candidates import EllipseOptions
-from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, contradictions, measure_predicted
+from stcal.sfm.detect.predict import CUT, REMEDIES, PredictedCircles, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet
 
 CAMERA = Camera(1600, 1200, [2500.0, 2400.0], [799.5, 599.5], [-0.12, 0.08, 1e-3, -5e-4, 0, 0, 0, 0])
@@ -70,8 +70,9 @@ def test_what_is_where_and_as_it_is_predicted_stays():
 
 @pytest.mark.parametrize(
     ("change", "out"),
-    [(lambda look: look.cut(2, 0.2), True), (lambda look: look.cut(2, 0.4), True)]
-    + [(lambda look, f=f: look.enlarge(2, f), out) for f, out in ((1.1, 0), (0.9, 0), (1.3, 1), (0.75, 1), (2.0, 1))],
+    [(lambda look: look.cut(2, 0.2), CUT), (lambda look: look.cut(2, 0.4), CUT)]
+    + [(lambda look, f=f: look.enlarge(2, f), "") for f in (1.1, 0.9)]
+    + [(lambda look, f=f: look.enlarge(2, f), "shape") for f in (1.3, 0.75, 2.0)],
 )
 def test_a_circle_cut_or_of_another_size_goes_out_with_its_reason(change, out):
     """15 % along any direction are allowed, and half a pixel at each end of what may be 7 px long: 23 %. A fifth of the
@@ -80,8 +81,10 @@ def test_a_circle_cut_or_of_another_size_goes_out_with_its_reason(change, out):
     change(look)
     look.cut(15, 0.3)
     found = look.taken_out()
-    assert list(found) == [look.labels[2]] * bool(out) + [look.labels[15]]
-    assert all("times its size along one direction" in reason for reason in found.values())
+    assert {label: reason.code for label, reason in found.items()} == ({look.labels[2]: out} if out else {}) | {
+        look.labels[15]: CUT
+    }
+    assert all("its size along one direction" in reason for reason in found.values())
 
 
 def test_a_plane_whose_circles_are_all_larger_stays_and_excuses_no_other():

@@ -61,6 +61,21 @@ def test_all_is_well():
     assert "2.2 µm of these 3.0 µm" in found.next  # √(0.36 + 0.64/4) · 3.04
 
 
+@pytest.mark.parametrize("name", ["number", "distance", "angles", "blur", "light"])
+def test_what_makes_sigma_larger_is_named_in_the_words_of_a_photographer(name):
+    good = dict.fromkeys(["number", "distance", "angles", "blur", "light"], (7.3, 1.1))
+    found = judgement_of(report() | {"conditions": good})
+    assert found.limit.startswith("Number alone: distance, angles, blur, light are good. The centring of circles")
+    assert found.next.startswith("Nothing has to be done; four times the images")
+    found = judgement_of(report() | {"conditions": good | {name: (7.3, 2.04)}})
+    assert found.limit.startswith(f"{name.capitalize()}: ")
+    assert "; σ are up to 2.0 times larger by it. The centring of circles" in found.limit
+    assert found.next.startswith("Nothing has to be done. To be better, ")
+    found = judgement_of(report() | {"conditions": good | {name: (7.3, 8.0)}})
+    assert "Nothing has to be done" not in found.next
+    assert ". Or four times the images" in found.next
+
+
 WHOLE_SET = check(CAUSE, "failed", remedy="look") | {"title": OF_WHOLE_SET + "Check b"}
 
 

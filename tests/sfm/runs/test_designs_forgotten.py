@@ -6,8 +6,13 @@ import pytest
 
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_target
+from stcal.errors import StcalError
 from stcal.sfm.detect.face_patterns import likeness_notes
+from stcal.sfm.pipeline import run
+from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.designs import second_design
+from stcal.synthetic.render import RenderOptions
+from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import INPUT, assert_error
 
 pytestmark = pytest.mark.usefixtures("no_page")
@@ -117,3 +122,11 @@ def test_the_parent_of_the_images_is_told_from_them(stcal_sfm, small_set):
     assert "group images: 1 usable image (images/stray.jpg), 2 needed" in err
     assert "images/12: a folder inside a group; images lie in <group>/ directly; it holds images" in err
     assert f"did you mean {small.images}?" in err
+
+
+@pytest.mark.slow
+def test_circles_cut_by_a_rim_are_named_where_a_run_fails(tmp_path):
+    scene = make_scene(SceneOptions(seed=3, width=1728, height=1152, images_per_group=4, groups=(("2", "3"),)))
+    write_dataset(tmp_path, scene, RenderOptions(rim_mm=3.3), workers=1)
+    with pytest.raises(StcalError, match=r"; circles cut off on one side in 3 of 4 images: behind a rim\?"):
+        run(tmp_path / "images", tmp_path / "cameras.txt", tmp_path / "out", tmp_path / "target.toml")
