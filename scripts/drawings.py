@@ -4,8 +4,8 @@
 
 `eccentricity` : a circle seen obliquely, the centre of its ellipse and the image of its own centre, and how far they
 are apart; `residuals` : the same simulated labels adjusted with and without the correction, residuals beside errors;
-`chain` : groups of photographs that link the faces; `folders` : the folders of the package by what they import, and the
-way of a photograph through `stcal/sfm`.
+`chain` : groups of photographs that link the faces; `labelling` : how circles get their labels; `folders` : the folders
+of the package by what they import, and the way of a photograph through `stcal/sfm`.
 """
 
 import ast
@@ -30,8 +30,12 @@ FOCAL_PX = 24 / 36 * 5184
 """Of a 24 mm lens over 5184 px."""
 NOISE_PX = 0.01
 LAYERS = (
-    ("errors", "cross_validation", "geometry"),
-    ("labels", "design", "lookalikes", "io", "boards", "report"),
+    ("errors", "explain", "cross_validation", "parallel"),
+    ("geometry",),
+    ("adjust",),
+    ("labels", "design", "lookalikes"),
+    ("io",),
+    ("boards", "report"),
     ("synthetic", "drawing"),
     ("sfm", "robot", "register", "handeye", "locate"),
     ("workflows",),
@@ -141,6 +145,29 @@ def chain() -> Drawing:
     return drawing
 
 
+def labelling() -> Drawing:
+    """The four steps of ``stcal.sfm.detect.labelling``: what each decides, and what it leaves out with a note."""
+    steps = {
+        "one image": (("what each pattern", "may be"), ("a pattern seen twice:", "one is a reflection")),
+        "its group": (("one arrangement", "of faces and board"), ("no reading fits it,", "or several do")),
+        "all groups": (("one arrangement", "of the faces"), ("a face elsewhere than", "in most groups")),
+        "second look": (("circles that must be", "in view are measured"), ("hidden, or of another", "size or place")),
+    }
+    drawing = Drawing(8.4, 2.4)
+    axes = Axes(drawing, (0, 0, drawing.width, drawing.height), (-2.2, 2.2), (-2.2, 1.1))
+    at = axes.at(1.12 * (np.arange(len(steps)) - 1.5), 0.7)
+    for where, (name, (decided, left_out)) in zip(at, steps.items(), strict=True):
+        boxed(drawing, where, name, "#e8f1f8", BLUE, BLUE)
+        for lines, under, colour in ((decided, 34, INK), (left_out, 96, RED)):
+            for k, line in enumerate(lines):
+                drawing.words((where[0], where[1] + under + 13 * k), line, 8.5, colour=colour)
+    beside, below, down = np.array([48.0, 0.0]), np.array([0.0, 54.0]), np.tile([0.0, 28.0], (len(at), 1))
+    drawing.lines(arrows(at[:-1] + beside, at[1:] - at[:-1] - 2 * beside, 1.2), fill=BLUE)
+    drawing.lines(arrows(at + below, down, 1.2), fill=RED)
+    axes.words(0, -1.85, "red: left out, with a note; what stays has one label in all photographs", size=8.5)
+    return drawing
+
+
 def imports() -> set[tuple[str, str]]:
     """Pairs of folders (or files) of stcal/, the first of which imports the second."""
     found = set()
@@ -155,7 +182,7 @@ def imports() -> set[tuple[str, str]]:
 
 def folders() -> Drawing:
     """Layers from what all rest on, below, to the commands, above; a line for each import between folders."""
-    drawing = Drawing(8.4, 5.2)
+    drawing = Drawing(8.4, 6.8)
     top = 1.25 * len(LAYERS)
     axes = Axes(drawing, (0, 0, drawing.width, drawing.height), (-6.2, 6.2), (-1.0, top + 0.8))
     place = {
@@ -180,7 +207,7 @@ def folders() -> Drawing:
     return drawing
 
 
-DRAWINGS: dict[str, Callable] = {d.__name__: d for d in (eccentricity, residuals, chain, folders)}
+DRAWINGS: dict[str, Callable] = {d.__name__: d for d in (eccentricity, residuals, chain, labelling, folders)}
 
 
 @script({"names": list(DRAWINGS)}, out=ROOT / "docs" / "pictures")
