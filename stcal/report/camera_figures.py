@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
-from stcal.report.svg import SMALL, VIRIDIS, Axes, Drawing
+from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import join, number, text_table
 
 POOR_PX = 0.05
@@ -115,4 +115,31 @@ def field_figure(pixels: np.ndarray, moved: np.ndarray, what: str = "moved by th
     axes.frame("x, px", "y, px")
     drawing.scale((box[2] + 14, box[1] + 16, box[2] + 24, box[3] - 16), 0, most, "px", VIRIDIS)
     drawing.words(((box[0] + box[2]) / 2, 9), what, SMALL + 1)
+    return drawing
+
+
+LEAST = 5  # number of residuals in a cell whose mean is drawn
+
+
+def mean_residuals_figure(
+    mean_px: np.ndarray, count: np.ndarray, cells: tuple[int, int], size_px: tuple[int, int]
+) -> Drawing:
+    """Return a figure of the mean residuals (c, 2) in ``cells`` of an image, in x and y, with their numbers (c,); the
+    cells are column by column. Model errors are alike in neighbouring cells."""
+    (width, height), size = size_px, np.divide(size_px, cells)
+    drawing = Drawing(4.3, 0.65 + 3.55 * height / width)
+    axes = Axes(drawing, drawing.panels(top=24)[0], (-0.5, width - 0.5), (height - 0.5, -0.5))
+    enough = np.flatnonzero(count >= LEAST)
+    middle = (np.stack(np.divmod(enough, cells[1]), axis=1) + 0.5) * size
+    lengths = np.linalg.norm(mean_px[enough], axis=1)
+    longest = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
+    times = 0.6 * size.min() / longest if longest else 1.0
+    for (x, y), number_of in zip(middle, count[enough], strict=True):
+        axes.words(x, y + 0.36 * size[1], f"{number_of:.0f}", size=5, colour="#8b97a3")
+    axes.arrows(middle, times * mean_px[enough], 1.2, INK)
+    axes.frame("x, px", "y, px")
+    bar_px, right = round_below(longest), axes.box[2]
+    bar = times * bar_px * (right - axes.box[0]) / width
+    drawing.lines([np.array([[right - bar, 12], [right, 12]])], INK, 2)
+    drawing.words((right - bar - 5, 12), f"{bar_px:g} px; below, the number of residuals", SMALL, "end")
     return drawing

@@ -29,7 +29,7 @@ def page(tmp_path_factory):
     report["images"] = [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(NAMES, 1)]
     report["residuals_by_image"] = [by_image(n) | {"rms_px": r} for n, r in zip(NAMES, RMS, strict=True)]
     centres = np.random.default_rng(1).uniform((0, 0), (2592, 1728), (12, 2))
-    residuals = {name: np.column_stack([centres, np.full((12, 2), 0.01)]) for name in NAMES}
+    residuals = {name: np.column_stack([centres, np.full((12, 2), 0.01), np.ones((12, 2))]) for name in NAMES}
     file = tmp_path_factory.mktemp("page") / "report.html"
     file.write_text(report_html(report, dict.fromkeys(NAMES, jpeg()), residuals), encoding="utf-8")
     return file

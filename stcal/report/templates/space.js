@@ -44,13 +44,27 @@
       pen.clearRect(0, 0, ...size);
       const to = project(size);
       placed = data.filter((each) => view.part === "all" || each.target).map((each) => ({ each, at: each.xyz.map(to) }));
-      for (const item of placed) item.depth = item.at.reduce((sum, p) => sum + p[2], 0) / item.at.length;
-      placed.sort((one, two) => one.depth - two.depth);
-      for (const item of placed) paint(item.each, item.at);
+      // A body is convex: its faces that look away come first, then what lies behind it, then the others.
+      const away = new Set(placed.filter(({ each, at }) => each.kind === "sheet" && area(at) > 0).map(({ each }) => each.face));
+      for (const item of placed) {
+        const { face, kind } = item.each;
+        item.depth = item.at.reduce((sum, p) => sum + p[2], 0) / item.at.length;
+        item.pale = face !== undefined && away.has(face);
+        item.layer = face === undefined ? (item.depth < 0 ? 1 : 4) : item.pale ? 0 : kind === "sheet" ? 2 : 3;
+      }
+      placed.sort((one, two) => one.layer - two.layer || one.depth - two.depth);
+      for (const item of placed) paint(item.each, item.at, item.pale);
     }
 
-    function paint(each, at) {
+    // Twice the area of a polygon in the picture, negative where its corners run counterclockwise.
+    const area = (at) => at.reduce((sum, [x, y], i) => {
+      const [u, v] = at[(i + 1) % at.length];
+      return sum + x * v - u * y;
+    }, 0);
+
+    function paint(each, at, pale) {
       pen.strokeStyle = pen.fillStyle = each.colour;
+      pen.globalAlpha = pale ? 0.3 : 1;
       if (each.kind === "point") {
         pen.beginPath();
         pen.arc(at[0][0], at[0][1], each.size, 0, 7);
@@ -67,11 +81,14 @@
         pen.beginPath();
         at.forEach((p, i) => (i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])));
         pen.lineWidth = each.size || 1;
-        pen.globalAlpha = each.kind === "sheet" ? 0.18 : 1;
-        if (each.kind === "sheet") pen.fill();
-        else pen.stroke();
-        pen.globalAlpha = 1;
+        if (each.kind === "sheet") {
+          pen.closePath();
+          pen.fillStyle = pale ? "transparent" : "#e6ebf1";
+          pen.fill();
+        }
+        pen.stroke();
       }
+      pen.globalAlpha = 1;
     }
 
     function turn(azimuth, elevation) {

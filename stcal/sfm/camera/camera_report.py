@@ -11,9 +11,9 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, parameter_names
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.json import ByName, Matrix, Named, NamedReason, ResultFile
-from stcal.report.camera_figures import field_figure, moved_px
+from stcal.report.camera_figures import field_figure, mean_residuals_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
-from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
+from stcal.report.svg import VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.camera import calibrate
 from stcal.sfm.camera.calibrate import CameraCalibration, residual_rms_px
@@ -216,18 +216,8 @@ def sigma_map(result: CameraCalibration) -> Drawing:
 
 
 def residual_map(result: CameraCalibration) -> Drawing:
-    """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
-    camera = result.intrinsics.camera
-    axes = _image_axes(camera)
-    mean, weight = calibrate.mean_residuals(result.intrinsics)
-    size, count = np.array([camera.width, camera.height]) / calibrate.CELLS, weight.sum(0)
-    enough = count >= 3
-    mean = (weight[..., None] * mean).sum(0)[enough] / count[enough, None]
-    middle = (np.stack(np.divmod(np.flatnonzero(enough), calibrate.CELLS[1]), axis=1) + 0.5) * size
-    longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
-    times = round_below(0.7 * size.min() / longest) if longest else 1.0  # within the cells
-    axes.arrows(middle, times * mean, 1.2, INK)
-    axes.frame("x, px", "y, px")
-    said = f"enlarged {times:g} times; the longest is {longest:.4f} px"
-    axes.drawing.words(((axes.box[0] + axes.box[2]) / 2, 10), said, SMALL + 1)
-    return axes.drawing
+    """Returns a figure of mean residuals over cells of the image."""
+    camera, (mean, weight) = result.intrinsics.camera, calibrate.mean_residuals(result.intrinsics)
+    count = weight.sum(0)
+    mean = (weight[..., None] * mean).sum(0) / np.maximum(count, 1e-12)[:, None]
+    return mean_residuals_figure(mean, count, calibrate.CELLS, (camera.width, camera.height))

@@ -10,10 +10,11 @@ from itertools import chain, compress, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.labels import BOARD, dot_cells, parse_label, parse_labels
+from stcal.labels import BOARD, parse_label
 from stcal.report.document import (
     Block,
     Document,
+    Html,
     Section,
     Table,
     alarms,
@@ -33,23 +34,18 @@ from stcal.report.svg import (
     AXIS_COLOURS,
     COLOURS,
     INK,
-    RED_BLUE,
-    SMALL,
-    Axes,
-    Drawing,
-    arrows,
-    mixed_names,
     round_below,
 )
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
+from stcal.sfm.report.run_figures import board_residuals, by_photograph, halves, normalised_residuals, residual_field
 
 FIRST_IMAGES = 100  # number of rows and overlays that the page has room for
 LONGEST = 0.04  # length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width
 Residuals = np.ndarray
-"""Array (n, 4) of circles: centre x, y and residual x, y, px."""
+"""Array (n, 6) of circles: centre x, y and residual x, y, px; residual x, y over its σ."""
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
@@ -95,14 +91,13 @@ def report_html(
         if gone
         else "",
     ]
-    answers = macro("answers", judgement.answers(), tone_of(judgement.verdict))
     sections = [
         Section("Faces", _answer(report, colours)),
-        Section("May I use it?", [answers, *checks_section(report.get("checks", []))], name="use"),
+        Section("Checks", checks_section(report.get("checks", [])), name="use"),
         Section("How far to trust it", trust(report, judgement), name="trust"),
         Section("Faces in detail", _faces_in_detail(report), name="detail"),
         Section("Scale", _scale(report)),
-        Section("Residuals", _residuals(report, colours)),
+        Section("Residuals", _residuals(report, colours, residuals or {})),
         Section("Left out", _left_out(report)),
         *(Section(title, make(report[key]), name=key) for key, (title, make) in others.items() if key in report),
         Section("Settings", [Table(["<Setting", "<Value"], settings(report), css="text facts")]),
@@ -118,7 +113,7 @@ def report_html(
         CONTROL: not options["eccentricity"],
     }
     warning = [text for text, applies in warnings.items() if applies][:1]
-    banner = [alarms(warning), macro("answers", judgement.answers()[:1], tone_of(judgement.verdict))]
+    banner = [alarms(warning), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
@@ -234,8 +229,8 @@ def _scale(report: dict) -> list[Block]:
     ]
 
 
-def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
-    """Returns the residuals by image; and by label, face by face and board by board."""
+def _residuals(report: dict, colours: dict[str, str], residuals: Mapping[str, Residuals]) -> list[Block]:
+    """Returns the residuals in figures, by image, and by label: face by face and board by board."""
     target: dict[str, list] = {}
     board: dict[str, list] = {}
     for row in report["residuals_by_label"]:
@@ -256,12 +251,24 @@ def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
     table = Table(["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"], images)
     return [
         f"RMS is per axis, max is the length of the largest vector{named}",
+        plots(*_residual_plots(report, residuals)),
         subheading("By image"),
         fold(f"All {len(images)} images", table) if len(images) > FIRST_IMAGES else table,
         subheading("By label"),
         _by_label(target),
         fold("Dots of the board, by group", _by_label(board)),
     ]
+
+
+def _residual_plots(report: dict, residuals: Mapping[str, Residuals]) -> Iterable[Html]:
+    by_image, every = report["residuals_by_image"], np.concatenate([np.zeros((0, 6)), *residuals.values()])
+    if len(every):
+        size_px, of = tuple(report["camera"]["size_px"]), f"of {len(residuals)} photographs"
+        yield plot(partial(residual_field, every, size_px), f"Mean residuals over the image, {of}", css="")
+    if by_image:
+        yield plot(partial(by_photograph, by_image), "RMS of each photograph; the largest is named", css="")
+    if len(every):
+        yield plot(partial(normalised_residuals, every[:, 4:].ravel()), f"Residuals over their σ, {of}", css="")
 
 
 def _by_label(planes: dict[str, list]) -> Block:
@@ -414,10 +421,12 @@ def checks_section(checks_of_report: list[dict]) -> list[Block]:
         for check in checks
         for m in check.measured
     ]
+    halved = next((check for check in checks_of_report if check["key"] == "halves" and check["measured"]), None)
     return [
         f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
         "images or points it tested",
         Table(heads, open_, css="text"),
+        plots(plot(partial(halves, halved["measured"]), halved["title"], css="")) if halved else "",
         fold(
             f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
         ),
@@ -438,34 +447,6 @@ def published_section(comparison: dict) -> list[Block]:
         Table(heads, rows),
         alarms([f"{row['method']}: {row['reason']}." for row in comparison["rows"] if row["reason"]]),
     ]
-
-
-def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:
-    """Draws residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
-    ``residuals_um``: (3,) by ``board:row:column``; ``reach_um``: drawn as long as the pitch; ``height_um``: end of the
-    colour scale."""
-    cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
-    vectors = _points(residuals_um.values())
-    per_cell = reach_um if reach_um > 0 else 1.0
-    height_um = height_um if height_um > 0 else 1.0
-    bar_um = round_below(per_cell)
-    drawing = Drawing(4.3, 3.5)
-    last = cells.max(0) if len(cells) else np.zeros(2)
-    pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
-    box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
-    axes = Axes(drawing, box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
-    marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
-    rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
-    axes.frame("column", "row", "", columns, rows, SMALL)
-    places = axes.at(cells[:, 1], cells[:, 0])
-    colours = mixed_names((1 + vectors[:, 2] / height_um) / 2, RED_BLUE)
-    drawing.discs(places, min(2.75, 0.25 * pitch), colours, "#777777")
-    drawing.lines(arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
-    bar = axes.at([0, bar_um / per_cell], last[0] + 1.45)
-    drawing.lines([bar], INK, 2.5)
-    drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", SMALL + 1, "start")
-    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), -height_um, height_um, "z, µm", RED_BLUE)
-    return drawing
 
 
 def _points(places: Iterable) -> np.ndarray:
@@ -493,16 +474,18 @@ DIGITS = 2
 AXIS = 0.2  # length of the faces' axes, as a share of the target's extent
 CAMERA = 0.07  # depth of a camera's pyramid, as a share of the scene's extent
 SHEET = "#7f93a8"
+FLAT_MM = 0.1  # distance of a face from the middle of the circles within which there is no body, but one plane
 LEAST_UPRIGHT = 0.5  # length of the mean of the photographs' upward directions from which on they agree
 
 
 def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
     """Returns the parts to be drawn in the target frame: ``kind`` (``line``, ``sheet``, ``point``, ``text``), ``xyz``
-    (mm), ``colour``, and for some ``name``, ``size`` (px) and ``target``: whether the part belongs to the target."""
+    (mm), ``colour``, and for some ``name``, ``size`` (px), ``face`` and ``target``: whether it is of the target."""
     scene = report["scene"]
     parts = _faces(scene["circles"], report["faces"])
     for label, xyz in scene["circles"].items():
-        parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True))
+        face = parse_label(label).plane
+        parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True, face=face))
     for group, dots in scene["boards"].items():
         parts += [_part("point", [xyz], colours.get(group, INK), size=1.2) for xyz in dots]
         if len(dots):
@@ -521,21 +504,22 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
 
 
 def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict]:
-    """Returns sheet, axes and name of each face."""
+    """Returns sheet, axes and name of each face; corners of a sheet run counterclockwise seen from outside."""
     from scipy.spatial import ConvexHull, QhullError
 
-    reach, parts = _length(AXIS, _points(circles.values())), []
+    body = _points(circles.values())
+    reach, parts = _length(AXIS, body), []
     for name, face in faces.items():
         centres = _points(place for label, place in circles.items() if parse_label(label).plane == name)
-        pose = np.array(face["target_from_face"], float)
-        origin = pose[:3, 3]
+        pose, own = np.array(face["target_from_face"], float), {"target": True, "face": name}
+        origin, middle = pose[:3, 3], centres.mean(0) if len(centres) else pose[:3, 3]
         with suppress(QhullError, ValueError):  # circles that do not span the plane
-            hull = ConvexHull((centres - origin) @ pose[:3, :2])
-            parts.append(_part("sheet", centres[hull.vertices], SHEET, target=True))
+            corners = centres[ConvexHull((centres - origin) @ pose[:3, :2]).vertices]
+            outwards = (middle - body.mean(0)) @ pose[:3, 2] >= -FLAT_MM
+            parts.append(_part("sheet", corners if outwards else corners[::-1], SHEET, **own))
         for axis, colour in enumerate(AXIS_COLOURS):
-            parts.append(_part("line", [origin, origin + reach * pose[:3, axis]], colour, size=1.6, target=True))
-        middle = centres.mean(0) if len(centres) else origin
-        parts.append(_part("text", [middle + 0.9 * reach * pose[:3, 2]], "#1c2733", name=name, target=True))
+            parts.append(_part("line", [origin, origin + reach * pose[:3, axis]], colour, size=1.6, **own))
+        parts.append(_part("text", [middle + 0.9 * reach * pose[:3, 2]], "#1c2733", name=name, **own))
     return parts
 
 
@@ -547,7 +531,7 @@ def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str
     """Returns all photographs that the page shows, with vectors on one scale, and a bar of that scale."""
     width, height = report["camera"]["size_px"]
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
-    lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])
+    lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:4].T) for entry in residuals.values())])
     usual = float(np.quantile(lengths, 0.95)) if len(lengths) else 0.0
     factor = round_below(LONGEST * width / usual) if usual > 0 else 0.0
     bar_px = round_below(LONGEST * width / factor) if factor else 0.0
@@ -555,7 +539,7 @@ def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str
     for name, jpeg in overlays.items():
         entry = mapped.get(name)
         says = f"{entry['observations']} centres, {number(entry['rms_px'], 4)} px RMS" if entry else "not mapped"
-        lines = residuals.get(name, np.zeros((0, 4))).tolist()
+        lines = residuals.get(name, np.zeros((0, 6)))[:, :4].tolist()
         vectors = "".join(f"M{x:.1f} {y:.1f}l{factor * dx:.1f} {factor * dy:.1f}" for x, y, dx, dy in lines)
         uri = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
         each.append({"name": name, "says": says, "jpeg": uri, "vectors": vectors})

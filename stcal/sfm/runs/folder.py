@@ -244,14 +244,29 @@ def _report_page(run: Path, report: dict) -> tuple[str, int]:
     shown = shown_overlays(report)
     overlays = {name: path.read_bytes() for name in shown if (path := overlay_path(run, name)).is_file()}
     gone = len(shown) - len(overlays)
-    residuals: dict[str, list[list[float]]] = {name: [] for name in overlays}
+    rows: dict[str, list[list[float]]] = {name: [] for name in overlays}
+    # Of the group by group adjustments: poses and points are unknown, a similarity of each is not determined.
+    unknown = sum(6 * len(group["images"]) + 3 * group["points"] - 7 for group in report["groups"])
+    free = 1 - unknown / (2 * max(report["summary"]["observations"], 1))
+    factor = report["summary"]["sigma_factor"] * float(np.sqrt(max(free, 0.01)))
     with as_written(run / "labels.csv"):
         for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
-            if row["image"] in residuals and row["residual_x_px"]:
-                values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
-                residuals[row["image"]].append(values)
-    arrays = {name: np.array(values).reshape(-1, 4) for name, values in residuals.items()}
-    return report_html(report, overlays, arrays, gone), gone
+            if row["image"] in rows and row["residual_x_px"]:
+                rows[row["image"]].append([float(row[key]) for key in DRAWN])
+    residuals = {name: _with_normalised(np.array(own).reshape(-1, len(DRAWN)), factor) for name, own in rows.items()}
+    return report_html(report, overlays, residuals, gone), gone
+
+
+DRAWN = ("x_px", "y_px", "residual_x_px", "residual_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
+"""Columns of ``labels.csv`` that the page draws."""
+
+
+def _with_normalised(rows: np.ndarray, factor: float) -> np.ndarray:
+    """Returns centre and residual, and the residual over its σ, (n, 6), of columns ``DRAWN`` and a factor on σ."""
+    xx, cross, yy = rows[:, 4:].T
+    along, across = np.sqrt(xx), np.sqrt(np.maximum(yy - cross**2 / xx, 1e-12 * yy))
+    first = rows[:, 2] / along
+    return np.column_stack([rows[:, :4], first / factor, (rows[:, 3] - cross / along * first) / across / factor])
 
 
 def require_report(saved: SavedRun) -> None:

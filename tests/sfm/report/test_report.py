@@ -201,7 +201,7 @@ def test_the_page_is_whole_and_stands_alone(page):
 
 def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
-    assert len(plots) == 1  # board of the one group
+    assert len(plots) == 2  # board of the one group, and photographs
     for plot in plots:
         references = re.findall(r'(?:href|src)="([^"]*)"', base64.b64decode(plot).decode())
         assert all(reference.startswith(("#", "data:image/png")) for reference in references)
