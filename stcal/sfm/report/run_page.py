@@ -127,7 +127,7 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
             sigma = ["0"] * 6
         label = f"{name} (datum)" if name == reference else name
         rows.append([label, *[number(v, 4) for v in face["translation_mm"]], *sigma])
-    return Table(["<Face"] + ["x", "y", "z"] * 3, rows, [("", 1), ("mm", 3), ("σ µm", 3), ("σ mdeg", 3)])
+    return Table(["<Face"] + ["x", "y", "z"] * 3, rows, [("", 1), ("mm", 3), ("σ µm", 3), ("σ mdeg", 3)], "poses")
 
 
 def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
