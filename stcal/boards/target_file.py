@@ -356,7 +356,7 @@ def target_toml(target: TargetDesign) -> str:
 def _rough_lines(pose: Rigid | None) -> list[str]:
     about = [
         "# Where the drawing's (0, 0) is, its X and the outward normal, to a few mm and degrees, in a frame that all",
-        "# faces share: for `plan` and `simulate`; a calibration does not use it.",
+        "# faces share: for `plan` and `simulate`; `run` only tells by it that a face is on another side.",
     ]
     if pose is None:
         return [*about, "# rough_pose = { origin_mm = [0.0, 0.0, 0.0], x = [1.0, 0.0, 0.0], normal = [0.0, 0.0, 1.0] }"]

@@ -128,7 +128,8 @@ def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, tu
     yield from _variants(loop, setup, by_images)
     for side, role in SIDES[: 1 if by_images else 2]:
         for one, other in permutations(ANGLES, 2):
-            words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
+            words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad), or by the names of its "
+            words += f"columns, if they were read as {one}"
             yield Candidate(words, _changed(loop, partial(_with_angles, one, other), side), 1)
         read = loop.camera_from_board if side == "board" else _by_robot(loop)
         for names, places in other_axes(read.translation) if turns_agree else ():
@@ -272,7 +273,8 @@ class Repair:
         names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
         if not names:
             return ()
-        return (Aside(f"numbered from another end of the board, and corrected: {', '.join(names)}"),)
+        numbered = f"numbered from another end of the board, and corrected: {', '.join(names)}"
+        return (Aside(f"{numbered}; base_from_board may belong to either end"),)
 
 
 def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:

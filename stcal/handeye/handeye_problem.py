@@ -414,7 +414,7 @@ class HandEyeProblem:
             notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
         doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
         if doubted:
-            which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+            which = ", ".join(f"{FACTORS[name]} {factor:.1f} times" for name, factor in doubted.items())
             notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
         more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
         more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}

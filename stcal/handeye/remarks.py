@@ -239,8 +239,8 @@ class Verdict:
         return [each.said for each in self.findings if each.word == BAD]
 
     def remedies(self) -> list[str]:
-        """Returns what to do against the reasons that forbid to use the calibration, each once."""
-        return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
+        """Returns what to do against the reasons for a doubt, each once."""
+        return list(dict.fromkeys(each.remedy for each in self.reasons() if each.remedy))
 
     def sentence(self) -> str:
         """Returns the word and its reasons in one line."""

@@ -252,6 +252,9 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
     for order, name, axes, unit in stated:
         columns = [f"{prefix}{name.format(axis)}_{unit}" for axis in axes]
         if (values := _all(table, columns)) is not None:
+            if rotation and said_convention(rotation, columns[0], where, 3).order != order:
+                fault = f"{where}: the column {columns[0]} states another rotation than --rotation {rotation}"
+                raise InputError("E-OPTION-CONTRADICTS", f"{fault}; rename the columns, or leave the option out")
             return Turned(*rotations(values, Convention(order, unit), places, where), tuple(columns))
     matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     if (values := _all(table, matrix)) is not None:

@@ -89,7 +89,7 @@ def require_size(size_mm: Sequence[float]) -> None:
     """Refuses sides outside 1 mm to 100 m."""
     if not all(1 <= side <= 1e5 for side in size_mm):
         size = ",".join(f"{side:g}" for side in size_mm)
-        raise InputError("E-OPTION-RANGE", f"--size {size}: sides of 1 mm to 100 m needed")
+        raise InputError("E-OPTION-RANGE", f"--size {size}: sides of 1 mm to 100 m needed, in mm")
 
 
 HIDDEN = 3

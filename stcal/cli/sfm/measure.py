@@ -26,10 +26,17 @@ def plan(
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     distance: shared.Distance = 1000.0,
-    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
+    width: Annotated[
+        int | None,
+        "Take images of this width, px, 3:2, with a 24 mm lens; 5184 if not given.",
+        Opt(min=320, max=100_000),
+    ] = None,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
-    run: Annotated[Path | None, "Take the σ of the centres from the finished run in this folder."] = None,
+    run: Annotated[
+        Path | None,
+        "Take the σ of the centres, and target, board and camera if not given, from this finished run.",
+    ] = None,
     target: shared.TargetFile = None,
     faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,
     board: shared.BoardFile = None,
@@ -51,6 +58,12 @@ def plan(
     from stcal.sfm.runs.run_options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
+    def of_run(given: Path | None, name: str) -> Path | None:
+        file = run / "inputs" / name if run else None
+        return given or (file if file and file.exists() else None)
+
+    target, board = of_run(target, "target.toml"), of_run(board, "board.toml")
+    camera = of_run(camera, "cameras.txt") if width is None else camera
     design = target_of(target)
     if noise is not None and run is not None:
         raise InputError("E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both state σ; give one of them")
@@ -67,7 +80,7 @@ def plan(
         source = f"{source} (--noise, --run)"
     model, pairs = read_camera(camera) if camera else None, pairs_of_faces(groups, design) if groups else None
     how = centre_noise, one_board, RunOptions(refine_camera=refine_camera), seed, margin
-    options = PlanOptions(images, spread, distance, width, model, pairs, *how)
+    options = PlanOptions(images, spread, distance, width or 5184, model, pairs, *how)
     with shared.designs_told(target, board):
         result = planned(options, design, load_dots(board) if board else None, faces)
     with printed_last():

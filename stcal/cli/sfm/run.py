@@ -226,6 +226,14 @@ def budget(
 LIMIT = Opt(min=0, max=1e6)
 
 
+def _warn_of_failures(run: Path) -> None:
+    from stcal.sfm.planning.advise import failures_of
+    from stcal.sfm.runs.saved import load_run
+
+    if failures := failures_of(load_run(run)):
+        print_each("warning", [f"{failures}: do not use what was written"])
+
+
 @app.command(name="export-database")
 def export_database(
     run: Run,
@@ -250,6 +258,7 @@ def export_model(
     from stcal.sfm.interop.export_colmap import model_text
 
     say(model_text(export(run, out, kind), kind))
+    _warn_of_failures(run)
 
 
 @app.command(name="export")
@@ -269,6 +278,7 @@ def export_run(
     from stcal.sfm.interop.export import export_text
 
     say(export_text(export(run, out, form, name)))
+    _warn_of_failures(run)
 
 
 @app.command()

@@ -211,7 +211,10 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
         needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
-        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}")
+        other = [name for side in SIDES if wanted not in side for name in side]
+        swapped = not names and any(column.startswith(f"{name}_") for name in other for column in table.columns)
+        exchanged = "; it has those of the other side: exchange the files" if swapped else ""
+        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}{exchanged}")
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
     common = table.common_errors(covariance, names[0] + "_")
     return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)

@@ -78,7 +78,7 @@ def budget_in_brief(file: BudgetFile) -> str:
         *tests,
         "--report FILE.html writes a certificate of calibration" if certifies(file) else _no_certificate(file),
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
-        f"inputs, contributions and {len(file.notes)} notes: -v, or --report FILE.html",
+        f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
     ]
     return "\n".join(filter(None, lines))
 
@@ -103,11 +103,12 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
         if worst.position_um:
             value = significant(worst.position_um.expanded)
             headline.append((value, "µm", f"U of the position of face {name}, the worst; {together}"))
-        value, which = significant(worst.rotation_mdeg.expanded), "" if worst.position_um else ", the worst"
-        headline.append((value, "mdeg", f"U of the rotation of face {name}{which}; {together}"))
+        turned, most = max(file.faces.items(), key=lambda each: each[1].rotation_mdeg.expanded)
+        value = significant(most.rotation_mdeg.expanded)
+        headline.append((value, "mdeg", f"U of the rotation of face {turned}, the worst; {together}"))
         shares = {row.title: (worst.position_um or worst.rotation_mdeg).share(row.key) for row in file.sources}
         first, *more = sorted(shares, key=lambda title: -shares[title])
-        then = "".join(f", {shares[title]:.0%} from {title}" for title in more[:2] if shares[title] > LIMITS)
+        then = "".join(f", {100 * shares[title]:.0f} % from {title}" for title in more[:2] if shares[title] > LIMITS)
         headline.append((f"{100 * shares[first]:.0f}", "%", f"of the variance of face {name} is from {first}{then}"))
     for each in file.distances[:1]:
         length = as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
@@ -168,9 +169,11 @@ def _no_certificate(file: BudgetFile) -> str:
         return ""
     if file.reserved:
         return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
-    unstated = [row.title for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
+    missing = [row for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
+    unstated = [f"{row.title} ({row.words})" for row in missing]
     unstated += [name for name in REQUIRED if not file.fields.get(name, "").strip()]
-    camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
+    without = any(row.key == "intrinsics" for row in missing)
+    camera = ", and σ of the intrinsics in the camera file" if without else ""
     remedy = f"this is not a certificate: nothing is stated of {join(unstated)}; state it with --statement{camera}"
     return remedy if unstated else ""
 

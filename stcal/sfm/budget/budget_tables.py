@@ -98,12 +98,12 @@ def results(file: BudgetFile) -> list[Block]:
 
 
 def inputs(file: BudgetFile, words: bool = False) -> Table:
-    """Returns the table of the sources; with ``words`` also where their σ come from."""
+    """Returns the table of the sources and whether their σ are stated; with ``words`` also where."""
     rows = []
     for each in file.sources:
         sigma = NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}"
-        rows.append([each.title, sigma, each.evaluation, *([each.origin, each.words] if words else ())])
-    return Table(["<input", "standard uncertainty", "<type", *(["<σ is", "<from"] if words else ())], rows, css="text")
+        rows.append([each.title, sigma, each.evaluation, each.origin, *([each.words] if words else ())])
+    return Table(["<input", "standard uncertainty", "<type", "<σ is", *(["<from"] if words else ())], rows, css="text")
 
 
 def contributions(file: BudgetFile) -> list[Block]:

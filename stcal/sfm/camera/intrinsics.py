@@ -375,7 +375,12 @@ def adjust_intrinsics(
 ) -> Intrinsics:
     """Adjusts the intrinsics from ``start`` by at least three views, with dots of the board only."""
     basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
-    models = tuple(model_of_views(members, board, start) for members in by_group(views).values())
+    groups = by_group(views)
+    largest = max(groups, key=lambda name: len(groups[name]))
+    for name in [name for name, members in groups.items() if len(members) < 2 and name != largest]:
+        # A single view cannot tell errors of the print from those of its centres: it is taken for one of this board.
+        groups[largest] += [replace(view, group=largest) for view in groups.pop(name)]
+    models = tuple(model_of_views(members, board, start) for members in groups.values())
     fit = Fit(
         models=models,
         camera=start,

@@ -37,6 +37,8 @@ def radius_checks(evidence: Evidence) -> list[Check]:
                 hidden = lost_radius_mm(before_mm[label], views.tan_tilt[own], radius) / radius
                 faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / radius
                 found.setdefault(label, []).append(np.stack([views.ratio[own] + hidden + faded, views.size_px[own]]))
+    # A blur of σ moves the steepest place of a bent edge of radius r by σ²/2r.
+    blur_px = float(np.median([*evidence.blur_px.values()] or [0.0]))
     kinds: dict[str, dict[Label, np.ndarray]] = {}
     for label, parts in found.items():
         kind = f"{'dots' if isinstance(label, DotLabel) else 'circles'} of radius {design_mm[label]:g} mm"
@@ -45,8 +47,9 @@ def radius_checks(evidence: Evidence) -> list[Check]:
     for kind, members in kinds.items():
         ratio, size_px = np.array(list(members.values())).T
         usual = float(np.median(ratio))
-        bias_px = (usual - 1) * float(np.median(size_px))
-        whole.append(Trial(kind, bias_px, "px", (bias_px / EDGE_BIAS_PX) ** 2, 1))
+        size = float(np.median(size_px))
+        bias_px, allowed_px = (usual - 1) * size, np.hypot(EDGE_BIAS_PX, blur_px**2 / (2 * size))
+        whole.append(Trial(kind, bias_px, "px", (bias_px / allowed_px) ** 2, 1))
         if len(members) >= MIN_PEERS:
             sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
             freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
@@ -234,13 +237,14 @@ def scales_check(evidence: Evidence) -> Check:
     print_factor = 1.0 if joint is None else joint.print_factor
     remedy = "another size than stated: measure a side of each print, and correct target.toml or state size_sigma_mm"
     name, times = _alone(networks, board) or ("", 1.0)
+    of_name = f"correct the size of {name}, or state size_sigma_mm of the prints larger"
     fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
     if print_factor > MOST_PRINT_FACTOR:
         # σ that have grown so much would hide the contradiction that made them grow.
         grown = TestedValue("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
         if name:
             size = TestedValue(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
-            return Check(key, title, "failed", fits, (size, grown), 1, (name,), f"correct the size of {name}")
+            return Check(key, title, "failed", fits, (size, grown), 1, (name,), of_name)
         why = "the size or drawing of the print is another one, or its σ too small"
         reason = f"{grown.name} at {grown.words()}: {why}"
         return Check(key, title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
@@ -264,7 +268,7 @@ def scales_check(evidence: Evidence) -> Check:
     check = assess(key, trials, "sources of the scale", remedy)
     if check.names and name:
         reason = f"{fits}; {check.reason}"
-        check = replace(check, reason=reason, names=(name,), remedy=f"correct the size of {name}")
+        check = replace(check, reason=reason, names=(name,), remedy=of_name)
     return check
 
 

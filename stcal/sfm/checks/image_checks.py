@@ -360,7 +360,8 @@ def control_check(evidence: Evidence) -> Check:
 def _control(evidence: Evidence) -> tuple[str, tuple[TestedValue, ...]]:
     camera, whole = evidence.calibration.camera, evidence.calibration.target
     models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
-    options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
+    plain = replace(evidence.options, refine_camera=False, eccentricity=False)
+    options = replace(plain, solve="chain", frame="three-point")
     control = calibrate(models, camera, evidence.target, evidence.board, options).target
     shifts = {
         face: MICRO * float(np.linalg.norm(control.target_from_face[face].translation - pose.translation))

@@ -16,7 +16,7 @@ from stcal.io.table import COVARIANCE, POSE, Table, common_columns, csv_text, po
 from stcal.report.document import Answer, Document, Printed, Section, legend, page_only, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
-from stcal.report.text import number
+from stcal.report.text import number, significant
 from stcal.sfm.data.group_model import Outlier
 from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import TargetPose, fit_verdict
@@ -196,7 +196,7 @@ def summary(result: MeasureResult) -> list[str]:
             alone = 1e3 * np.sqrt(np.median(whole) * max(1 - share, 0.0) / 3)
             lines.append(
                 f"{100 * share:.0f} % of the variance of positions is common to all poses (target and intrinsics); "
-                f"between poses σ is about {alone:.2g} µm along an axis"
+                f"between poses σ is about {significant(alone)} µm along an axis"
             )
     if result.searched is not None:
         total = len(poses) + sum(image.gate == "pose" for image in result.left_out)

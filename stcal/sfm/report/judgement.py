@@ -429,7 +429,7 @@ class _Run:
             used, given = (self.summary[key] for key in ("images_mapped", "images"))
             advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
         read = [face for face in self.lacking if self._seen(face)]
-        if unseen := [face for face in self.lacking if face not in read]:
+        if not self.cause and (unseen := [face for face in self.lacking if face not in read]):
             advice.append(
                 f"Photograph {_faces(unseen)} together with one of the others: no image that was used shows it."
             )

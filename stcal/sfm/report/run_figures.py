@@ -102,7 +102,7 @@ def halves(measured: list[dict]) -> Drawing:
     reach = limits([row[key] or 0.0 for row in rows for key in ("value", "limit")], 0.08, low=0)
     axes = Axes(drawing, drawing.panels(left=60, top=18)[0], reach, (len(rows) - 0.4, -0.6))
     at = np.arange(len(rows))
-    axes.frame(f"apart, {rows[0]['unit']}", "", "x", None, (at, [row["name"][:12] for row in rows]))
+    axes.frame(f"apart, {rows[0]['unit']}", "", "x", None, (list(range(len(rows))), [row["name"][:12] for row in rows]))
     limit = [row["limit"] or 0.0 for row in rows]
     axes.lines([([0, end], [k, k]) for k, end in enumerate(limit)], AXIS, 2)
     axes.marks(limit, at, "bar", 9, AXIS)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses
 from stcal.io.rotations import FIRST, INVERTED, LAST, READINGS, read_rotations
 from stcal.io.table import Table, read_table
-from tests.outcome import refuses
+from tests.outcome import fails_with, refuses
 
 
 def about(axis: str, degrees: float) -> np.ndarray:
@@ -50,6 +50,13 @@ def test_conventions(header, values, rotation, expected):
     found = read(header, *values, rotation=rotation)
     assert np.abs(found.rotation[0] - expected).max() < 1e-12  # rounding
     assert found.columns == tuple(header.split(","))
+
+
+def test_columns_that_name_their_angles_are_not_overruled_in_silence():
+    header = "euler_ZYX_1_deg,euler_ZYX_2_deg,euler_ZYX_3_deg"
+    assert np.array_equal(read(header, 3, 2, 1).rotation, read(header, 3, 2, 1, rotation="ZYX-deg").rotation)
+    with fails_with("E-OPTION-CONTRADICTS … euler_ZYX_1_deg … --rotation xyz-deg … rename"):
+        read(header, 3, 2, 1, rotation="xyz-deg")
 
 
 @pytest.mark.parametrize(

@@ -304,6 +304,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     assert title in text
     assert all(what in text for what in CHECKS[report["checks"][1]["key"]][1])
     assert "expanded uncertainty U" not in text
+    assert "do not use what was written" in stcal_sfm("export", copy, tmp_path / "box.csv")[1]
     page, out = tmp_path / "budget.html", tmp_path / "budget.json"
     lengths = tmp_path / "lengths.csv"
     lengths.write_text("from,to,length_mm\n1:1,1:2,1000\n")

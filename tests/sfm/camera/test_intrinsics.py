@@ -236,6 +236,16 @@ def test_a_stretched_print_moves_the_focal_lengths_within_their_sigma(kind, coun
     assert 0.5 < np.mean(squares) < most
 
 
+@pytest.mark.parametrize("groups", [("a", "b", "c", "d", "e"), ("a", "b", "b", "b", "b")])
+def test_photographs_each_alone_in_their_group_are_of_one_board(groups):
+    """A board of its own in each would explain every photograph, whatever the centres' errors are."""
+    views = views_of(np.random.default_rng(8), len(groups))
+    result = calibrated([replace(view, group=group) for view, group in zip(views, groups, strict=True)])
+    one = calibrated([replace(view, group="b") for view in views])
+    assert len(result.models) == 1
+    assert error(result) == pytest.approx(error(one), abs=1e-3 * one.sigma().max())
+
+
 def test_a_board_upside_down_is_numbered_like_the_others():
     rng = np.random.default_rng(4)
     images, truth = [], []

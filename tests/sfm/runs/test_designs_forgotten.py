@@ -67,6 +67,9 @@ def test_measure_calibrate_camera_and_plan_name_what_they_assumed(stcal_sfm, sma
     assert not any(said in out for said in (TARGET_ASSUMED, "reference board"))
     out = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")[1]
     assert (TARGET_ASSUMED in out, BOARD_ASSUMED in out) == (True, True)
+    out = stcal_sfm("plan", "--run", small_run, "--images", 2, "--groups", "12")[1]
+    assert "assumed: " not in out
+    assert "1296×864 px" in out
 
 
 @pytest.mark.slow
