@@ -1,7 +1,7 @@
 """Verdict on a pose, and the mistake in a layout that explains a bad fit; for comparison, the method of the CN patent
 "monocular visual target positioning" (Anhui Yuanguji), steps S5 to S9."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -14,7 +14,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import PlanePoses, covariance_of_both, deciding_delta, poses_of_plane
+from stcal.geometry.plane import PlanePoses, apply_homography, covariance_of_both, deciding_delta, poses_of_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import ObjPose, SeenTags, locate, reprojection_rms
@@ -158,7 +158,7 @@ def likely_mistake(
         variant = replace(layout, corners_mm=corners_mm)
         return _misfit_px(detected, variant, camera, locate(detected, variant, camera, prior))
 
-    candidates = _mistakes(layout.corners_mm)
+    candidates = [*_mistakes(layout.corners_mm), *_other_size(detected, layout, camera, pose)]
     found = [candidate for candidate, _ in explain(candidates, misfit, allowed, ALIKE)]
     return next((each.words for each in candidates if each in found), None)
 
@@ -169,6 +169,22 @@ def _misfit_px(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: O
         return np.inf
     xy = layout.corners_mm[detected.rows].reshape(-1, 2)
     return reprojection_rms(pose.camera_from_obj, xy, detected.corners_px.reshape(-1, 2), camera)
+
+
+def _other_size(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose | None) -> Iterator[Candidate]:
+    """Yields the layout with tags of the size, about their middles, at which the image has them."""
+    if pose is None:
+        return
+    from_obj, stated = pose.camera_from_obj, layout.corners_mm[detected.rows]
+    plane = np.linalg.inv(np.column_stack([from_obj.rotation[:, :2], from_obj.translation]))
+    rays = camera.normalised_from_pixel(detected.corners_px.reshape(-1, 2))
+    seen = apply_homography(plane, rays).reshape(stated.shape)
+    middle_seen, middle = (corners.mean(axis=1, keepdims=True) for corners in (seen, stated))
+    apart = [float(np.linalg.norm(places - places.mean(axis=0))) for places in (middle_seen, middle)]
+    size = float(np.median(np.linalg.norm(seen - middle_seen, axis=2) / np.linalg.norm(stated - middle, axis=2)))
+    times, every = size * apart[1] / apart[0], layout.corners_mm.mean(axis=1, keepdims=True)
+    words = f"every tag were {times:.3g} times as large (multiply each size_mm by that)"
+    yield Candidate(words, lambda: every + times * (layout.corners_mm - every))
 
 
 def _mistakes(corners: np.ndarray) -> list[Candidate]:

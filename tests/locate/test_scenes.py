@@ -137,6 +137,12 @@ def test_a_camera_file_of_another_camera(seen):
     assert locate_scene(seen, LAYOUT, model).verdict.decision == "reject"
 
 
+def sized(times) -> TargetLayout:
+    """The layout with all tags larger, about their middles."""
+    middle = LAYOUT.corners_mm.mean(axis=1, keepdims=True)
+    return dataclasses.replace(LAYOUT, corners_mm=middle + times * (LAYOUT.corners_mm - middle))
+
+
 def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
     """The layout with each tag about its middle, places with Y times ``flip`` and angles times ``orientation``."""
     corners = LAYOUT.corners_mm
@@ -157,6 +163,8 @@ def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
         (turned(90), "subtract 90 from each angle_deg"),
         (turned(0, -1, -1), "change the signs of y_mm and angle_deg"),
         (turned(0, -1), "change the signs of y_mm"),
+        (sized(1.25), "every tag were 0.80"),
+        (sized(0.5), "every tag were 2"),
     ],
 )
 def test_tags_that_are_turned_in_the_layout(seen, layout, remedy):

@@ -128,9 +128,9 @@ def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
     reach = 0.25 * float(np.ptp(np.vstack([xy, [[0, 0]]]), axis=0).max())
     tips = reach * np.array([[1.0, 0.0], [0.0, out]])
     axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
-    for tip, colour, name in zip(tips, AXIS_COLOURS, "XY", strict=False):
+    for tip, colour, name, aside in zip(tips, AXIS_COLOURS, "XY", ((0, -8), (-9, 0)), strict=False):
         axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
-        axes.words(1.12 * tip[0], 1.12 * tip[1], name, colour=colour, size=11, weight="bold")
+        axes.words(*tip, name, aside, colour=colour, size=11, weight="bold")  # names of circles stand below them
     axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
     names = list(xyz)
     for i in range(len(xy)) if len(xy) <= MOST_NAMES else _outermost(xy):
@@ -164,9 +164,12 @@ def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid], ou
         ink = INK if seen else FAINT
         axes.lines([outline.T], AXIS if seen else FAINT, 1.0, fill="#eef2f6" if seen else "#ffffff")
         axes.marks(xy[:, 0], xy[:, 1], "ring", 4, ink)
-        axes.words(xy[:, 0].mean(), xy[:, 1].mean(), face, size=11, weight="bold", colour=ink)
         if seen:
             start = onto @ poses[face].translation
             for direction, colour in zip(poses[face].rotation.T, AXIS_COLOURS, strict=True):
                 axes.arrows(start[None], reach * (onto @ direction)[None], 1.2, colour)
+    for face, xy in places.items():  # of a face that looks away, outside of the item
+        seen = normals[face] @ viewer > 0
+        at = xy.mean(0) + (0.0 if seen else 1.2 * reach) * (onto @ normals[face])
+        axes.words(*at, face, size=11, weight="bold", colour=INK if seen else AXIS)
     return drawing
