@@ -47,20 +47,20 @@ SOURCES = {
         "The size, by the edges of tags",
         "all edges may have the same error, which no residual shows; {distance}",
     ),
-    "sizes": ("The size of the print", "measure it better than size_sigma_mm says, or {distance}"),
+    "sizes": ("The size of the print", "measure the print better than size_sigma_mm says, or {distance}"),
     "board": (
         "The places of the board's dots",
-        "measure them, or take a better plate, and state sigma_mm in board.toml",
+        "measure the dots, or take a better plate, and state sigma_mm in board.toml",
     ),
     "print": (
         "The places of the printed corners",
-        "measure them, or take a better print, and state sigma_mm in target.toml",
+        "measure the corners, or take a better print, and state sigma_mm in target.toml",
     ),
     "distances": (
         "The known distances",
         "measure a longer one, or the same better, and state it with [[scale]] in target.toml",
     ),
-    "flatness": ("The flatness of the faces", "measure it, and state it with --flatness"),
+    "flatness": ("The flatness of the faces", "measure the flatness, and state it with --flatness"),
     "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
 }
 """Name and remedy of each source of σ beside the photographs."""
@@ -404,8 +404,8 @@ class _Run:
         limit, remedy = self._by_conditions()
         centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
-            f"{limit}{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; no face stands "
-            "out.",
+            f"{limit}{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; "
+            "other faces are alike.",
             f"{remedy} four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} µm, and "
             f"{advice}",
         )

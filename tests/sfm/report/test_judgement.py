@@ -57,7 +57,7 @@ def test_all_is_well():
     assert (found.rotation_face, found.rotation_sigma_mdeg) == ("4", 0.723)
     assert "3.0 µm (face 3) and 0.72 mdeg (face 4)" in found.quality
     assert "2.0 ppm" in found.quality
-    assert "64 % of the variance of face 3 along x (σ 3.0 µm); no face stands out" in found.limit
+    assert "64 % of the variance of face 3 along x (σ 3.0 µm); other faces are alike" in found.limit
     assert "2.2 µm of these 3.0 µm" in found.next  # √(0.36 + 0.64/4) · 3.04
 
 
