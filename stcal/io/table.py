@@ -349,9 +349,13 @@ def plain(cell: str) -> str:
 
 
 def csv_rows(text: str) -> Iterator[dict[str, Any]]:
-    """Yield the rows of CSV by the names of its columns; a row that is cut has None, as of ``csv.DictReader``."""
-    for row in csv.DictReader(io.StringIO(text)):
-        yield {name and plain(name): cell and plain(cell) for name, cell in row.items()}
+    """Yield the rows of CSV by the names of its columns; a row that is cut has None, as of ``csv.DictReader``. Raises
+    ValueError: a cell is longer than any may be."""
+    try:
+        for row in csv.DictReader(io.StringIO(text)):
+            yield {name and plain(name): cell and plain(cell) for name, cell in row.items()}
+    except csv.Error as error:
+        raise ValueError(str(error)) from error
 
 
 def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:

@@ -145,6 +145,8 @@ def test_names_that_a_spreadsheet_would_run_are_guarded_and_read_back(tmp_path):
     assert [line.split(",") for line in text.splitlines()[1:3]] == [["'=1+11/a.jpg", "-0.5"], ["'+a", "-0.5"]]
     assert [row["image"] for row in csv_rows(text)] == names
     assert {row["=x"] for row in csv_rows(text)} == {"-0.5"}
+    with pytest.raises(ValueError, match="field larger"):
+        list(csv_rows("image\n" + "1" * 200_000))
     assert list(read_table(table(tmp_path, text), "t").text("image")) == names
 
 

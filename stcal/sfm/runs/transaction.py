@@ -2,7 +2,6 @@
 take the places of the earlier ones. Whoever opens the folder next finishes that if the process was killed. A marker
 holds the input of the run, and the hashes of its files."""
 
-import csv
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -169,7 +168,7 @@ def as_written(file: Path | str) -> Iterator[None]:
         raise InputError(
             "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
         ) from error
-    except (LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
 
