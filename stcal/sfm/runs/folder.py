@@ -81,6 +81,7 @@ LONGEST_NAME, HASH_DIGITS = 200, 12
 during writing."""
 WEAK_FOCAL = 0.01  # relative σ of a focal length beyond which the views lack what determines it
 FIRST = 20  # number of images that are named
+FEW = 3  # number of images up to which what was left out in each is said
 
 
 @contextlib.contextmanager
@@ -351,15 +352,17 @@ def document_of(result: RunResult) -> Document:
 def _remarks(result: RunResult) -> Iterator[str]:
     """Yields what was left out, on what the size and the camera rest, and what was corrected."""
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
-    noted = [image.observations.name for image in result.labelled if image.notes]
+    noted = {image.observations.name: image.notes for image in result.labelled if image.notes}
     outliers = sum(len(solution.outliers) for solution in result.solutions)
     for lines in (_skipped(result.detection), unmapped):
         yield from lines[:FIRST]
         if len(lines) > FIRST:
             yield f"and {len(lines) - FIRST} more, which the report names"
-    if noted:
+    if 0 < len(noted) <= FEW:
+        yield from (f"left out in {name}: {notes[0]}" for name, notes in noted.items())
+    elif noted:
         more = f" and {len(noted) - FIRST} more" if len(noted) > FIRST else ""
-        yield f"something was left out in {join(noted[:FIRST])}{more}; the report says what and why"
+        yield f"something was left out in {join([*noted][:FIRST])}{more}; the report says what and why"
     if outliers:
         yield f"{outliers} {result.target_design.points} left out that contradict the others"
     yield from _on_size(result)
