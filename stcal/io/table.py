@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -242,15 +243,18 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         names = [name.strip() for name in cells_of(used[0][1], between)]
     except csv.Error as error:
         raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header needed") from error
+    if len(names) > MOST_COLUMNS:
+        fault = f"{where}: line {used[0][0]} has {len(names)} columns"
+        raise InputError("E-TABLE-HEADER", f"{fault}, at most {MOST_COLUMNS} are read; check the file")
     names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
         fault = f"{where}: line {used[0][0]} is numbers"
         raise InputError("E-TABLE-HEADER", f"{fault}, a header with units needed, like x_mm")
-    for name in names:
-        if names.count(name) > 1 or not name:
+    for name, count in Counter(names).items():
+        if count > 1 or not name:
             shown = name or "without a name"
-            raise InputError("E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; once needed")
+            raise InputError("E-TABLE-HEADER", f"{where}: column {shown} occurs {count} times; once needed")
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
         raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]} is no header of the rows below it; remove it")
     if len(used) == 1:
@@ -282,6 +286,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     return Table(where, dict(columns), numbers, quaternions, form=form)
 
 
+MOST_COLUMNS = 2000
 SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
 """Separators beside the comma, in words."""
 _LONG = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch", "deg": "degree", "rad": "radian"}

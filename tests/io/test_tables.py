@@ -62,6 +62,7 @@ def test_names_of_columns(tmp_path, head, separator):
         ("PT0;10.5;2000.25;-3.125;0;0;1\nPT1;11.5;2000.25;-3.5;0;0;1\n", "E-TABLE-HEADER … line 1 … numbers"),
         ("My measurement\nname,x_mm,y_mm\nA,1,2\n", "E-TABLE-HEADER … line 1 … no header"),
         ("P1 1.5 2.5 3.5\nP2 4 5 6\n", "E-TABLE-HEADER … line 1"),
+        (f"{','.join(f'c{i}' for i in range(2001))}\n", "E-TABLE-HEADER … line 1 … 2001 columns … 2000"),
     ],
 )
 def test_what_is_no_table_is_said(tmp_path, text, error):
