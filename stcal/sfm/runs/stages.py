@@ -272,7 +272,7 @@ class Groups:
         missing = [str(label) for label in every if label not in mapped]
         them = "it" if len(missing) == 1 else "them"
         note = (
-            f"{_listed(missing)}: not in the result, as too few images show {them} as drawn; check radius and place in "
+            f"{_listed(missing)}: not in the result, as too few images show {them} as drawn; check their design in "
             "target.toml, unless something hides it"
         )
         return [*unseen_lines(dots, self.board.rows, self.board.columns), *([note] if missing else [])]
