@@ -485,7 +485,8 @@ def require_unsaid(statements: Said, where: str) -> None:
     if statements.options():
         raise InputError(
             "E-OPTION-NEEDS",
-            f"{where}: the names of columns state unit, rotation and direction; leave {', '.join(statements.options())} out, and "
+            f"{where}: the names of columns state unit, rotation and direction; leave "
+            f"{', '.join(statements.options())} out, and "
             "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, or flange_from_base_x_mm)",
         )
 

@@ -267,4 +267,4 @@ def test_circles_that_no_image_shows_as_drawn_are_named(few, lab):
 
     cut = tuple(replace(each, model=without(each.model, "1:4")) for each in solutions)
     [note] = replace(groups, solutions=cut).unseen_notes(few.target)
-    assert note.startswith("1:4: not in the result, as too few images show it as drawn; check radius and place")
+    assert note.startswith("1:4: not in the result, as too few images show it as drawn; check their design")
