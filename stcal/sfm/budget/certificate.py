@@ -130,7 +130,9 @@ def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
     axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
     for tip, colour, name, aside in zip(tips, AXIS_COLOURS, "XY", ((0, -8), (-9, 0)), strict=False):
         axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
-        axes.words(*tip, name, aside, colour=colour, size=11, weight="bold")  # names of circles stand below them
+        axes.words(
+            tip[0], tip[1], name, aside, colour=colour, size=11, weight="bold"
+        )  # names of circles stand below them
     axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
     names = list(xyz)
     for i in range(len(xy)) if len(xy) <= MOST_NAMES else _outermost(xy):
@@ -171,5 +173,5 @@ def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid], ou
     for face, xy in places.items():  # of a face that looks away, outside of the item
         seen = normals[face] @ viewer > 0
         at = xy.mean(0) + (0.0 if seen else 1.2 * reach) * (onto @ normals[face])
-        axes.words(*at, face, size=11, weight="bold", colour=INK if seen else AXIS)
+        axes.words(at[0], at[1], face, size=11, weight="bold", colour=INK if seen else AXIS)
     return drawing

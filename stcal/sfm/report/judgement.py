@@ -70,19 +70,10 @@ HARMS = 3.0
 """The same from which it is to be changed."""
 CONDITIONS = {
     "number": ("{:.0f} images in a group, 10 are usual", "take more photographs"),
-    "distance": ("faces and board cover {:.0f} % of a picture's diagonal, 70 % if they fill it", "go nearer"),
-    "angles": (
-        "the cameras of a group stand within {:.0f}° as seen from the target, within 80° is usual",
-        "photograph from farther to the sides, from above and below",
-    ),
-    "blur": (
-        "rims are blurred by {:.1f} px (one σ), sharp ones by 0.8 px",
-        "focus on the middle of the target and close the aperture",
-    ),
-    "light": (
-        "a pixel's noise is {:.1f} % of the contrast, 1.4 % is usual",
-        "give more light, or expose longer at a lower gain",
-    ),
+    "distance": ("pictures are filled to {:.0f} %, 70 % is usual", "go nearer"),
+    "angles": ("the cameras of a group stand within {:.0f}°, 80° is usual", "photograph from farther apart"),
+    "blur": ("rims are blurred by {:.1f} px, 0.8 px is sharp", "focus on the target's middle and close the aperture"),
+    "light": ("noise is {:.1f} % of the contrast, 1.4 % is usual", "give more light, or expose longer at a lower gain"),
 }
 """What is said of each condition of the photographs with its measured value, and the remedy."""
 
@@ -397,17 +388,15 @@ class _Run:
                 f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
                 f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
             )
-        centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says which do most."
+        centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says how."
         if not photographs:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
         fewer, share = math.sqrt(max(sigma**2 - photographs * (1 - 1 / MORE), 0.0)), 100 * photographs / sigma**2
         limit, remedy = self._by_conditions()
-        centring = f"The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
+        centring = f"{limit}The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
         return (
-            f"{limit}{centring} in {self.summary['images_mapped']} images: {number(share, 0)} {of_all}; "
-            "other faces are alike.",
-            f"{remedy} four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} µm, and "
-            f"{advice}",
+            f"{centring}: {number(share, 0)} {of_all}.",
+            f"{remedy} four times the images make {number(fewer, 1)} of {number(sigma, 1)} µm; {advice}",
         )
 
     def _by_conditions(self) -> tuple[str, str]:
@@ -419,7 +408,7 @@ class _Run:
             good = [name for name in CONDITIONS if name in conditions and name != "number"]
             return f"Number alone: {join(good)} are good. " if good else "", "Nothing has to be done;"
         words, remedy = CONDITIONS[worst]
-        limit = f"{worst.capitalize()}: {words.format(value)}; σ are up to {factor:.1f} times larger by it. "
+        limit = f"{worst.capitalize()}: {words.format(value)}; σ are up to {factor:.1f} times larger. "
         return limit, f"{sentence(remedy)} Or" if factor > HARMS else f"Nothing has to be done. To be better, {remedy};"
 
     def further(self, verdict: Use) -> list[str]:
