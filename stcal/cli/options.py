@@ -401,7 +401,7 @@ def designs_told(
         yield
     except StcalError as error:
         if assumed and not isinstance(error, InputError):
-            error.append(f"; assumed: {' and '.join(assumed)}")
+            error.append(f"; assumed: {' and '.join(assumed)}; if yours is another, give its file")
         raise
 
 
