@@ -130,9 +130,7 @@ def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
     axes = Axes.equal(drawing, drawing.panels(left=16, right=16, top=14, bottom=14)[0], np.vstack([xy, tips, 0 * tips]))
     for tip, colour, name, aside in zip(tips, AXIS_COLOURS, "XY", ((0, -8), (-9, 0)), strict=False):
         axes.arrows(np.zeros((1, 2)), tip[None], 1.2, colour)
-        axes.words(
-            tip[0], tip[1], name, aside, colour=colour, size=11, weight="bold"
-        )  # names of circles stand below them
+        axes.words(tip[0], tip[1], name, aside, colour=colour, size=11, weight="bold")
     axes.marks(xy[:, 0], xy[:, 1], "ring", 7, INK)
     names = list(xyz)
     for i in range(len(xy)) if len(xy) <= MOST_NAMES else _outermost(xy):
@@ -145,10 +143,8 @@ def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid], ou
     look away are pale."""
     drawing = Drawing(3.3, 2.6)
     normals = {face: out[face] * poses[face].rotation[:, 2] for face in circles}
-    turn, height = (
-        np.pi * (1 + 5**0.5) * np.arange(DIRECTIONS),
-        np.linspace(-0.95, 0.95, DIRECTIONS),
-    )  # evenly on a sphere
+    # Evenly on a sphere, but not along Y, which is up.
+    turn, height = np.pi * (1 + 5**0.5) * np.arange(DIRECTIONS), np.linspace(-0.95, 0.95, DIRECTIONS)
     across = np.sqrt(1 - height**2)
     towards = np.column_stack([across * np.cos(turn), height, across * np.sin(turn)])
     facing = np.clip(towards @ np.array(list(normals.values())).T, 0, None)

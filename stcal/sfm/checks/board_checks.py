@@ -18,6 +18,7 @@ from stcal.sfm.checks.significance import MICRO, Evidence, Trial, assess
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05  # σ of the bias that light, lens and threshold add to all radii alike; it moves no centre
+SHARP_PX = 0.8  # blur, σ, of photographs of which EDGE_BIAS_PX holds
 RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5  # smallest number of circles of one design radius that are compared with each other
@@ -37,7 +38,6 @@ def radius_checks(evidence: Evidence) -> list[Check]:
                 hidden = lost_radius_mm(before_mm[label], views.tan_tilt[own], radius) / radius
                 faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / radius
                 found.setdefault(label, []).append(np.stack([views.ratio[own] + hidden + faded, views.size_px[own]]))
-    # A blur of σ moves the steepest place of a bent edge of radius r by σ²/2r.
     blur_px = float(np.median([*evidence.blur_px.values()] or [0.0]))
     kinds: dict[str, dict[Label, np.ndarray]] = {}
     for label, parts in found.items():
@@ -48,7 +48,9 @@ def radius_checks(evidence: Evidence) -> list[Check]:
         ratio, size_px = np.array(list(members.values())).T
         usual = float(np.median(ratio))
         size = float(np.median(size_px))
-        bias_px, allowed_px = (usual - 1) * size, np.hypot(EDGE_BIAS_PX, blur_px**2 / (2 * size))
+        # A blur of σ moves the steepest place of an edge of radius r by σ²/2r.
+        bias_px, by_blur_px = (usual - 1) * size, max(blur_px**2 - SHARP_PX**2, 0.0) / (2 * size)
+        allowed_px = np.hypot(EDGE_BIAS_PX, by_blur_px)
         whole.append(Trial(kind, bias_px, "px", (bias_px / allowed_px) ** 2, 1))
         if len(members) >= MIN_PEERS:
             sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))

@@ -286,9 +286,7 @@ def _look_again(file: ImageFile, camera: Camera, *searched) -> SecondLook | None
 
 
 def _stored_look(stored, meta) -> SecondLook:
-    missed = {
-        parse_label(label): Note(words, code, "", remedy) for label, (words, code, remedy) in meta["missed"].items()
-    }
+    missed = {parse_label(label): Note(**note) for label, note in meta["missed"].items()}
     return SecondLook(parse_labels(meta["labels"]), _part(stored, "centres", 0, Centres), missed)
 
 

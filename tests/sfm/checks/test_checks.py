@@ -17,7 +17,7 @@ from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import face_checks
-from stcal.sfm.checks.board_checks import board_checks
+from stcal.sfm.checks.board_checks import board_checks, radius_checks
 from stcal.sfm.checks.image_checks import moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
 from stcal.sfm.checks.suite import run_checks
@@ -161,6 +161,18 @@ def test_radii_of_another_design_are_no_wrong_pitch(full_scene, lab):
     """All circles of the faces 8 % larger: their slope says 8 %, and their places that the pitch is right."""
     checks = lab.check(full_scene, lab.reshaped(full_scene, lambda image: np.where(on_face(image), 1.08, 1.0)))
     assert not_passed(checks) == {"radius-design": "failed"}
+
+
+@pytest.mark.parametrize(("blur_px", "as_sharp"), [(0.76, True), (4.0, False)])
+def test_radii_may_be_off_by_what_blur_moves_a_bent_edge(small_result, blur_px, as_sharp):
+    """Circles of 4 mm are 8 px in radius here: 4 px of blur move their rims by 1 px."""
+    evidence = small_result.evidence()
+    plain, blurred = (
+        radius_checks(replace(evidence, blur_px=dict.fromkeys(evidence.blur_px, blur)))[1].measured
+        for blur in (0.5, blur_px)
+    )
+    before, after = ({row.name: row.limit for row in rows}["circles of radius 4 mm"] for rows in (plain, blurred))
+    assert (after == before) if as_sharp else (10 < after / before < 40)
 
 
 def test_a_rim_is_said_alone(full_scene, lab):

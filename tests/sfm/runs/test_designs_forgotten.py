@@ -128,8 +128,13 @@ def test_the_parent_of_the_images_is_told_from_them(stcal_sfm, small_set):
 
 
 @pytest.mark.slow
-def test_circles_cut_by_a_rim_are_named_where_a_run_fails(tmp_path):
+def test_circles_cut_by_a_rim_are_named_where_a_run_fails_and_again_from_what_was_kept(stcal_sfm, tmp_path):
     scene = make_scene(SceneOptions(seed=3, width=1728, height=1152, images_per_group=4, groups=(("2", "3"),)))
     write_dataset(tmp_path, scene, RenderOptions(rim_mm=3.3), workers=1)
+    camera, target = tmp_path / "cameras.txt", tmp_path / "target.toml"
     with pytest.raises(StcalError, match=r"; circles cut off on one side in 3 of 4 images: behind a rim\?"):
-        run(tmp_path / "images", tmp_path / "cameras.txt", tmp_path / "out", tmp_path / "target.toml")
+        run(tmp_path / "images", camera, tmp_path / "out", target)
+    command = "detect", tmp_path / "images", "--camera", camera, "--target", target, "--out", tmp_path / "detect"
+    first, again = stcal_sfm(*command), stcal_sfm(*command)
+    assert "should be in view and not measured" in first[1]
+    assert again[1] == first[1]
