@@ -2,7 +2,7 @@
 poses of the robot to take next."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +16,6 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye.methods.closed_form import Bounds
-    from stcal.robot import Robot
     from stcal.workflows.handeye_inputs import Files, Timing
 
 
@@ -64,7 +63,7 @@ class PoseFiles:
     quaternions: shared.Quaternions = "wxyz"
     workers: shared.Workers = None
 
-    def given(self, timing: "Timing", robot: "Robot | None" = None) -> "Files":
+    def given(self, timing: "Timing") -> "Files":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
         from stcal.handeye.data.pose_content import Said
         from stcal.workflows.handeye_inputs import Files, one_source
@@ -75,7 +74,7 @@ class PoseFiles:
             print_each("note", notes)
         else:
             source = shared.Joined(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
-        return Files(source, self.poses, self.camera, self.board, said, self.quaternions, timing, robot)
+        return Files(source, self.poses, self.camera, self.board, said, self.quaternions, timing)
 
 
 POSE_FILES = PoseFiles()
@@ -100,11 +99,6 @@ def handeye(
     sigma_board_mm: Annotated[float | None, "Set σ of a corner's position on the board; 0 if exact.", SIGMA] = None,
     refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones and weighted by their σ."] = False,
     with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
-    with_kinematics: Annotated[
-        Path | None,
-        "Adjust this robot (TOML) and the intrinsics too, from images and joint values: columns q1_deg … of --poses.",
-    ] = None,
-    robot_out: Annotated[Path | None, "Write the adjusted robot of --with-kinematics to this file.", WRITES] = None,
     undo_flips: Annotated[
         bool,
         "Replace a pose of a flat target by its second solution, tilted the other way, if only that one agrees with "
@@ -165,7 +159,6 @@ def handeye(
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.static_transforms import messages
-    from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye_inputs import Timing
     from stcal.workflows.handeye_run import ALL, calibrate_handeye, without_flips
 
@@ -176,13 +169,10 @@ def handeye(
     given, folder = files.given(timing), files.source is not None and files.source.is_dir()
     for code, refusals in {
         "E-OPTION-NEEDS": {
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given": (
-                camera_out and not (refine_camera or with_kinematics)
+            "--camera-out: only with --refine-camera; otherwise the camera stays as given": (
+                camera_out and not refine_camera
             ),
             "--refine-camera: only with images; poses do not determine the intrinsics": refine_camera and not folder,
-            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file": (
-                robot_out and not with_kinematics
-            ),
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name": (
                 (parent or child or camera_frame != "optical") and not (ros or urdf or exports)
             ),
@@ -203,22 +193,12 @@ def handeye(
             f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed": (
                 method not in (None, ALL, *METHODS)
             ),
-            f"--with-kinematics: {method} does not solve for the arm; leave --method out": (
-                with_kinematics and method not in (None, "reprojection")
-            ),
-        },
-        "E-OPTION-CONFLICT": {
-            "--with-kinematics, --four-dof: give one of them; turns about one axis do not determine the kinematics": (
-                with_kinematics and four_dof
-            ),
         },
     }.items():
         for message, refused in refusals.items():
             if refused:
                 raise InputError(code, message)
     forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
-    if with_kinematics:
-        given = replace(given, robot=load_robot(with_kinematics))
     shift = _bounds("--de-bounds-mm", de_bounds_mm, 1.0)
     turn = _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1))
     evolved = EvolutionOptions(bounds_mm=shift) if turn is None else EvolutionOptions(bounds_rad=turn, bounds_mm=shift)
@@ -264,9 +244,6 @@ def handeye(
         camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
         save_camera(camera_out, camera, "colmap")
         say(f"written: {camera_out}")
-    if robot_out and inputs.arm is not None and adjusted is not None and adjusted.arm is not None:
-        save_robot(robot_out, inputs.arm.identified(adjusted.arm))
-        say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
     found = judged(outcome)
     shared.require_passed(strict, found.failed(), report, found.doubt())

@@ -23,7 +23,6 @@ PANELS = {
     "sigma_px sigma_mm sigma_rad",
     "Cross-validation": "held_out splits folds motions_held_out",
     "Clocks of robot and camera": "time_offset image_times time_tolerance",
-    "Errors of the arm itself": "with_kinematics robot_out",
     "Files for other programs": "ros urdf opencv export parent child camera_frame camera_out",
     "Differential evolution": "de_bounds_deg de_bounds_mm",
 }

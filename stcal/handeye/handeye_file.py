@@ -91,7 +91,7 @@ class HandEyeFile(ResultFile):
     )
     sigma: dict[str, float] = Field(
         description="`robot_rad`, `robot_mm`, `camera_rad`, `camera_mm`, `corner_px`, `board_mm` as far as the method "
-        "weights by them; `arm_rad`, `arm_mm`: of the axes about the robot's file; "
+        "weights by them; "
         "`camera_factor`: by which the σ of given covariances of `camera_from_board` were multiplied; "
         "`camera_focal`, `camera_centre`, `camera_radial`, `camera_tangential` (`camera_all` where their covariance is "
         "stated): factors, 1 or more, by which the σ of the camera file were widened"
@@ -116,12 +116,6 @@ class HandEyeFile(ResultFile):
         None,
         description="with `--motions-held-out`: number of `fitted` motions; `names` of the poses from which and to "
         "which each other motion leads, and errors `rotation_rad`, `translation_mm` of X B X⁻¹ against A",
-    )
-    arm: dict[str, Any] | None = Field(
-        None,
-        description="with `--with-kinematics`: name of the `robot`, `parameters` by which its axes are off its file, "
-        "small motions of their frames (`J2 rx`: rad, `J2 x`: mm), their `sigma`, and `plain`: as `held_out` "
-        f"({MEANS}), on the same poses, of the solution without them",
     )
     choice: Annotated[ChosenWay, Named("chosen sentence tried")] | None = Field(
         None,
@@ -156,11 +150,8 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        result, arm, held_out, pitch_mm = outcome.result, outcome.arm, outcome.held_out, outcome.pitch_mm
+        result, held_out, pitch_mm = outcome.result, outcome.held_out, outcome.pitch_mm
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
-        if arm is not None:
-            parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
-            optional["arm"] = parts | {"plain": arm.plain and arm.plain.summary()}
         if whole:
             optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
         adjusted, poses = result.reprojection, []

@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
-from stcal.handeye.handeye_pipeline import ArmFound, Outcome, judged
+from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.handeye_problem import FACTORS, HandEye
 from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
@@ -57,8 +57,6 @@ SIGMA_NAMES = {
     "camera_mm": ("board's pose, position", "mm", 1.0),
     "camera_factor": ("board's pose", "times its own σ", 1.0),
     "board_mm": ("corner on the board", "mm", 1.0),
-    "arm_rad": ("axis of the arm, direction", "°", DEGREE),
-    "arm_mm": ("axis of the arm, place", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
 
@@ -141,7 +139,6 @@ def outcome_report(outcome: Outcome) -> Document:
         [
             Section("Result", answer, terminal=True),
             Section("What was tried", _tried(outcome.choice), terminal=True),
-            Section("The arm", _arm(outcome.arm), terminal=True),
             Section("Methods", _methods(outcome), terminal=True),
             Section("Motions held out", _motions(outcome.motions), terminal=True),
             Section("Poses", poses),
@@ -188,28 +185,6 @@ def _tried(choice: ChosenWay | None) -> list[Block]:
             "taken, unless one that trusts the files more, or states σ, is behind it by no more than chance. The "
             "errors above are those of the whole procedure: in each split, the way is chosen by the errors on all "
             "other poses"
-        ),
-    ]
-
-
-def _arm(arm: ArmFound | None) -> list[Block]:
-    """Returns a table with a row per axis: its deviation from the robot's file, and σ."""
-    if arm is None:
-        return []
-    axes: dict[str, list[str]] = {}
-    for name, value in arm.parameters.items():
-        axis, component = name.split()
-        unit, factor, digits = ("°", DEGREE, 4) if component.startswith("r") else ("mm", 1.0, 3)
-        text = f"{component} {number(value * factor, digits)} ± {number(arm.sigma[name] * factor, digits)} {unit}"
-        axes.setdefault(axis, []).append(text)
-    width = max(map(len, axes.values()))
-    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in axes.items()]
-    return [
-        Table([f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], rows, css="text"),
-        page_only(
-            "Difference of each axis from the robot's file, and σ: rotations (rx, ry) and translations (x, y) of the "
-            "joint's frame, one after the other from the base. What the poses do not determine stays near 0, held by "
-            "the estimated σ of all axes"
         ),
     ]
 

@@ -39,20 +39,6 @@ from stcal.parallel import one_thread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ArmFound:
-    """The arm's parameters, if they were solved for.
-
-    ``robot`` : name of the robot; ``parameters``, ``sigma`` : by name, such as J2 ry in rad, J2 x in mm, small motions
-    of the axes about the robot's file, and their σ; ``plain`` : errors on the same held-out poses without them.
-    """
-
-    robot: str
-    parameters: dict[str, float]
-    sigma: dict[str, float]
-    plain: HeldOutPoses | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
     """A calibration with everything that its report shows.
 
@@ -62,9 +48,8 @@ class Outcome:
     rows that did not take part, and why; ``notes`` : notes in addition to those of the result; ``motions`` : errors of
     the last motions, held out; ``choice`` : the candidates that were tried, if no method was named; ``pairs``,
     ``views`` : the poses that were solved, and their corners if there were images; a symmetric board's as numbered;
-    ``understood`` : how files of other programs were interpreted; ``arm`` : the arm's parameters, if they were solved
-    for; ``time_offset`` : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain
-    its σ.
+    ``understood`` : how files of other programs were interpreted; ``time_offset`` : offset of the robot's clock from
+    the camera's, if it was solved for. σ of the result contain its σ.
     """
 
     where: str
@@ -80,7 +65,6 @@ class Outcome:
     pairs: HandEyePoses | None = None
     views: Views | None = None
     understood: tuple[str, ...] = ()
-    arm: ArmFound | None = None
     time_offset: TimeOffset | None = None
 
     @property
@@ -95,15 +79,7 @@ class Outcome:
 
     def sentence(self) -> str:
         """Returns what was solved for and what that gains; empty if the user chose what to solve for."""
-        if self.arm is None:
-            return self.choice.sentence if self.choice else ""
-        if self.arm.plain is None or self.held_out is None:
-            return f"solved for the parameters of {self.arm.robot} too"
-        with_arm, without_arm = self.held_out.means(), self.arm.plain.means()
-        return (
-            f"with the parameters of {self.arm.robot} solved for, poses held out are missed by "
-            f"{with_arm['board_mm']:.3g} mm at the board, {without_arm['board_mm']:.3g} mm without"
-        )
+        return self.choice.sentence if self.choice else ""
 
     def all_notes(self) -> tuple[str, ...]:
         """Returns the notes of the result, then those of the choice, then the others."""
@@ -185,7 +161,6 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     error, fitted = float(np.sqrt((held.translation_mm[agreeing] ** 2).mean())), result.rms()[1]
     camera_covariance = result.reprojection.camera_covariance if result.reprojection else None
     unknowns = 12 + (result.sigma_scale is not None) + (0 if camera_covariance is None else len(camera_covariance))
-    unknowns += len(outcome.arm.parameters) if outcome.arm else 0
     equations, predicting = 6 * int(good.sum()), 6 * (len(good) - held.rows.shape[1])
     if unknowns >= min(equations, predicting) or fitted < NOTHING_MM:
         return None
@@ -201,9 +176,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
 
 
 def _of_share(outcome: Outcome) -> Finding | None:
-    """Judges the share of the transform's σ in a prediction; unknown with an arm, whose errors cancel the
-    transform's."""
-    if (share := share_of_variance(outcome)) is None or outcome.arm is not None:
+    """Judges the share of the transform's σ in a prediction."""
+    if (share := share_of_variance(outcome)) is None:
         return None
     distance, sigma, shift = share
     part = sigma**2 / (sigma**2 + shift**2)

@@ -17,7 +17,7 @@ from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.bundle import ROBOT, ArmModel
+from stcal.handeye.methods.bundle import ROBOT
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
 from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import (
@@ -184,8 +184,6 @@ class HandEyeOptions(ByValue):
     evolution : options of ``de`` and ``de-polished``
     camera : uncertainty of the camera's parameters if they are not solved for. With views, it is propagated into σ. The
         parameters are exact if None.
-    arm : model of the arm, with the joint vectors of the same poses. Its parameters are solved for too, held by σ that
-        are estimated. Its poses replace those of the pairs. ``reprojection`` only.
     """
 
     noise: Noise = field(default_factory=Noise)
@@ -195,7 +193,6 @@ class HandEyeOptions(ByValue):
     four_dof: bool = False
     evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
     camera: CameraPrior | None = None
-    arm: ArmModel | None = None
 
     def __post_init__(self):
         require_fields(self, "hand-eye")
@@ -203,7 +200,7 @@ class HandEyeOptions(ByValue):
     @property
     def names_unknowns(self) -> bool:
         """True if the options name what is solved for, so that no way of solving is left to choose."""
-        return bool(self.intrinsics or self.with_scale or self.four_dof or self.arm)
+        return bool(self.intrinsics or self.with_scale or self.four_dof)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,8 +220,7 @@ class HandEyeProblem:
 
     def __getitem__(self, rows: np.ndarray) -> "HandEyeProblem":
         """Returns the problem of these poses alone."""
-        views, arm = (None if each is None else each[rows] for each in (self.views, self.options.arm))
-        return replace(self, pairs=self.pairs[rows], views=views, options=replace(self.options, arm=arm))
+        return replace(self, pairs=self.pairs[rows], views=None if self.views is None else self.views[rows])
 
     def without(self, out: np.ndarray) -> "HandEyeProblem":
         """Returns the problem without the poses ``out``, (k,)."""
@@ -260,16 +256,12 @@ class HandEyeProblem:
         if method == "reprojection" and (self.views is None or len(self.views) != len(pairs)):
             said = "hand-eye: reprojection needs the corners of every pose; give views, or use method pose"
             raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
-        if options.arm is not None and method != "reprojection":
-            said = f"hand-eye: {method} does not solve for the arm; give views, and method reprojection"
-            raise InputError("E-HANDEYE-NEEDS-VIEWS", said)
         seen = self.seen  # what the poses must determine
         if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
             said = f"{len(pairs)} poses, {LEAST_WITH_SCALE} needed to find the board's size too; take more"
             raise DegenerateError("E-HANDEYE-FEW-POSES", f"{pairs.where}: {said}")
         problem = self.mended()
-        if options.arm is None:
-            problem.pairs.require_moving_flange()
+        problem.pairs.require_moving_flange()
 
         @cache
         def guess(loop: Loop, with_scale: bool) -> LoopState:
@@ -387,7 +379,7 @@ class HandEyeProblem:
 
         def adjusted(loop: Loop, noise: Noise) -> AdjustedCorners:
             prior, scaled, flange = options.intrinsics, options.with_scale, pairs.base_from_flange
-            return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera, options.arm)
+            return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera)
 
         solution, _, notes = self._by_true_robot(adjusted)
         state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale

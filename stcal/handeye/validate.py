@@ -225,9 +225,7 @@ def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
 
 def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
     """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
-    pairs, arm, adjusted, views = unseen.pairs, unseen.options.arm, result.reprojection, unseen.views
-    if arm is not None and adjusted is not None and adjusted.arm is not None:
-        pairs = replace(pairs, base_from_flange=arm.poses(adjusted.arm))
+    pairs, views = unseen.pairs, unseen.views
     loop, x, z, scale = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board, result.scale
     errors = {"mount_from_camera": x.matrix()}
     if views is not None:

@@ -10,10 +10,10 @@ import numpy as np
 
 from stcal.boards.target_file import load_boards
 from stcal.errors import InputError
-from stcal.geometry.arrays import TWIST, require_arguments
-from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.rigid import Order, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views
-from stcal.handeye.data.pose_content import PoseSide, Said, require_each_once
+from stcal.handeye.data.pose_content import PoseSide, Said
 from stcal.handeye.data.pose_files import (
     ToldPairs,
     own_told,
@@ -32,14 +32,8 @@ from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
-from stcal.io.rotations import places_of
 from stcal.io.table import Table, read_table
 from stcal.parallel import Progress, one_thread
-from stcal.robot import Robot
-from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
-from stcal.robot.kinematics.measurements import joint_values
-from stcal.robot.kinematics.robot_model import Chain
 from stcal.workflows.board_views import Board, detect_boards, kind_of
 
 
@@ -128,59 +122,6 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     return time_of_image
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Arm:
-    """A robot at joint values (m, n) moved by small motions of its axes, as
-    :class:`stcal.handeye.methods.bundle.ArmModel`; X and Z absorb errors of its base and flange."""
-
-    robot: Robot
-    q: np.ndarray
-
-    @property
-    def angles(self) -> np.ndarray:
-        """Boolean array (k,): True for parameters in rad."""
-        return np.array([component < 3 for _, component in chain_parameters(self._chain())])
-
-    def poses(self, parameters: np.ndarray) -> Poses:
-        """Returns base_from_flange, m poses."""
-        return flange_poses(moved_chain(self._chain(), parameters), self.q)
-
-    def slope(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns the derivative (m, 6, k) of :meth:`poses` by a step of the parameters."""
-        chain = moved_chain(self._chain(), parameters)
-        return chain_jacobian(chain, self.q, flange_poses(chain, self.q))
-
-    def __getitem__(self, rows) -> "Arm":
-        """Returns the arm at these joint values alone."""
-        return Arm(self.robot, self.q[rows])
-
-    def identified(self, parameters: np.ndarray) -> Robot:
-        """Returns the robot with these parameters, as D-H rows; base and tools stay as they were."""
-        moved = robot_from_chain(moved_chain(self._chain(), parameters), dict(self.robot.tools), self.robot)
-        return replace(moved, world_from_base=self.robot.world_from_base)
-
-    def names(self) -> tuple[str, ...]:
-        """Returns the names (k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
-        return tuple(f"J{joint + 1} {TWIST[c]}" for joint, c in chain_parameters(self._chain()))
-
-    def _chain(self) -> Chain:
-        return replace(self.robot, world_from_base=Rigid()).chain()
-
-
-def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[PoseSide, Arm]:
-    """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV).
-
-    Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
-    """
-    table = read_table(path, "robot poses", quaternions)
-    arm = Arm(robot, joint_values(table, robot))
-    images, places = tuple(table.text("image")), places_of(table)
-    require_each_once(images, places, table.where, "image ")
-    understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
-    flange = arm.poses(np.zeros(len(arm.angles)))
-    return PoseSide(flange, places, "", names=images, where=str(path), understood=understood), arm
-
-
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | ToldPairs
 
@@ -191,9 +132,8 @@ class HandEyeInput:
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where the user or a file states it; ``arm`` : at the joint
-    values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's
-    stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
+    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -205,7 +145,6 @@ class HandEyeInput:
     left_out: LeftOut = ()
     understood: tuple[str, ...] = ()
     setup: Setup | None = None
-    arm: Arm | None = None
     timed: Timed | None = None
     notes: tuple[str, ...] = ()
 
@@ -245,7 +184,6 @@ def read_handeye(
     tolerance_s: float = TOLERANCE_S,
     image_times: str | Path | None = None,
     time_offset: bool = False,
-    robot: Robot | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> HandEyeInput:
@@ -268,7 +206,6 @@ def read_handeye(
     tolerance_s : time within which the nearest of the robot's poses is taken where none can be interpolated, s
     image_times : table of the times of photographs
     time_offset : whether the offset of the two clocks is to be estimated
-    robot : the robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for
     workers : number of processes; one per core if None
     progress : called with (stage, done, total)
 
@@ -288,7 +225,7 @@ def read_handeye(
     place = Path(source) if isinstance(source, str) else source
     if isinstance(place, Path) and other is not None and not place.is_dir():
         place, notes = one_source(place, other, key, statements, quaternions, timing)
-    files = Files(place, robot_file, camera_file, board_file, statements, quaternions, timing, robot)
+    files = Files(place, robot_file, camera_file, board_file, statements, quaternions, timing)
     return replace(files.read(workers, progress), notes=notes)
 
 
@@ -306,7 +243,6 @@ class Files:
     statements: Said = field(default_factory=Said)
     quaternions: Order = "wxyz"
     timing: Timing = field(default_factory=Timing)
-    robot: Robot | None = None
 
     @one_thread()
     def read(self, workers: int | None = None, progress: Progress | None = None) -> HandEyeInput:
@@ -331,13 +267,12 @@ class Files:
         place, held = source, "is a file of poses"
         if not isinstance(source, Path):
             place, held = source.pairs.where if isinstance(source, ToldPairs) else source.where, "are poses"
-        elif self.robot is None and not source.exists():
+        elif not source.exists():
             raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
         extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
         timed = isinstance(source, ToldPairs) and source.timed is not None
         times = f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
         for message, refused in {
-            "--with-kinematics: only with a folder of images, which show the arm's errors": self.robot is not None,
             f"{extra}: only with a folder of images; {place} {held}": bool(extra),
             "--image-times: only with a folder of images; poses have their times beside them": self.timing.image_times,
             f"{times}and --poses, each with times": self.timing.offset and not timed,
@@ -379,7 +314,6 @@ class _Photographs:
     model: CameraModel
     images: list[ImageFile]
     robot: PoseSide
-    arm: Arm | None
     row_of: dict[str, int]
     understood: tuple[str, ...]
     clock: Clock | None
@@ -387,25 +321,15 @@ class _Photographs:
 
     @classmethod
     def of(cls, files: Files, folder: Path) -> "_Photographs":
-        poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
+        poses, camera, board, timing = files.poses, files.camera, files.board, files.timing
         if poses is None or camera is None or board is None:
             missing = ", ".join(name for name, path in files._of_images().items() if path is None)
             raise InputError("E-OPTION-MISSING", f"image folder {folder}: {missing} needed with images")
-        if files.robot is None:
-            robot = read_robot(poses, files.statements, files.quaternions)
-        elif timing.offset or timing.image_times is not None:
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by "
-                "name; name the images in the column image",
-            )
-        else:
-            robot, arm = read_arm(poses, files.robot, files.quaternions)
+        robot = read_robot(poses, files.statements, files.quaternions)
         design, model = load_boards(board), read_camera(camera)
         images, skipped = find_images(folder)
-        names, late, clock = [image.name for image in images], (), None
-        if arm is None:
-            robot, late, clock = robot_at_images(robot, names, timing)
+        names = [image.name for image in images]
+        robot, late, clock = robot_at_images(robot, names, timing)
         names = [name for name in names if name not in dict(late)]
         row_of, missing, how = rows_of_images(robot, names)
         if not row_of:
@@ -415,7 +339,7 @@ class _Photographs:
         left_out += [(name, f"no row in {poses.name}") for name in names if name not in row_of]
         left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
         understood = (f"robot: {robot.understood}", *([f"images matched {how}"] if how else []))
-        return cls(files, folder, design, model, images, robot, arm, row_of, understood, clock, tuple(left_out))
+        return cls(files, folder, design, model, images, robot, row_of, understood, clock, tuple(left_out))
 
     def lines(self) -> list[str]:
         (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
@@ -450,6 +374,5 @@ class _Photographs:
             (*without_board, *self.left_out),
             (*understood, *(f"board: {part}" for part in detections.unused())),
             self.files.statements.setup,
-            arm=self.arm and self.arm[rows],
             timed=timed,
         )

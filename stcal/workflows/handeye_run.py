@@ -1,6 +1,5 @@
 """Hand-eye calibration from a file of poses or from images of any board, for ``stcal handeye``, and the poses to take
-next within an arm's reach. The offset of the clocks and parameters of the arm may be unknowns too. It composes three
-systems."""
+next within an arm's reach. The offset of the clocks may be unknown too. It composes three systems."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,17 +15,16 @@ from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.conventions import flipped, tilted
 from stcal.handeye.data.pose_pairs import rms_of
 from stcal.handeye.data.stream import LONGEST_S, Timed
-from stcal.handeye.handeye_pipeline import ArmFound, Outcome, validated
+from stcal.handeye.handeye_pipeline import Outcome, validated
 from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, splits
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye_inputs import Arm, HandEyeInput
+from stcal.workflows.handeye_inputs import HandEyeInput
 
 ALL = "all"
 """Word in place of a method's name: all methods, compared."""
@@ -105,8 +103,6 @@ def calibrate_handeye(
         kept = {name: getattr(given, name) for name in ("where", "pitch_mm", "left_out", "understood")}
         kept |= {"pairs": mended.pairs, "views": mended.views}
         outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
-        if given.arm is not None:
-            outcome = with_arm(outcome, given.arm, mended, given.prior, rows, workers, partial(told, "with the arm"))
     except StcalError as error:
         if given.left_out:
             name, why = given.left_out[0]
@@ -130,37 +126,6 @@ NO_COVARIANCE = Aside(
     "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the board's "
     "size, is not in σ; `measure` writes it (columns cov_… and common…)"
 )
-
-
-def with_arm(
-    outcome: Outcome,
-    arm: Arm,
-    problem: HandEyeProblem,
-    prior: CameraPrior | None,
-    rows: np.ndarray,
-    workers: int | None,
-    progress: Callable[[int, int], None],
-) -> Outcome:
-    """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
-
-    ``outcome`` : calibration of the ``problem`` by the robot's file; ``arm`` : at the joint values of the same poses;
-    ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
-    """
-    problem = replace(problem, options=replace(problem.options, arm=arm, intrinsics=prior))
-    solved, notes = validated(problem, "reprojection", rows, None, False, workers, progress), outcome.notes
-    result, held_out, adjusted = solved.result, solved.held_out, solved.result.reprojection
-    if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
-        raise ValueError("reprojection with an arm has its parameters")
-    values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
-    parameters, sigma = (dict(zip(arm.names(), each, strict=True)) for each in values)
-    found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
-    if held_out is not None and outcome.held_out is not None:
-        now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
-        if now >= before:
-            gain = f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
-            notes += (f"{gain}them): leave --with-kinematics out, or take more poses",)
-    notes += solved.notes
-    return replace(outcome, result=result, held_out=held_out, options=problem.options, notes=notes, arm=found)
 
 
 HINT_T, SURE_SIGMAS = 3.0, 4.0
@@ -213,7 +178,7 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
     try:
         if abs(_lag_t(problem, timed, result)) < HINT_T:
             return result, ()
-        plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
+        plain = replace(options, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
         problems = (HandEyeProblem(each, setup, None, plain) for each in (pairs[lag.kept], shifted))

@@ -38,7 +38,6 @@ def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
 def test_exports(stcal_sfm, small_result, small_run, tmp_path):
     for words, call in (
         (("export", "urdf"), lambda out: sfm.export_run(small_result, out)),
-        (("export-model", "nvm", "--format", "nvm"), lambda out: sfm.export_model(small_run, out, "nvm")),
         (("export-database", "db", "--schema", "3.8"), lambda out: sfm.export_database(small_result, out, "3.8")),
     ):
         one, two = tmp_path / f"one.{words[1]}", tmp_path / f"two.{words[1]}"

@@ -250,14 +250,14 @@ def export_database(
 @app.command(name="export-model")
 def export_model(
     run: Run,
-    out: Annotated[Path, "Write to this place: a new file for nvm, a new or empty folder for the others.", Arg("OUT")],
-    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, nvm or bundler.", Opt("--format")],
+    out: Annotated[Path, "Write to this new or empty folder.", Arg("OUT")],
+    kind: Annotated[str, "Write this format: colmap-bin or colmap-txt.", Opt("--format")],
 ) -> None:
     """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
     from stcal.sfm.interop.export_colmap import export_model as export
     from stcal.sfm.interop.export_colmap import model_text
 
-    say(model_text(export(run, out, kind), kind))
+    say(model_text(export(run, out, kind)))
     _warn_of_failures(run)
 
 

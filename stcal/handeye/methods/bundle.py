@@ -1,8 +1,8 @@
-"""Unknowns and residuals of a hand-eye adjustment from corners, and of an arm that is adjusted too."""
+"""Unknowns and residuals of a hand-eye adjustment from corners."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,48 +13,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
 
-
-@runtime_checkable
-class ArmModel(Protocol):
-    """An arm with k parameters, small motions of the axes about the arm's file, and m joint vectors.
-
-    ``angles`` : (k,) bool, True for parameters in rad, False for those in mm; ``poses`` : returns base_from_flange, m;
-    ``slope`` : returns the derivative (m, 6, k) of these, left perturbation, by a small further motion of the axes
-    about their places at ``parameters``; ``arm[rows]`` : the arm with these joint vectors alone.
-    """
-
-    @property
-    def angles(self) -> np.ndarray: ...
-    def poses(self, parameters: np.ndarray) -> Poses: ...
-    def slope(self, parameters: np.ndarray) -> np.ndarray: ...
-    def __getitem__(self, rows: Any) -> "ArmModel": ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearArm:
-    """An arm linearised about ``parameters`` (k,). ``slope`` : (m, 6, k) derivative of the flange's poses by the
-    parameters; ``angles`` : (k,)."""
-
-    parameters: np.ndarray
-    slope: np.ndarray
-    angles: np.ndarray
-
-    def __getitem__(self, rows) -> "LinearArm":
-        """Returns the linearisation with these poses alone."""
-        return LinearArm(self.parameters, self.slope[rows], self.angles)
-
-    def moved(self, base_from_flange: Poses, step: np.ndarray) -> Poses:
-        """Returns the poses (m) of the flange after a step (k,) from the parameters."""
-        motion = self.slope @ step
-        turn = Rotation.from_rotvec(motion[:, :3]).as_matrix()
-        return Poses(turn @ base_from_flange.rotation, base_from_flange.translation + motion[:, 3:])
-
-    def parts(self) -> dict[str, np.ndarray]:
-        """Returns the rows of the parameters by group of σ: directions of axes and places of axes, if any."""
-        rows_of_part = {"arm_rad": np.flatnonzero(self.angles), "arm_mm": np.flatnonzero(~self.angles)}
-        return {name: rows for name, rows in rows_of_part.items() if len(rows)}
-
-
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""
 ROBOT = ("robot_rad", "robot_mm")
@@ -63,7 +21,7 @@ ROBOT = ("robot_rad", "robot_mm")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """The unknowns: X, Z, true base_from_flange (m), corners (K, 3), camera, scale, and a step (k,) of the arm."""
+    """The unknowns: X, Z, true base_from_flange (m), corners (K, 3), camera, and scale."""
 
     mount_from_camera: Rigid
     stand_from_board: Rigid
@@ -71,7 +29,6 @@ class Bundle:
     corners: np.ndarray
     camera: Camera
     scale: float
-    arm: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +39,7 @@ class Corners:
     ``corner`` : (n,) view and corner of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1;
     ``robot`` : (m, 6, 6) whitening in place of σ, or None; ``sigma`` : σ of each kind, 0 where exact; ``basis`` : (16,
     q) of the intrinsics solved for; ``information`` : (q, q) of them about ``camera``, to be divided by the squares of
-    the factors; ``with_scale``; ``arm`` : the arm whose parameters are solved for and by which ``base_from_flange`` was
-    computed, or None.
+    the factors; ``with_scale``.
     """
 
     inverted: bool
@@ -99,7 +55,6 @@ class Corners:
     basis: np.ndarray
     information: np.ndarray
     with_scale: bool
-    arm: LinearArm | None = None
 
     def problem(self) -> Adjustment:
         """Returns the adjustment: X, Z, the scale, and what else has a σ."""
@@ -111,11 +66,6 @@ class Corners:
             for name, rows in camera_parts(self.basis, self.information):
                 root = np.linalg.cholesky(self.information[np.ix_(rows, rows)]).T
                 a.factor(_linear(root, rows), on[-1:], kind=name)
-        if self.arm is not None:
-            arm = self.arm.parameters
-            on.append((a.block("arm", Vector(np.zeros((1, len(arm))))), None))
-            for name, rows in self.arm.parts().items():
-                a.factor(_linear(np.eye(len(rows)), rows, arm[rows]), on[-1:], kind=name)
         m = len(self.base_from_flange)
         if self.robot is not None or self.sigma["robot_mm"]:
             on.append((a.block("robot", Poses.of([Rigid()] * m)), self.view))
@@ -148,9 +98,7 @@ class Corners:
 
     def bundle(self, values: Mapping[str, Any]) -> Bundle:
         """Returns the unknowns, those that are not solved for included."""
-        arm = values["arm"].array[0] if "arm" in values else np.zeros(0)
         flange, camera = self.base_from_flange, self.camera
-        flange = flange if self.arm is None else self.arm.moved(flange, arm)
         if "robot" in values:
             off = values["robot"]
             flange = Poses(off.rotation @ flange.rotation, off.translation + flange.translation)
@@ -158,7 +106,7 @@ class Corners:
             camera = camera.with_parameters(camera.parameters() + self.basis @ values["camera"].array[0])
         corners = values["board"].array if "board" in values else self.xyz_board
         x, z = values["x"][0], values["z"][0]
-        return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]), arm)
+        return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]))
 
     def _placed(self, state: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns of each measured corner its place (n, 3) in the frames of the stand, the mount and the camera."""
@@ -186,7 +134,7 @@ class Corners:
         by_mount = state.camera.projection_jacobian(xyz_camera) @ x.rotation.T
         by_stand = by_mount @ mount_from_stand
         of_board = stand - z.translation
-        slopes = {
+        return {
             "x": np.concatenate([by_mount @ skew(mount - x.translation), -by_mount], axis=2),
             "z": np.concatenate([-by_stand @ skew(of_board), by_stand], axis=2),
             "camera": state.camera.parameter_jacobian(xyz_camera[:, :2] / xyz_camera[:, 2:]) @ self.basis,
@@ -194,12 +142,6 @@ class Corners:
             "board": state.scale * by_stand @ z.rotation,
             "robot": by_mount @ by_hand,
         }
-        if self.arm is not None:  # rotation vectors of a step do not add
-            turns, shifts = self.arm.slope[:, :3], self.arm.slope[:, 3:]
-            cross = skew(turns @ state.arm)
-            to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
-            slopes["arm"] = slopes["robot"] @ np.concatenate([to_left @ turns, shifts], axis=1)[self.view]
-        return slopes
 
     def only(self, keep: np.ndarray) -> "Corners":
         """Returns the problem of the poses ``keep``, a mask (m,)."""
@@ -212,7 +154,6 @@ class Corners:
             xy_px=self.xy_px[rows],
             weight=self.weight[rows],
             robot=None if self.robot is None else self.robot[keep],
-            arm=None if self.arm is None else self.arm[keep],
         )
 
     def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":

@@ -1,6 +1,5 @@
 """Reprojection adjustment: X and Z from the corners in the images, with the errors of robot, board and camera."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.corner_views import Views, resect, whitened
 from stcal.handeye.data.pose_pairs import Loop, LoopState
-from stcal.handeye.methods.bundle import ROBOT, ArmModel, Bundle, Corners, LinearArm, camera_parts, errors
+from stcal.handeye.methods.bundle import ROBOT, Bundle, Corners, camera_parts, errors
 from stcal.handeye.methods.pose_adjustment import (
     CAUTION,
     FALSE_ALARM,
@@ -38,7 +37,7 @@ CAMERA_GAIN = 5.0
 """Gain in cost per intrinsic above which intrinsics are wrong. Eight right ones gain 8 ± 4 together, 1 ± 0.5 each."""
 SAME_DIGITS = 6
 """Decimals of a millimetre to which two places on the board agree that are one corner."""
-FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1, "arm_rad": 1e-3, "arm_mm": 0.5}
+FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1}
 """First guesses of the σ that are estimated."""
 LEAST_SIGMA = {kind: {"px": 1e-6, "rad": 1e-8, "mm": 1e-5}[kind.rpartition("_")[2]] for kind in FIRST}
 """Lower limits of estimated σ: exact data would give 0. The lower limit of the factors of stated camera σ is 1."""
@@ -46,8 +45,6 @@ ROUNDS, SETTLED = 50, 1e-3
 """Rounds in which factors of σ are estimated, and their relative change below which the iteration has converged."""
 ADJUST_ROUNDS, ROUGHLY = 20, 1e-6
 """Rounds of σ, and relative fall of the cost below which the minimisation within a round ends."""
-ARM_ROUNDS, SETTLED_MM = 10, 1e-3
-"""Rounds of linear steps of an arm, and largest motion of a flange, in mm, whose square is negligible."""
 INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
 """Steps from the solution of all poses to one without some; damping of directions that nothing determines."""
 SEEN = 1e-3
@@ -63,8 +60,7 @@ class Reprojection:
     q) covariance of the intrinsics solved for, in the order of their COLMAP model; ``base_from_flange`` : m true poses
     of the flange; as reported for outliers, and where the robot is exact; ``designed``, ``corners`` : (K, 3) the
     board's corners as designed, and as adjusted in the true scale, mm; ``view``, ``corner`` : (n,) pose and row in
-    ``corners`` of each measured corner. Outliers have no corners; ``residuals_px`` : (n, 2) projected minus measured;
-    ``arm``, ``arm_covariance`` : (k,) parameters of the arm, where they were solved for; rad, mm.
+    ``corners`` of each measured corner. Outliers have no corners; ``residuals_px`` : (n, 2) projected minus measured.
     """
 
     camera: Camera
@@ -75,8 +71,6 @@ class Reprojection:
     view: np.ndarray
     corner: np.ndarray
     residuals_px: np.ndarray
-    arm: np.ndarray | None = None
-    arm_covariance: np.ndarray | None = None
 
     def __post_init__(self):
         freeze(self, "designed", (None, 3), "corners")
@@ -110,16 +104,14 @@ def problem(
     noise: Noise,
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
-    arm: LinearArm | None = None,
-    first: Mapping[str, float] = FIRST,
 ) -> tuple[Corners, tuple[str, ...]]:
-    """Returns the problem, and the groups whose σ are to be estimated, from ``first``."""
+    """Returns the problem, and the groups whose σ are to be estimated, from :data:`FIRST`."""
     seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
     designed, corner = np.unique(seen, axis=0, return_inverse=True)
     stated = {name: getattr(noise, name) for name in ("corner_px", *ROBOT, "board_mm")}
-    sigma = {name: first[name] if value is None else value for name, value in stated.items()}
+    sigma = {name: FIRST[name] if value is None else value for name, value in stated.items()}
     free = [name for name, value in stated.items() if value is None]
-    if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of them only: tiny σ there
+    if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of them only: tiny σ there
         sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
     robot = None
     if loop.robot_covariance is not None:
@@ -127,9 +119,6 @@ def problem(
         free = [name for name in free if not name.startswith("robot")]
     basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
-    if arm is not None:
-        sigma |= {name: first[name] for name in arm.parts()}
-        free += list(arm.parts())
     corners = Corners(
         inverted=loop.inverted,
         base_from_flange=base_from_flange,
@@ -144,7 +133,6 @@ def problem(
         basis=basis,
         information=information,
         with_scale=with_scale,
-        arm=arm,
     )
     factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
@@ -342,53 +330,33 @@ def adjust_views(
     intrinsics: CameraPrior | None = None,
     with_scale: bool = False,
     camera: CameraPrior | None = None,
-    arm: ArmModel | None = None,
 ) -> AdjustedCorners:
     """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
 
     ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
     their σ, the true poses of the robot and the true places of the board's corners. Intrinsics about ``intrinsics``
     (whose σ are widened where the corners contradict them) and the board's scale are unknowns on demand. Errors of
-    intrinsics that are not solved for are considered by their prior, ``camera``. The parameters of an ``arm``, which
-    replaces ``base_from_flange``, are unknowns too. Corners and poses have Huber's weights; poses that contradict the
-    others are then left out.
+    intrinsics that are not solved for are considered by their prior, ``camera``. Corners and poses have Huber's
+    weights; poses that contradict the others are then left out.
 
     Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
     """
-    parameters, sigma, settled = np.zeros(0 if arm is None else len(arm.angles)), FIRST, False
-    for _ in range(1 if arm is None else ARM_ROUNDS):
-        linear, flange = None, base_from_flange
-        if arm is not None:
-            linear, flange = LinearArm(parameters, arm.slope(parameters), arm.angles), arm.poses(parameters)
-            loop = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
-        used, good = _near(loop, first), len(loop)
-        while True:
-            rows = np.flatnonzero(used)
-            if len(rows) < 3:
-                said = (
-                    f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
-                )
-                said += "belong together, and the conventions of both"
-                raise DegenerateError("E-HANDEYE-DISAGREE", said)
-            own = loop[rows], flange[rows], views[rows], noise, intrinsics, with_scale
-            corners, free = problem(*own, None if linear is None else linear[rows], sigma)
-            corners, solution, settled = adjust(corners, corners.start(*first), free)
-            inverse = generalised_inverse(solution.normal)
-            bad = contradicting(corners, solution, inverse)
-            if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
-                break
-            used[rows[bad]] = False
-            good -= int(bad.sum())
-        state = corners.bundle(solution.values)
-        if linear is None:
+    used, good = _near(loop, first), len(loop)
+    while True:
+        rows = np.flatnonzero(used)
+        if len(rows) < 3:
+            said = f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
+            said += "belong together, and the conventions of both"
+            raise DegenerateError("E-HANDEYE-DISAGREE", said)
+        corners, free = problem(loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
+        corners, solution, settled = adjust(corners, corners.start(*first), free)
+        inverse = generalised_inverse(solution.normal)
+        bad = contradicting(corners, solution, inverse)
+        if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
             break
-        first = LoopState(state.mount_from_camera, state.stand_from_board, state.scale)
-        parameters = parameters + state.arm
-        sigma = FIRST | {name: float(value) for name, value in corners.sigma.items() if value}
-        if np.linalg.norm(linear.slope[:, 3:] @ state.arm, axis=1).max() < SETTLED_MM:
-            break
-    else:
-        settled = False
+        used[rows[bad]] = False
+        good -= int(bad.sum())
+    state = corners.bundle(solution.values)
     values, camera_error, gain = solution.values, None, 1.0
     if intrinsics is None:
         if camera is not None:
@@ -398,7 +366,7 @@ def adjust_views(
         wider, unknown = corners.with_intrinsics(*UNKNOWN_LENS), UNKNOWN_LENS[0].shape[1]
         step = wider.problem().at(values | {"camera": Vector(np.zeros((1, unknown)))})
         gain = (float(step.right @ generalised_inverse(step.normal) @ step.right) + step.reduction.gain) / unknown
-    covariance, true = {name: inverse[at, at] for name, at in solution.places.items()}, list(flange)
+    covariance, true = {name: inverse[at, at] for name, at in solution.places.items()}, list(base_from_flange)
     for row, pose in zip(rows, state.base_from_flange, strict=True):
         true[row] = pose
     found = Reprojection(
@@ -410,8 +378,6 @@ def adjust_views(
         rows[corners.view],
         corners.corner,
         corners.residuals(state),
-        None if corners.arm is None else corners.arm.parameters + state.arm,
-        covariance.get("arm"),
     )
     sigma_scale = float(np.sqrt(covariance["scale"].item())) if with_scale else None
     hint, of_loop = _scale_hint(corners, values), inverse[:UNKNOWNS, :UNKNOWNS]

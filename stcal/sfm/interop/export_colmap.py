@@ -12,22 +12,19 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.camera_model import camera_from_colmap
 from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
-from stcal.sfm.mapping.database import from_colmap_px, pycolmap, write_database
-from stcal.sfm.mapping.models import open_model, require_keypoints, rigid_from_colmap, write_reconstruction
+from stcal.sfm.mapping.database import pycolmap, write_database
+from stcal.sfm.mapping.models import open_model, require_keypoints, write_reconstruction
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
@@ -163,24 +160,23 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
     """
     run, out, wanted = saved_run(run), Path(out), find_schema(schema)
     require_new(out)
-    with _complete(out) as scratch:
-        pairs = write_copy(run, scratch / out.name, wanted)
+    with _complete(out) as made:
+        pairs = write_copy(run, made, wanted)
     return Exported(out, wanted.name, len(run.observations), pairs, (run.camera.colmap_model,))
 
 
 @contextmanager
-def _complete(*places: Path) -> Iterator[Path]:
-    """Yield a folder for new files or folders, which appear at their places complete or not at all."""
+def _complete(place: Path) -> Iterator[Path]:
+    """Yield the path of a new file or folder, which appears at its place complete or not at all."""
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{places[-1].name}.partial-", dir=places[-1].parent) as scratch:
-            yield Path(scratch)
-            for place in places:
-                require_free(place, folder=place.is_dir())
-                if place.is_dir():
-                    place.rmdir()  # empty; not every system lets a folder take its place
-                (Path(scratch) / place.name).rename(place)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name}.partial-", dir=place.parent) as scratch:
+            yield (made := Path(scratch) / place.name)
+            require_free(place, folder=place.is_dir())
+            if place.is_dir():
+                place.rmdir()  # empty; not every system lets a folder take its place
+            made.rename(place)
     except OSError as error:  # a full disk names no file
-        error.filename = error.filename or str(places[-1])
+        error.filename = error.filename or str(place)
         raise
 
 
@@ -224,8 +220,9 @@ def database_text(written: Exported) -> str:
     )
 
 
-FORMATS = ("colmap-bin", "colmap-txt", "nvm", "bundler")
-"""Formats of a model. OUT is a folder, but a file for NVM, with ``OUT.labels.csv`` beside it."""
+FORMATS = ("colmap-bin", "colmap-txt")
+"""Formats of a model, which is a folder."""
+LABELS = "labels.csv"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
 
@@ -237,8 +234,6 @@ class ExportedModel:
     labels: Path
     images: int
     points: int
-    focal_px: float | None  # of an ideal camera in place of the run's; None if the format holds the run's camera
-    centre_px: tuple[float, float] | None  # OpenCV pixel origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,27 +242,21 @@ class _Point:
     group: str  # empty if several groups share it
     label: Label
     xyz: list[float]  # (3,), target frame, mm
-    rgb: tuple[int, int, int]
-    views: tuple[tuple[int, int], ...]  # (image id, keypoint)
 
 
 @require_arguments
 def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
-    """Writes the final model of a run in another program's format: mm, target frame, labels beside it.
+    """Writes the final model of a run in COLMAP's binary or text format: mm, target frame, labels beside it.
 
     It appears complete or not at all. The model's files must be as the run wrote them.
-
-    NVM and Bundler support one focal length, little distortion and a centred principal point. They get an ideal camera
-    without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
-    undistorted to match.
 
     Parameters
     ----------
     run : str, Path, SavedRun or RunResult
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
-        New file for ``nvm``, new or empty folder for the others; missing parent folders are made.
-    form : {"colmap-bin", "colmap-txt", "nvm", "bundler"}
+        New or empty folder; missing parent folders are made.
+    form : {"colmap-bin", "colmap-txt"}
         The format.
 
     Raises
@@ -276,45 +265,28 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
         Not a finished run, a damaged or changed model, an unknown format, a name that it cannot hold, or ``out``
         exists.
     """
-    out, kind, is_folder = Path(out), form, form != "nvm"
-    if kind not in FORMATS:
-        raise InputError("E-OPTION-FORM", f"format {kind}: unknown; give one of {', '.join(FORMATS)}")
-    labels = out / "labels.csv" if is_folder else out.with_name(f"{out.name}.labels.csv")
+    out = Path(out)
+    if form not in FORMATS:
+        raise InputError("E-OPTION-FORM", f"format {form}: unknown; give one of {', '.join(FORMATS)}")
     existing = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
     if not existing.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{out}: {existing} is a file; give another place")
-    places = [out] if is_folder else [labels, out]
-    for place in places:
-        require_free(place, folder=is_folder)
+    require_free(out, folder=True)
     saved = saved_run(run)
     reconstruction, points = _labelled_points(saved)
-    (native,) = reconstruction.cameras.values()
-    camera = camera_from_colmap(
-        native.model.name, native.width, native.height, list(native.params), saved.folder
-    ).sized(0, 0)
     spaced = [image.name for image in saved.observations if " " in image.name]
-    if spaced and kind in ("colmap-txt", "bundler"):
+    if spaced and form == "colmap-txt":
         raise InputError(
             "E-MODEL-NAMES",
-            f"format {kind}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
+            f"format {form}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
             "or rename the image and run again",
         )
-    texts, focal_px = {labels.name: _labels_csv(points, saved.faces, kind)}, float(camera.focal.mean())
-    if kind in IDEAL:
-        images = [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
-        texts |= dict(zip((out.name,) if kind == "nvm" else ("bundle.out", "list.txt"),
-                          IDEAL[kind](images, points, _ideal_views(images, points, camera, focal_px), focal_px),
-                          strict=True))  # fmt: skip
     out.parent.mkdir(parents=True, exist_ok=True)
-    with _complete(*places) as scratch:
-        folder = scratch / out.name if is_folder else scratch
-        folder.mkdir(exist_ok=True)
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        if kind not in IDEAL:
-            write_reconstruction(reconstruction, folder, text=kind == "colmap-txt")
-    optics = (focal_px, ((camera.width - 1) / 2, (camera.height - 1) / 2)) if kind in IDEAL else (None, None)
-    return ExportedModel(out, labels, len(reconstruction.reg_image_ids()), len(points), *optics)
+    with _complete(out) as folder:
+        folder.mkdir()
+        (folder / LABELS).write_text(_labels_csv(points, saved.faces), encoding="utf-8")
+        write_reconstruction(reconstruction, folder, text=form == "colmap-txt")
+    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(points))
 
 
 def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
@@ -346,91 +318,25 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
         point.color = np.array(colour, np.uint8)
         group = groups.pop() if len(groups) == 1 else ""
-        points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))
+        points.append(_Point(point_id, group, label, point.xyz.tolist()))
     return reconstruction, points
 
 
-def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
-    """Returns ``labels.csv``. Its first column is the point's id in COLMAP's files, in others its index from 0."""
+def _labels_csv(points: Sequence[_Point], faces: FacesFile) -> str:
+    """Returns ``labels.csv``. Its first column is the point's id."""
     covariance = faces.circle_covariance_mm2
     rows: list[Sequence] = [LABEL_COLUMNS]
-    for place, point in enumerate(points):
+    for point in points:
         sigma = [""] * 3
         if point.label in covariance:
             sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
-        name = point.id if kind.startswith("colmap") else place
-        rows.append([name, point.group, point.label, *map(repr, point.xyz), *sigma])
+        rows.append([point.id, point.group, point.label, *map(repr, point.xyz), *sigma])
     return csv_text(rows)
 
 
-View = tuple[int, int, float, float]
-"""Place of the image, keypoint, and x and y in the ideal camera, px, relative to the principal point, y down."""
-
-
-def _ideal_views(
-    images: Sequence[pycolmap.Image], points: Sequence[_Point], camera: Camera, focal_px: float
-) -> list[list[View]]:
-    """Returns the views of every point in the ideal camera."""
-    place = {image.image_id: i for i, image in enumerate(images)}
-    xy_px = np.concatenate([[images[place[i]].points2D[k].xy for i, k in point.views] for point in points])
-    ideal = iter((focal_px * camera.normalised_from_pixel(from_colmap_px(xy_px))).tolist())
-    return [
-        [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, ideal, strict=False)]  # which goes on
-        for point in points
-    ]
-
-
-def _nvm(
-    images: Sequence[pycolmap.Image], points: Sequence[_Point], views: Sequence[list[View]], focal_px: float
-) -> tuple[str]:
-    """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
-    MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
-    lines = ["NVM_V3 ", " ", f"{len(images)}  "]
-    for image in images:
-        x, y, z, w = image.cam_from_world().rotation.quat.tolist()
-        centre = image.projection_center().tolist()
-        lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
-    lines += ["", str(len(points))]
-    for point, own in zip(points, views, strict=True):
-        lines.append(_numbers(*point.xyz, *point.rgb, len(own), *chain(*own)))
-    return ("\n".join([*lines, "", "0", ""]),)
-
-
-def _bundler(
-    images: Sequence[pycolmap.Image], points: Sequence[_Point], views: Sequence[list[View]], focal_px: float
-) -> tuple[str, str]:
-    """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
-    lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
-    up_from_down = np.diag([1.0, -1.0, -1.0])
-    for image in images:
-        pose = rigid_from_colmap(image.cam_from_world())
-        rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
-        lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
-    for point, own in zip(points, views, strict=True):
-        up = chain(*((i, k, x, -y) for i, k, x, y in own))
-        lines += [_numbers(*point.xyz), _numbers(*point.rgb), _numbers(len(own), *up)]
-    return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
-
-
-def _numbers(*values: float) -> str:
-    """Returns the shortest text that reads back as the same numbers."""
-    return " ".join(map(repr, values))
-
-
-IDEAL = {"nvm": _nvm, "bundler": _bundler}  # writers of the formats that know an ideal camera alone
-
-
-def model_text(written: ExportedModel, kind: str) -> str:
-    """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
-    lines = [
-        f"{written.images} images and {written.points} points; mm, target frame: {written.path}",
-        f"labels: {written.labels}",
-    ]
-    if written.focal_px is not None and written.centre_px is not None:
-        x, y = written.centre_px
-        lines.append(
-            f"{kind} knows one focal length and a principal point at the centre: the keypoints are those of an ideal "
-            f"camera without distortion, f = {written.focal_px:.4f} px, principal point ({x:g}, {y:g}) px; undistort "
-            "the photographs to it to match"
-        )
-    return "\n".join(lines)
+def model_text(written: ExportedModel) -> str:
+    """Returns a text on the contents of the model."""
+    return (
+        f"{written.images} images and {written.points} points; mm, target frame: {written.path}\n"
+        f"labels: {written.labels}"
+    )

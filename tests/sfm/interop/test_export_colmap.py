@@ -1,8 +1,7 @@
 """Databases and models for other versions of COLMAP and other programs.
 
 Only native COLMAP 3.8 and pycolmap 4.2 run here. The other schemas are compared with what was published: a checksum of
-the description of the empty database that each version made when it was run. Models are read back by COLMAP, and by
-small readers of what the formats' documents say.
+the description of the empty database that each version made when it was run. Models are read back by COLMAP.
 """
 
 import csv
@@ -14,16 +13,12 @@ import shutil
 import sqlite3
 import subprocess
 from contextlib import closing
-from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 import pycolmap
 import pytest
-from scipy.spatial.transform import Rotation
 
-from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_colmap import SCHEMAS, export_database, export_model
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with, refuses
@@ -212,7 +207,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(saved, tmp_path, monke
 
 AGAIN_PX = 5e-5
 """The eccentricity, settled group by group in ``labels.csv``, is computed again in the joint adjustment: nanometres."""
-FORMATS = ("colmap-bin", "colmap-txt", "nvm", "bundler")
+FORMATS = ("colmap-bin", "colmap-txt")
 
 
 @pytest.fixture(scope="module")
@@ -255,70 +250,12 @@ def own(small_run, tmp_path):
 
 
 def labels_of(path) -> list[dict]:
-    beside = path / "labels.csv" if path.is_dir() else path.with_name(f"{path.name}.labels.csv")
-    with open(beside, encoding="utf-8", newline="") as stream:
+    with open(path / "labels.csv", encoding="utf-8", newline="") as stream:
         return list(csv.DictReader(stream))
 
 
 def xyz_of(row: dict) -> np.ndarray:
     return np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
-
-
-def read_nvm(path):
-    """Cameras as (name, f, R, t), points as (xyz, rgb, views). VisualSFM: quaternion w x y z, camera centre,
-    distortion, 0; measurements relative to the principal point, x right, y down."""
-    lines = path.read_text(encoding="utf-8").split("\n")
-    assert lines[0].split() == ["NVM_V3"]
-    words = " ".join(lines[1:]).split()
-    count, words = int(words[0]), words[1:]
-    cameras = []
-    for i in range(count):
-        name, *numbers = words[11 * i : 11 * i + 11]
-        f, w, x, y, z, *centre, distortion, end = map(float, numbers)
-        assert distortion == end == 0
-        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
-        cameras.append((name.replace('"', " "), f, rotation, -rotation @ centre))
-    words = words[11 * count :]
-    points, words = [], iter(words[1:])
-    for _ in range(int(lines[lines.index("", 2) + 1])):
-        xyz, rgb = [float(next(words)) for _ in range(3)], [int(next(words)) for _ in range(3)]
-        views = [
-            (int(next(words)), int(next(words)), float(next(words)), float(next(words)))
-            for _ in range(int(next(words)))
-        ]
-        points.append((np.array(xyz), rgb, views))
-    assert list(words) == ["0"]
-    return cameras, points
-
-
-def project(camera, xyz, forward: int):
-    """Place in the image of a camera that looks along +Z or −Z."""
-    _, f, rotation, translation = camera
-    x, y, z = forward * (rotation @ xyz + translation)
-    assert z > 0
-    return f * forward * np.array([x, y]) / z
-
-
-def read_bundler(path):
-    """As :func:`read_nvm`. Bundler's manual: P = R X + t, p = -P / P.z, p' = f p; x right, y up from the centre."""
-    lines = (path / "bundle.out").read_text(encoding="ascii").splitlines()
-    names = (path / "list.txt").read_text(encoding="utf-8").splitlines()
-    assert lines[0] == "# Bundle file v0.3"
-    images, count = map(int, lines[1].split())
-    assert images == len(names)
-    rows = [np.array(line.split(), float) for line in lines[2:]]
-    cameras = []
-    for i, name in enumerate(names):
-        (f, k1, k2), *rotation, translation = rows[5 * i : 5 * i + 5]
-        assert k1 == k2 == 0
-        cameras.append((name, f, np.array(rotation), translation))
-    points = []
-    for k in range(count):
-        xyz, rgb, views = rows[5 * images + 3 * k : 5 * images + 3 * k + 3]
-        quadruples = views[1:].reshape(-1, 4)
-        assert views[0] == len(quadruples)
-        points.append((xyz, rgb.astype(int).tolist(), [(int(i), int(k), x, y) for i, k, x, y in quadruples]))
-    return cameras, points
 
 
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
@@ -344,38 +281,6 @@ def test_colmap_has_the_runs_circles_poses_and_keypoints(exported, known, keypoi
         assert np.abs(pose.translation - translation).max() < 1e-9
         for k, point in enumerate(images[name].points2D):
             assert np.abs(point.xy - 0.5 - keypoints[name, k][1]).max() < AGAIN_PX
-
-
-@pytest.mark.parametrize(
-    ("kind", "read", "up"),
-    [("nvm", read_nvm, 1), ("bundler", read_bundler, -1)],
-)
-def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keypoints, kind, read, up):
-    camera = read_camera(small_run / "inputs/cameras.txt").sized(0, 0)
-    cameras, points = read(exported[kind])
-    rows = labels_of(exported[kind])
-    assert [int(row["point"]) for row in rows] == list(range(len(points)))
-    assert {name for name, *_ in cameras} == known[2].keys()
-    residuals, seen = [], 0
-    for row, (xyz, _, views) in zip(rows, points, strict=True):
-        assert np.abs(xyz - xyz_of(row)).max() < 1e-9
-        for i, k, x, y in views:
-            name, focal, *_ = cameras[i]
-            label, corrected_px = keypoints[name, k]
-            assert label == row["label"]
-            # Seen through the run's own lens, the keypoint is where the run has it.
-            assert np.abs(camera.pixel_from_normalised(np.array([x, up * y]) / focal) - corrected_px).max() < AGAIN_PX
-            rotation, translation = known[2][name]
-            truth = rotation @ xyz + translation
-            projected = project(cameras[i], xyz, up)
-            assert np.abs(projected - focal * truth[:2] / truth[2] * [1, up]).max() < 1e-6
-            residuals.append(projected - [x, y])
-            seen += 1
-    own = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["summary"]
-    assert seen == own["observations"]
-    # The lens stretches residuals by a few per cent.
-    assert np.sqrt(np.mean(np.square(residuals))) == pytest.approx(own["residual_rms_px"], rel=0.1)
-    assert own["residual_rms_px"] < 0.02
 
 
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
@@ -404,24 +309,6 @@ def test_native_colmap_reads_it(exported, kind, tmp_path):
             assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
 
 
-def test_two_focal_lengths_become_one(own, tmp_path, keypoints):
-    model = read_camera(own / "inputs/cameras.txt")
-    camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
-    write_cameras_txt(own / "inputs/cameras.txt", camera)
-    native = pycolmap.Reconstruction(str(own / "colmap/target_model"))
-    native.camera(1).params = camera.colmap_params()
-    native.write_binary(str(own / "colmap/target_model"))
-    written = export_model(own, tmp_path / "model.nvm", "nvm")
-    assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
-    cameras, points = read_nvm(tmp_path / "model.nvm")
-    for _, _, views in points:
-        for i, k, x, y in views:
-            name, focal, *_ = cameras[i]
-            assert focal == written.focal_px
-            seen = camera.pixel_from_normalised(np.array([x, y]) / focal)
-            assert np.abs(seen - keypoints[name, k][1]).max() < AGAIN_PX
-
-
 def test_a_model_that_was_changed_is_refused(small_run, tmp_path):
     own = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache", "overlays"))
     model = pycolmap.Reconstruction(str(own / "colmap/target_model"))
@@ -433,7 +320,7 @@ def test_a_model_that_was_changed_is_refused(small_run, tmp_path):
 
 
 def test_labels_carry_group_and_sigma(exported, known):
-    rows = {(row["group"], row["label"]): row for row in labels_of(exported["nvm"])}
+    rows = {(row["group"], row["label"]): row for row in labels_of(exported["colmap-txt"])}
     faces = known[0]
     assert {group for group, label in rows if label.startswith("board:")} == {"12", "14"}
     assert {group for group, label in rows if label.startswith("1:")} == {""}  # both groups have it in common
@@ -451,24 +338,11 @@ def test_a_chained_run_has_no_sigma(own, tmp_path):
     faces = json.loads((own / "faces.json").read_text(encoding="utf-8"))
     del faces["circle_covariance_mm2"]
     (own / "faces.json").write_text(json.dumps(faces), encoding="utf-8")
-    export_model(own, tmp_path / "model.nvm", "nvm")
-    assert {row[f"sigma_{axis}_um"] for row in labels_of(tmp_path / "model.nvm") for axis in "xyz"} == {""}
+    export_model(own, tmp_path / "model", "colmap-bin")
+    assert {row[f"sigma_{axis}_um"] for row in labels_of(tmp_path / "model") for axis in "xyz"} == {""}
 
 
-def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(own, tmp_path):
-    for name in ("labels.csv", "report.json"):
-        text = (own / name).read_text(encoding="utf-8")
-        (own / name).write_text(text.replace("IMG_1000", "IMG 1000"), encoding="utf-8")
-    model = pycolmap.Reconstruction(str(own / "colmap/target_model"))
-    for image_id in model.reg_image_ids():
-        model.image(image_id).name = model.image(image_id).name.replace("IMG_1000", "IMG 1000")
-    model.write_binary(str(own / "colmap/target_model"))
-    export_model(own, tmp_path / "model.nvm", "nvm")
-    assert '\n12/IMG"1000.jpg ' in (tmp_path / "model.nvm").read_text(encoding="utf-8")
-    assert "12/IMG 1000.jpg" in {name for name, *_ in read_nvm(tmp_path / "model.nvm")[0]}
-
-
-@pytest.mark.parametrize("kind", ["nvm", "bundler"])  # a file, and a folder
+@pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
 def test_no_model_is_overwritten(small_run, tmp_path, kind):
     (tmp_path / "file").write_text("mine", encoding="utf-8")
     (tmp_path / "full").mkdir()
@@ -480,7 +354,7 @@ def test_no_model_is_overwritten(small_run, tmp_path, kind):
 
 
 def test_errors(own, small_run, tmp_path):
-    def refused(error, run, kind="nvm"):
+    def refused(error, run, kind="colmap-bin"):
         refuses(error, export_model, run, out, kind)
         assert not out.exists()
 
