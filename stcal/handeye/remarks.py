@@ -251,8 +251,9 @@ class Verdict:
         return "" if self.word == GOOD else self.answer().lines()[0]
 
     def answer(self) -> Answer:
-        """Returns the answer at the head of a report."""
-        return Answer(dict(zip(get_args(Word), ("yes", "with care", "no"), strict=True))[self.word], self._why())
+        """Returns the answer at the head of a report; the first finding alone where all are good."""
+        why = self.findings[0].said if self.word == GOOD else self._why()
+        return Answer(dict(zip(get_args(Word), ("yes", "with care", "no"), strict=True))[self.word], why)
 
     def _why(self) -> str:
         return "; ".join(each.said for each in self.reasons())

@@ -171,8 +171,9 @@ def _where_it_holds(found: Findings) -> list[Block]:
             places, error = field.grid["xyz_a_mm"], field.grid["error_mm"]
             return _views(found.b_from_a @ places, error, np.ones(len(places), bool))
 
-        about = "Systematic error to expect of the transform at places in and around the points, enlarged, frame b"
-        blocks.append(plot(figure, "systematic error over the workspace", about))
+        if field.seen:
+            about = "Systematic error to expect of the transform at places in and around the points, enlarged, frame b"
+            blocks.append(plot(figure, "systematic error over the workspace", about))
     if reach is not None:
         middle = " ".join(f"{v:.1f}" for v in reach.middle)
         explained = (

@@ -254,7 +254,9 @@ def test_page_shows_outliers_and_escapes_names():
     page = registration_report(found_of(), [Section("One <more>", ["section"])]).page()
     assert "pairs &lt;a&amp;b&gt;.csv" in page
     assert "<a&b>" not in page
-    assert page.count("data:image/svg+xml;base64,") == 2
+    assert page.count("data:image/svg+xml;base64,") == 1
+    bent = registration_report(found_of(n=60, bend=0.15)).page()
+    assert bent.count("data:image/svg+xml;base64,") == 2  # a systematic error is drawn, noise is not
     order = [
         page.index(f'id="{key}"') for key in ("result", "residuals-in-space", "where-it-holds", "one-more", "rows")
     ]

@@ -76,14 +76,12 @@ def results(file: BudgetFile) -> list[Block]:
         ["–".join(each.faces), as_exact(each.angle_deg, 1e-3 * (u := each.angle_mdeg.expanded)), significant(u)]
         for each in file.angles
     ]
-    lengths = [
-        [
-            "–".join(own.circles),
-            *(as_exact(v, 1e-3 * own.distance_um.expanded) for v in (own.length_mm, own.corrected_mm)),
-            significant(own.distance_um.expanded),
-        ]
-        for own in file.distances
-    ]
+    corrected = ["corrected for what is stated, mm"]
+    corrected *= any(own.corrected_mm != own.length_mm for own in file.distances)
+    lengths = []
+    for own in file.distances:
+        u, values = own.distance_um.expanded, (own.length_mm, own.corrected_mm)[: 1 + len(corrected)]
+        lengths.append(["–".join(own.circles), *(as_exact(v, 1e-3 * u) for v in values), significant(u)])
     circles = [
         [label, *with_u(e.position_mm, e.position_xyz_um, e.coverage_factor)] for label, e in file.circles.items()
     ]
@@ -92,7 +90,7 @@ def results(file: BudgetFile) -> list[Block]:
         Table(heads("position of face", "mm", "µm"), positions),
         Table(heads("rotation vector of face", "°", "mdeg"), rotations),
         Table(["<angle of faces", "°", "U, mdeg"], angles),
-        Table(["<distance of", "as calibrated, mm", "corrected for what is stated, mm", "U, µm"], lengths),
+        Table(["<distance of", "as calibrated, mm", *corrected, "U, µm"], lengths),
         Table(heads("circle", "mm", "µm"), circles),
     ]
 

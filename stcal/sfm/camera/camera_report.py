@@ -156,7 +156,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     parameters.append(plot(lambda: field_figure(*moved_px(lens)), "What the lens moves"))
     uncertainty = [
         "How well it is known where the camera sees a known direction, up to a rotation of the camera, which poses "
-        "absorb. White: dots",
+        "absorb. Points: those of the boards",
         plots(plot(lambda: sigma_map(result), "σ of a projection over the image", "", "")),
     ]
     residuals = [
