@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 LEAST_SIDE = 4
 """Smallest number of rows before and after a jump. Fewer are outliers, which are named by themselves."""
@@ -119,7 +119,8 @@ def _best(errors: np.ndarray, basis: np.ndarray, motions: np.ndarray, good: np.n
     inverse = np.where(keep, 1 / np.where(keep, values, 1.0), 0.0)
     gains, counts = (inside**2 * inverse).sum(1), keep.sum(1)
     ratio = gains / np.maximum(counts, 1) / np.maximum((square - gains) / np.maximum(freedom - counts, 1), 1e-300)
-    chances = np.where(counts > 0, f_distribution.logsf(ratio, np.maximum(counts, 1), freedom - counts), 0.0)
+    chances = np.maximum(fdtrc(np.maximum(counts, 1), freedom - counts, ratio), np.finfo(float).tiny)
+    chances = np.where(counts > 0, np.log(chances), 0.0)
     if not counts.any():
         return None
     best = int(chances.argmin())

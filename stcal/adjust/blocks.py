@@ -160,11 +160,8 @@ def component_variances(
         remaining = residuals - jacobian @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
         fitted = np.einsum("mab,mb->ma", inverse, remaining)
         value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * remaining).sum()
-        gradient = np.einsum("mab,kmba->k", inverse, free)
-        weighted_free = np.einsum("kmab,mbj->kmaj", free, weighted)
-        gradient = gradient - np.einsum("mai,kmaj,ij->k", weighted, weighted_free, covariance, optimize=True)
-        gradient = gradient - np.einsum("ma,kmab,mb->k", fitted, free, fitted, optimize=True)
-        return float(value - caution * logs.sum()), gradient * theta - caution
+        inner = inverse - weighted @ covariance @ np.swapaxes(weighted, 1, 2) - fitted[:, :, None] * fitted[:, None]
+        return float(value - caution * logs.sum()), np.tensordot(free, inner, 3) * theta - caution
 
     limits = np.log(np.column_stack(bounds))
     optimum = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})

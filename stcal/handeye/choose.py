@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
@@ -152,7 +152,7 @@ def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool
         off = basis.T @ (found.camera.parameters() - problem.views.camera.parameters()) / basis.sum(0)
         if found.camera_covariance is not None:
             tests.append((float(off @ generalised_inverse(found.camera_covariance) @ off), len(off)))
-    return all(share * squared > chi2.ppf(1 - SHOWN, dof) for squared, dof in tests)
+    return all(share * squared > chdtri(dof, SHOWN) for squared, dof in tests)
 
 
 def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tried:
@@ -256,7 +256,7 @@ def widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye,
             continue
         gap = Poses.of([rival.mount_from_camera]).difference(Poses.of([result.mount_from_camera]))[0]
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
-        if squared > chi2.ppf(1 - CONTRADICT, 6):
+        if squared > chdtri(6, CONTRADICT):
             ratio, turn, shift = np.sqrt(squared / 6), np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             factor = max(factor, ratio)
             notes.append(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Never
 
 import numpy as np
-from scipy.stats import f
+from scipy.special import fdtri
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
@@ -16,6 +16,7 @@ from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, LengthUnit, Loop, Setup
 from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS
 from stcal.handeye.remarks import (
     BAD,
     CARE,
@@ -115,13 +116,15 @@ WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 that were never calibrated and poses of single tags stay below half of these."""
 OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
 """Deviation of a board's size, and in σ, beyond which it is told: printers err by that, measured pitches do not."""
+FEW_FREEDOM = 12
+"""Redundancy of four poses, of which σ are known to 1/√24, 20 %."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
 
 def judged(outcome: Outcome) -> Verdict:
     """Returns the verdict on a calibration."""
-    kinds = (_of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers)
+    kinds = _of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers, _of_number
     tests = [judge(outcome) for judge in kinds]
     for note in outcome.all_notes():  # the text behind a note's colon is the remedy
         if not isinstance(note, Aside):
@@ -159,20 +162,29 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     if not agreeing.any():
         return None
     error, fitted = float(np.sqrt((held.translation_mm[agreeing] ** 2).mean())), result.rms()[1]
-    camera_covariance = result.reprojection.camera_covariance if result.reprojection else None
-    unknowns = 12 + (result.sigma_scale is not None) + (0 if camera_covariance is None else len(camera_covariance))
+    intrinsics = result.reprojection.camera_covariance if result.reprojection else None
+    unknowns = UNKNOWNS + (result.sigma_scale is not None) + (0 if intrinsics is None else len(intrinsics))
     equations, predicting = 6 * int(good.sum()), 6 * (len(good) - held.rows.shape[1])
     if unknowns >= min(equations, predicting) or fitted < NOTHING_MM:
         return None
     # The fit makes residuals smaller than the errors; its own error makes errors on held-out poses larger.
     expected = (1 + unknowns / predicting) / (1 - unknowns / equations)
     dof = equations / 2, (equations - unknowns) / 2
-    limits = [fitted * float(np.sqrt(expected * f.ppf(1 - odds, *dof))) for odds in (SUSPICIOUS, FAILED)]
+    limits = [fitted * float(np.sqrt(expected * fdtri(*dof, 1 - odds))) for odds in (SUSPICIOUS, FAILED)]
     word, promised = _word(error, *limits), f"the residuals of {fitted:.3g} mm promise"
     promise = f"as {promised}" if word == GOOD else f"where {promised} {fitted * np.sqrt(expected):.3g} mm"
     said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
     remedy = "take more poses, and look for poses that do not belong to the others"
     return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
+
+
+def _of_number(outcome: Outcome) -> Finding | None:
+    """Doubts a result of so few poses that σ, which are estimated from them, are themselves known to 20 % at best."""
+    used = int((~outcome.result.outliers).sum())
+    if 6 * used - UNKNOWNS > FEW_FREEDOM:
+        return None
+    said = f"{used} poses are few: neither σ nor outliers can be trusted"
+    return Finding("Number of poses", CARE, said, remedy="take ten poses or more, and turn the flange about two axes")
 
 
 def _of_share(outcome: Outcome) -> Finding | None:

@@ -6,7 +6,7 @@ from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, ByValue, freeze, require_fields
@@ -356,7 +356,7 @@ class HandEyeProblem:
             notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
         if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
             factor, redundancy = solution.variance_factor, solution.redundancy
-            low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
+            low, high = chdtri(redundancy, [0.9995, 0.0005]) / redundancy
             if not low <= factor <= high:
                 times = f"the residuals are {np.sqrt(factor):.2g} times what the stated σ make expect"
                 notes += (f"{times}; correct σ, or look for errors",)
@@ -428,7 +428,7 @@ class HandEyeProblem:
         estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
         if rad and mm:
             dof = max(3 * (len(loop) - LEAST_WITH_SCALE), 3)
-            limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
+            limit = max(ROBOT_BEYOND, float(np.sqrt(chdtri(dof, BY_CHANCE) / dof)))
             contradicted = estimated[0] > limit * rad or estimated[1] > limit * mm
         else:  # an exact robot, with which corners or the board's poses fit worse
             shared = [
@@ -439,7 +439,7 @@ class HandEyeProblem:
         if contradicted and isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
             # σ of a robot far better than the camera hardly show: what is estimated then is no evidence by itself.
             used = ~free.outliers
-            contradicted = solution.misfit(used) - free.misfit(used) >= chi2.ppf(1 - BY_CHANCE, len(ROBOT))
+            contradicted = solution.misfit(used) - free.misfit(used) >= chdtri(len(ROBOT), BY_CHANCE)
         if not contradicted:
             return solution, noise, ()
         note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "

@@ -213,7 +213,7 @@ def budget(
         require_pdf()
     fields = fields_of(field or ())
     result = uncertainty_budget(run, statement, fields, check_lengths, lengths, lengths_statement)
-    say(result.document().text() if verbose() else budget_in_brief(result.file))
+    say(result.document().text() if verbose() else budget_in_brief(result.file, page is not None))
     write_if(out, lambda: result.file, "as JSON")
     if page:
         html = result.document().page()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, f
+from scipy.special import chdtri, fdtri
 
 from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
@@ -269,7 +269,7 @@ def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Returns poses to start with, by σ from medians: at least the better two thirds, so as not to select by chance."""
     squared = _squared(residuals, covariance)
     enough = min(max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES), len(squared))
-    return squared <= max(chi2.ppf(1 - FALSE_ALARM, 6), np.sort(squared)[enough - 1])
+    return squared <= max(chdtri(6, FALSE_ALARM), np.sort(squared)[enough - 1])
 
 
 def _agreeing(
@@ -281,8 +281,8 @@ def _agreeing(
     redundancy = 6 * int(used.sum()) - count - 6
     if redundancy < 6:
         return used
-    level = 1 - FALSE_ALARM / m
-    limit = 6 * f.ppf(level, 6, redundancy) if estimated else chi2.ppf(level, 6)
+    chance = FALSE_ALARM / m
+    limit = 6 * fdtri(6, redundancy, 1 - chance) if estimated else chdtri(6, chance)
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian
     solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import f
+from scipy.special import fdtri
 
 from stcal.adjust.blocks import Vector
 from stcal.adjust.engine import Solution
@@ -400,7 +400,7 @@ def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> 
     turned = np.einsum("mab,ma->mb", vector, white)
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
     redundancy = max(6 * (m - 1) - at.start + (not corners.with_scale), 6)
-    return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
+    return squared > 6 * fdtri(6, redundancy, 1 - FALSE_ALARM / m)
 
 
 def _scale_hint(corners: Corners, values: dict[str, Any]) -> tuple[float, float]:

@@ -14,8 +14,7 @@ from itertools import compress
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.special import chdtr, chdtrc
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc, chdtri
 
 from stcal.adjust.blocks import Components, Equations
 from stcal.geometry.clusters import by_clusters
@@ -497,8 +496,8 @@ class _LinearRows:
                 return np.ones(r, bool)
             share = 1.0
             if half is not None:  # mean square of so many smallest ones, in σ²
-                limit = chi2.ppf(half / r, w)
-                share, half = chi2.cdf(limit, w + 2) / (half / r), None
+                limit = chdtri(w, 1 - half / r)
+                share, half = chdtr(w + 2, limit) / (half / r), None
             length = np.zeros(r)
             for columns in kinds:
                 left_over = max(squares[good, columns].size - leverage[good, columns].sum(), 1.0)

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AliasPath, Field
-from scipy.stats import t as t_distribution
+from scipy.special import stdtr
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields, rms
@@ -484,7 +484,7 @@ def _lengths(result: Identified) -> list[str]:
     if square > 0 and (changes != 0).sum() >= LEAST_LENGTHS:
         scale = float(lengths @ changes) / square
         rest = float(np.linalg.norm(changes - scale * lengths)) / np.sqrt(free * square)
-        if abs(scale) > LEAST_SCALE and 2 * t_distribution.sf(abs(scale) / max(rest, 1e-15), free) < BY_CHANCE:
+        if abs(scale) > LEAST_SCALE and 2 * stdtr(free, -abs(scale) / max(rest, 1e-15)) < BY_CHANCE:
             return [
                 f"all lengths of the robot are {1 + scale:.5f} ± {rest:.1g} times nominal: rather than of the arm, "
                 "this is the scale of the instrument, or of a board or target by which positions were measured; check "

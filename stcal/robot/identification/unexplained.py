@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import (
@@ -207,7 +207,7 @@ class _Rest:
         takes = new @ (new.T @ self.remaining)
         left_over = self.remaining - takes
         ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (self.freedom - c), 1e-300)
-        return float(f_distribution.logsf(ratio, c, self.freedom - c)), takes, new
+        return float(np.log(max(fdtrc(c, self.freedom - c, ratio), np.finfo(float).tiny))), takes, new
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

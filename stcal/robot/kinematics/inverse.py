@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
-from scipy.stats import qmc
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
@@ -269,6 +268,8 @@ class InverseProblem:
 
     def every_solution(self, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
         """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), ignoring limits."""
+        from scipy.stats import qmc  # loads for a third of a second
+
         n, m = len(self.unit), len(poses)
         half = np.diff(self.bounds, axis=1)[:, 0] / 2
         one_turn = np.minimum(np.pi, half)  # of more than a turn one turn is enough

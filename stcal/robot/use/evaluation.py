@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import t as t_distribution
+from scipy.special import stdtr
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
@@ -545,6 +545,6 @@ def _differences(robots: tuple[Evaluated, ...], good: np.ndarray) -> tuple[Diffe
     for worse in order[1:]:
         apart = (worse.errors_mm - better.errors_mm)[good]
         mean, sigma = float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart))) if len(apart) > 1 else np.inf
-        p = 2 * t_distribution.sf(mean / sigma, len(apart) - 1) if 0 < sigma < np.inf else float(mean == 0 or sigma > 0)
+        p = 2 * stdtr(len(apart) - 1, -mean / sigma) if 0 < sigma < np.inf else float(mean == 0 or sigma > 0)
         found.append(Difference(better.name, worse.name, mean, sigma, float(min(1.0, (len(order) - 1) * p))))
     return tuple(found)

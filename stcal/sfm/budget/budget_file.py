@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter
-from scipy.stats import norm
+from scipy.special import ndtri
 
 import stcal
 from stcal.design import BoardDesign, StatedSize
@@ -74,7 +74,7 @@ class LengthTest:
         """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
         chance (Bonferroni)."""
         count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
-        limit = float(norm.isf(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
+        limit = float(-ndtri(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
         if not e_n:
             verdict = f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
             return cls(reference, list(lengths), None, None, limit, None, verdict, notes)

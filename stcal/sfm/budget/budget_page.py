@@ -51,7 +51,7 @@ def budget_report(file: BudgetFile) -> Document:
     is missing."""
     if certifies(file):
         return certificate(file)
-    given = [[FIELDS.get(name, name), value] for name, value in file.fields.items() if value]
+    given = [[FIELDS.get(name, name), value] for name, value in file.fields.items() if value and name != "number"]
     tests = [block for test in file.length_tests for block in [*length_test(test), Notes(test.notes)]]
     return Document(
         f"Uncertainty budget: {file.run.target}",
@@ -68,17 +68,18 @@ def budget_report(file: BudgetFile) -> Document:
     )
 
 
-def budget_in_brief(file: BudgetFile) -> str:
-    """Returns the result in at most fifteen lines; :func:`budget_report` has all."""
+def budget_in_brief(file: BudgetFile, page: bool) -> str:
+    """Returns the result in at most fifteen lines; :func:`budget_report` has all. ``page`` : whether it is written."""
     tests = [f"lengths against {test.reference}: {test.verdict}" for test in file.length_tests]
+    offered = certifies(file) and not page
     lines = [
         _about(file),
         *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
-        "--report FILE.html writes a certificate of calibration" if certifies(file) else _no_certificate(file),
+        _no_certificate(file) or ("--report FILE.html writes a certificate of calibration" if offered else ""),
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
-        f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
+        "" if page else f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
     ]
     return "\n".join(filter(None, lines))
 

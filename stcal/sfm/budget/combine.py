@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy.linalg import null_space
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtrit
 
 from stcal.boards.board_designs import TAG_SIGMA_MM
 from stcal.boards.board_file import BoardSizeEntry, SizeEntry
@@ -331,7 +330,7 @@ def _growth(stated: StatedSize) -> float | None:
 
 COVERAGE_FACTOR = 2.0
 """Coverage factor k for infinitely many degrees of freedom."""
-BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
+BY_CHANCE = 2 * float(ndtr(-COVERAGE_FACTOR))
 """Probability that an error is beyond U by chance, and that any length of a test is beyond the limit."""
 LONGEST_DISTANCES = 5
 """Number of distances in a budget."""
@@ -345,7 +344,7 @@ PARALLEL = 1e-3
 def coverage_factor(freedom: float) -> float:
     """Returns k for effective degrees of freedom: of Student's distribution, for the coverage that 2 has of a normal
     one, 95.45 % (JCGM 100, G.3)."""
-    return float(student.isf(BY_CHANCE / 2, freedom)) if np.isfinite(freedom) else COVERAGE_FACTOR
+    return float(-stdtrit(freedom, BY_CHANCE / 2)) if np.isfinite(freedom) else COVERAGE_FACTOR
 
 
 def effective_freedom(variance: float, estimated: float, freedom: float) -> float:

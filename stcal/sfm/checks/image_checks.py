@@ -44,7 +44,8 @@ def camera_check(evidence: Evidence) -> Check:
     if not evidence.camera_given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
         return impossible("camera", reason, "")
-    remedy = "not the camera of these images (focus, zoom, lens, size), or too coarse: use --refine-camera"
+    anew = "use --refine-camera" if evidence.prior is None else "calibrate the camera anew"
+    remedy = f"not the camera of these images (focus, zoom, lens, size), or too coarse: {anew}"
     networks, camera, found = evidence.networks, evidence.camera, evidence.calibration.camera
     if evidence.prior is not None and evidence.joint is not None:  # the options of a run ensure the latter
         model, stated = evidence.prior.colmap_model, evidence.prior.covariance

@@ -320,16 +320,29 @@ OTHER_SIZE, CLEARER = 0.005, 3.0
 at one place against each face, for images to be labelled with it."""
 
 
-def in_scale(groups: Sequence[Sequence[Named]], target: TargetDesign, board: BoardDesign | None) -> BoardDesign | None:
+def read_groups(
+    groups: Sequence[Sequence[Named]], target: TargetDesign, board: BoardDesign | None
+) -> tuple[list[list[list[Readings]]], BoardDesign | None]:
+    """Returns the readings of each image of each group, none of a mirrored one, and the board in the size in which they
+    have it."""
+
+    def readings(board: BoardDesign | None) -> list[list[list[Readings]]]:
+        return [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
+
+    found = readings(board)
+    if board is None or (sized := _in_scale(found, board)) is board:
+        return found, board
+    return readings(sized), sized
+
+
+def _in_scale(groups: Sequence[Sequence[Sequence[Readings]]], board: BoardDesign) -> BoardDesign:
     """Returns the board in the size at which its middle stays at one place against each face of a group. With another
     size, it seems to move from image to image; that the drawing has another is for the checks to say."""
-    if board is None:
-        return None
     middle, ways = np.append(board.xy_mm().mean(0), 0.0), [np.zeros((0, 2, 3))]
     for images in groups:
         places: dict[str, list[np.ndarray]] = {}  # of the board's middle, and of the camera, from each face
-        for _, _, detection in images:
-            views = [] if detection.mirrored else [each[0] for each in readings_of(detection, target, board)]
+        for readings in images:
+            views = [each[0] for each in readings]
             for dots in [view for view in views if view.plane == BOARD][:1]:
                 for view in (each for each in views if each.plane != BOARD and each.named):
                     seen = np.stack([dots.camera_from_plane @ middle, view.camera_from_plane.translation])

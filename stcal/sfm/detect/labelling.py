@@ -46,7 +46,7 @@ from stcal.sfm.detect.arrangement import (
     across_groups,
     arrange,
     as_drawn,
-    in_scale,
+    read_groups,
     readings_of,
 )
 from stcal.sfm.detect.candidates import EllipseOptions, FaceSighting, ImageDetection
@@ -103,12 +103,13 @@ def labelled_image(
 
 def label_groups(
     groups: Sequence[Sequence[Named]], target: TargetDesign, board: BoardDesign | None, focal_px: float
-) -> list[tuple[list[LabelledImage], Arrangement]]:
-    """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
+) -> tuple[list[tuple[list[LabelledImage], Arrangement]], BoardDesign | None]:
+    """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels. The board
+    is in the size in which the images have it."""
+    readings, board = read_groups(groups, target, board)
     steps = np.concatenate([np.zeros(0), *(KDTree(f.xy_mm).query(f.xy_mm, k=2)[0][:, 1] for f in target.faces)])
     step_mm = board.pitch_mm if board is not None else float(np.median(steps)) if len(steps) else 0.0
     alone: list[Arrangement] = []
-    readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
     likely = [[[[v for v in r if v.likely] for r in own] for own in group] for group in readings]
     for group, likely_ones in zip(readings, likely, strict=True):
         found = arrange(likely_ones, step_mm, focal_px)
@@ -117,10 +118,11 @@ def label_groups(
             found = max(found, arrange(group, step_mm, focal_px), key=Arrangement.explained)
         alone.append(as_drawn(found, target.rough_poses()))
     arrangements = across_groups(alone, MAX_SHIFT_PITCHES * step_mm)
-    return [
+    labelled = [
         ([_labelled(*image, own, found, i) for i, (image, own) in enumerate(zip(images, views, strict=True))], found)
         for images, views, found in zip(groups, likely, arrangements, strict=True)
     ]
+    return labelled, board
 
 
 def _labelled(
@@ -197,12 +199,12 @@ def label_images(
     """Returns the labelled circles and corners of all images, in the order of their groups, after two looks."""
     files, camera, focal_px = {i.file.name: i for i in detection.images}, detection.camera, _focal_px(detection.camera)
     circles, groups = target.with_faces(printed=False), _groups(detection)
-    board = in_scale(groups, circles, board)
+    labelled_groups, board = label_groups(groups, circles, board, focal_px)
     patterns = patterns_of(circles, board)
     sought = patterns_of(circles, None if isinstance(board, CornerBoard) else board)  # corners are used as found
     first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
-    for found in label_groups(groups, circles, board, focal_px):
+    for found in labelled_groups:
         group, arrangement = _without_outlying(*found, patterns, focal_px)
         for i, pose in arrangement.camera_from_group.items():
             seen, planes = group[i].observations, arrangement.group_from_plane
@@ -226,8 +228,7 @@ def label_images(
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
     """Labels all images as :func:`label_images`, without a second look."""
-    groups = _groups(detection)
-    labelled = label_groups(groups, target, in_scale(groups, target, board), _focal_px(detection.camera))
+    labelled, _ = label_groups(_groups(detection), target, board, _focal_px(detection.camera))
     return [each for found, _ in labelled for each in found]
 
 

@@ -518,6 +518,7 @@ def advice_text(advice: Advice) -> str:
     """Returns what to photograph next, as a table that a photographer can follow."""
     now, better_um = ForecastPart.of(advice.now, advice.shares), MICRO * advice.better_board.worst()[1]
     lines = [*now.table(), f"worst is face {now.worst_face}, {now.worst_sigma_um:.2f} µm"]
+    lines.append("by the mean noise of all centres; the σ of the report are by the noise of each centre")
     if advice.board_dominates:
         lines.append(
             f"{100 * advice.shares[now.worst_face]['board']:.0f} % of its variance comes from the board: further views "

