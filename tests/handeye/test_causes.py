@@ -16,16 +16,16 @@ from stcal.handeye.remarks import Grave, SizeDoubt
 from stcal.handeye.validate import better_setup
 from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye, lag_tried
-from tests.levels import sampled
+from tests.levels import FULL, sampled
 from tests.outcome import fails_with
 from tests.support.handeye import (
     BASE_FROM_CAMERA,
     FLANGE_FROM_BOARD,
     disturbed,
-    error,
     handeye,
     simulated,
     simulated_views,
+    squared,
 )
 from tests.support.handeye_stream import simulated_stream
 
@@ -38,10 +38,10 @@ def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset_s", [-0.003, -0.02, 0.1])
+@pytest.mark.parametrize("offset_s", [-0.003, 0.015, *(pytest.param(each, marks=FULL) for each in (-0.02, 0.1))])
 def test_a_lag_is_told_with_what_it_explains(offset_s):
     """A doubt of the board's size ends with it."""
-    given = given_of(11, offset_s)
+    given = given_of(11, offset_s, 15)
     doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
     again, (note,) = lag_tried(HandEyeProblem(given.pairs), given.timed, doubted)
     assert not any(isinstance(note, SizeDoubt) for note in again.notes)
@@ -51,7 +51,7 @@ def test_a_lag_is_told_with_what_it_explains(offset_s):
     assert isinstance(note, Grave) or abs(offset_s) < 0.01
 
 
-@pytest.mark.parametrize("seed", range(12, 15))
+@pytest.mark.parametrize("seed", sampled(range(12, 15)))
 def test_clocks_that_agree_are_not_blamed(seed):
     given = given_of(seed, 0.0)
     assert lag_tried(HandEyeProblem(given.pairs), given.timed, handeye(given.pairs))[1] == ()
@@ -72,14 +72,14 @@ def test_a_side_that_is_stored_a_pose_late_is_named(which, flange, board):
 
 
 def test_residuals_that_no_arm_leaves_are_not_to_be_used():
-    given = given_of(22, 0.0, 12)
+    given = given_of(22, 0.0, 5)
     rng = np.random.default_rng(1)
     board = given.pairs.camera_from_board
     far = Poses(board.rotation, board.translation + rng.normal(0, 40, (len(board), 3)))
     pairs = replace(given.pairs, camera_from_board=far)
-    outcome = calibrate_handeye(replace(given, pairs=pairs, timed=None), "pose", repeats=0)
-    assert judged(outcome).word == "do not use"
-    assert any(finding.title == "Residuals" for finding in judged(outcome).reasons())
+    found = judged(calibrate_handeye(replace(given, pairs=pairs, timed=None), "pose", repeats=0))
+    assert found.word == "do not use"
+    assert "Residuals" in [finding.title for finding in found.reasons()]
 
 
 def test_many_outliers_make_the_setup_suspect():
@@ -88,19 +88,6 @@ def test_many_outliers_make_the_setup_suspect():
     places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
     found = handeye(replace(pairs, camera_from_board=Poses(pairs.camera_from_board.rotation, places)))
     assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
-
-
-def test_a_camera_far_off_the_flange_needs_its_setup_stated():
-    """Robot's poses inverted, as of a camera beside the robot: nothing else tells."""
-    truth = simulated_stream(np.random.default_rng(23), 20, "eye-to-hand", 0.0)
-    flange = truth.stream.at(truth.seconds).inverse()
-    far = Poses(flange.rotation, flange.translation)
-    given = HandEyeInput("poses", replace(truth.pairs, base_from_flange=far))
-    outcome = calibrate_handeye(given, "pose", repeats=0)
-    assert np.linalg.norm(outcome.result.mount_from_camera.translation) > 1000
-    assert any("--setup eye-to-hand" in note and isinstance(note, Grave) for note in outcome.notes)
-    stated = calibrate_handeye(replace(given, setup="eye-in-hand"), "pose", repeats=0)
-    assert not any("--setup" in note for note in stated.notes)
 
 
 def test_a_board_at_the_base_needs_its_setup_stated():
@@ -117,23 +104,22 @@ def test_a_board_at_the_base_needs_its_setup_stated():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "told", "setup"),
     [
-        (lambda a, b: (a, b), ""),
-        (lambda a, b: (b, a), "the two sides are exchanged"),
-        (lambda a, b: (a.inverse(), b.inverse()), "both are the inverses of what they are named"),
+        (lambda a, b: (a, b), "", None),
+        (lambda a, b: (b, a), "the two sides are exchanged", None),
+        (lambda a, b: (a.inverse(), b.inverse()), "both are the inverses of what they are named", "eye-in-hand"),
     ],
 )
-@pytest.mark.parametrize("setup", [None, "eye-in-hand"])
 def test_sides_that_are_exchanged_are_doubted(given, told, setup):
     """No residual tells; the camera is then as far off the flange as the board is off the base."""
-    pairs = simulated_stream(np.random.default_rng(5), 15, "eye-in-hand", 0.0).pairs
+    pairs = simulated_stream(np.random.default_rng(5), 8, "eye-in-hand", 0.0).pairs
     flange, board = given(pairs.base_from_flange, pairs.camera_from_board)
     result = stcal.handeye.handeye(base_from_flange=flange, camera_from_board=board, setup=setup)
     assert any(told in note for note in result.notes) if told else not result.notes
 
 
-BAD = (8e-3, 3.0)
+BAD = (4e-3, 1.5)
 """σ of a robot in need of repair: rad, mm."""
 STATED = Noise(np.radians(0.02), 0.1)
 
@@ -153,19 +139,21 @@ def test_a_bad_robot_is_called_so_by_its_corners(noise, seed):
 
 @pytest.mark.parametrize("camera", [(None, None), (1e-3, 0.3)])
 def test_a_bad_robot_is_called_so_by_its_poses(camera):
-    truth = simulated(np.random.default_rng(2), 16, "eye-in-hand", BAD, (1e-3, 0.3))
+    truth = simulated(np.random.default_rng(2), 10, "eye-in-hand", BAD, (1e-3, 0.3))
     told = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(STATED.robot_rad, STATED.robot_mm, *camera)))
     assert any("its σ are estimated instead" in note for note in told.notes)
     off = np.linalg.norm(told.mount_from_camera.translation - truth.mount_from_camera.translation)
     assert off < 3 * np.sqrt(np.trace(told.covariance[3:, 3:]))
 
 
-@pytest.mark.parametrize(("count", "camera"), [(4, (None, None)), (8, (1e-3, 0.3)), (20, (None, None))])
+@pytest.mark.parametrize(
+    ("count", "camera"), [(4, (None, None)), (8, (1e-3, 0.3)), pytest.param(20, (None, None), marks=FULL)]
+)
 def test_a_robot_far_better_than_the_camera_is_believed(count, camera):
     """Its estimated σ are the camera's for the most part: it was doubted in all sets, and σ were up to 1.4 times too
-    large. Of 10 sets one may be doubted by a chance of 1 in 200."""
+    large. Of 5 sets one may be doubted by a chance of 1 in 1000."""
     doubted = 0
-    for seed in range(10):
+    for seed in range(5):
         truth = simulated(np.random.default_rng(seed), count, "eye-in-hand", (1e-4, 0.03), (1e-3, 0.3))
         found = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(1e-4, 0.03, *camera)))
         doubted += any("estimated instead" in note for note in found.notes)
@@ -185,7 +173,7 @@ def test_errors_of_a_stated_pair_are_said_and_widen_sigma():
 
 
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("seed", sampled(range(3)))
+@pytest.mark.parametrize("seed", sampled(range(3), (0, 1)))
 def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
     truth = simulated(np.random.default_rng(seed), 5, setup, (5e-3, 2.0), (2e-3, 0.5))
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[setup]
@@ -198,23 +186,21 @@ def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
 @pytest.mark.parametrize("method", ["pose", "reprojection"])
 def test_poses_at_one_place_of_the_robot_count_once(method):
     """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of
-    the squared error over the covariance is 18 by poses, and 5.9 by corners."""
+    the squared error over the covariance is 18 by poses, and 5.9 by corners; of χ² of 18, 2.35 in one of a thousand."""
     squares = []
-    for seed in range({"pose": 16, "reprojection": 6}[method]):
-        rng = np.random.default_rng(seed)
-        make = {"pose": simulated, "reprojection": simulated_views}[method]
-        truth = make(rng, 6, "eye-in-hand", (1.7e-3, 0.6), **({"corner_px": 0.1} if method == "reprojection" else {}))
-        flange, views = Poses.of([pose for pose in truth.pairs.base_from_flange for _ in range(4)]), None
-        if truth.views is None:
+    for seed in range({"pose": 6, "reprojection": 3}[method]):
+        rng, views = np.random.default_rng(seed), None
+        if method == "pose":
+            truth = simulated(rng, 6, "eye-in-hand", (1.7e-3, 0.6))
             seen = Poses.of([pose for pose in truth.pairs.camera_from_board for _ in range(4)])
-            pairs = HandEyePoses(flange, disturbed(rng, seen, 1e-4, 0.05))
         else:
+            truth = simulated_views(rng, 6, "eye-in-hand", (1.7e-3, 0.6), corner_px=0.1)
             again = [view for view in truth.views.views for _ in range(4)]
             moved = [View(v.xyz_board, v.xy_px + rng.normal(0, 0.1, v.xy_px.shape)) for v in again]
             views = Views(truth.views.camera, tuple(moved))
-            pairs = pairs_of_views(flange, views)
+        flange = Poses.of([pose for pose in truth.pairs.base_from_flange for _ in range(4)])
+        pairs = pairs_of_views(flange, views) if views else HandEyePoses(flange, disturbed(rng, seen, 1e-4, 0.05))
         found = handeye(pairs, views=views)
-        off = error(found, truth)
-        squares.append(off @ np.linalg.solve(found.covariance, off) / 6)
+        squares.append(squared(found, truth) / 6)
         assert any("several times at one place" in str(note) for note in found.notes)
     assert np.mean(squares) < 2.5

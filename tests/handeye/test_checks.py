@@ -11,11 +11,9 @@ from stcal.errors import StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.conventions import repair
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.remarks import Observability
 from stcal.io.rotations import INVERTED
-from stcal.workflows.handeye_inputs import HandEyeInput
-from stcal.workflows.handeye_run import without_flips
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import (
@@ -28,7 +26,6 @@ from tests.support.handeye import (
     simulated,
 )
 
-SETUPS = ("eye-in-hand", "eye-to-hand")
 ONE_QUICK = ("eye-in-hand", pytest.param("eye-to-hand", marks=FULL))
 """Where the other setup is the same but for what its poses are called."""
 NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}
@@ -52,8 +49,7 @@ def flange_turned(rng, rotvec):
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("axis", [(0, 0, 1.0), (0, 1.0, 0), (0.6, 0, 0.8)])
-@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize(("axis", "exact"), [((0, 1.0, 0), True), ((0.6, 0, 0.8), True), ((0.6, 0, 0.8), False)])
 def test_parallel_axes_are_refused_with_the_missing_rotation(setup, axis, exact):
     """The axis is named in the flange's frame, whichever carries the camera, and the one to add is across."""
     rng = np.random.default_rng(1)
@@ -83,15 +79,12 @@ def test_motions_that_are_too_small_are_refused(setup):
     refuses("E-HANDEYE-AXES … 0", handeye, seen_from(flange_turned(rng, np.zeros((6, 3))), setup, rng), setup)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_too_few_poses(count):
+def test_too_few_poses():
     truth = simulated(np.random.default_rng(5), 3)
-    if count == 3:
-        found = handeye(truth.pairs)
-        assert found.flange_from_camera.translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-5)
-        return
-    with fails_with(f"E-HANDEYE-FEW-POSES … {count} … 3 … 10 … rotate"):
-        handeye(truth.pairs[:count])
+    found = handeye(truth.pairs)
+    assert found.flange_from_camera.translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-5)
+    for count in (0, 2):
+        refuses(f"E-HANDEYE-FEW-POSES … {count} … 3 … 10 … rotate", handeye, truth.pairs[:count])
 
 
 def test_four_dof_where_it_does_not_belong():
@@ -147,26 +140,19 @@ ROBOT_MISTAKES = {
     "left-handed in x": (left_handed(0), ""),
     "x, -y, z": (places(lambda xyz: xyz * [1, -1, 1]), "x, y, z of the robot … taken as x, −y, z"),
     "no such places": (WILD, "positions … rotations agree … columns of positions"),
-    "ZYX": (
-        read_as("xyz", "ZYX"),
-        "--rotation robot=ZYX-deg (or -rad), … names of its columns, if they were read as xyz",
-    ),
     "zyx": (
         read_as("XYZ", "zyx"),
         "--rotation robot=zyx-deg (or -rad), … names of its columns, if they were read as XYZ",
     ),
-    "other rows": (lambda poses: poses[np.roll(np.arange(len(poses)), 5)], "spread over … pair each pose"),
+    "other rows": (lambda poses: poses[np.roll(np.arange(len(poses)), 3)], "spread over … pair each pose"),
 }
 BOARD_MISTAKES = {
     "board_from_camera": (Poses.inverse, "board_from_camera"),
     "metres": (times(1e-3), "the board's lengths times 1000 … metres"),
     "micrometres": (times(1e3), "the board's lengths divided by 1000 … unit camera=mm"),
-    "radians": (RADIANS, "angles of the board are radians"),
     "x y z w": (XYZW, "the board's quaternions in another order … name the columns so"),
-    "left-handed": (left_handed(0), ""),
 }
 BOTH_MISTAKEN = {
-    "radians": (RADIANS, "angles of the robot and the board are radians"),
     "x y z w": (XYZW, "with all quaternions in another order … give --quaternions xyzw"),
 }
 
@@ -181,7 +167,7 @@ BOTH_MISTAKEN = {
 )
 @pytest.mark.parametrize("setup", ONE_QUICK)
 def test_a_mistake_is_named_with_its_side_and_remedy(setup, sides, change, said):
-    pairs = simulated(np.random.default_rng(10), 12, setup, **NOISE).pairs
+    pairs = simulated(np.random.default_rng(10), 8, setup, **NOISE).pairs
     flange = pairs.base_from_flange if sides == "board" else change(pairs.base_from_flange)
     board = pairs.camera_from_board if sides == "robot" else change(pairs.camera_from_board)
     with fails_with(f"E-HANDEYE-CONVENTION … {said}") as caught:
@@ -192,7 +178,7 @@ def test_a_mistake_is_named_with_its_side_and_remedy(setup, sides, change, said)
 
 
 def test_a_mistake_in_poses_of_the_other_setup_is_named():
-    pairs = simulated(np.random.default_rng(53), 16, setup="eye-to-hand", **NOISE).pairs
+    pairs = simulated(np.random.default_rng(53), 10, setup="eye-to-hand", **NOISE).pairs
     with fails_with("E-HANDEYE-CONVENTION … with --setup eye-to-hand and with the robot's lengths times 1000"):
         handeye(HandEyePoses(times(1e-3)(pairs.base_from_flange), pairs.camera_from_board))
 
@@ -220,7 +206,7 @@ def test_a_board_behind_the_camera_is_said():
 
 def test_a_board_of_another_size_is_no_contradiction():
     """Half as large as stated: said, with its size, and solved for on demand."""
-    pairs = simulated(np.random.default_rng(17), 12, **NOISE).pairs
+    pairs = simulated(np.random.default_rng(17), 8, **NOISE).pairs
     board = Poses(pairs.camera_from_board.rotation, 2 * pairs.camera_from_board.translation)
     found = handeye(HandEyePoses(pairs.base_from_flange, board))
     said = re.search(r"the board is ([\d.]+) ± ([\d.]+) times as large as stated", found.notes[0])
@@ -256,7 +242,7 @@ def test_a_flange_that_only_turns_tells_no_size(seed):
     [(25.4, "the robot's were in inches"), pytest.param(0.1, "its lengths were in centimetres", marks=FULL)],
 )
 def test_units_of_one_side_are_named(factor, unit):
-    pairs = simulated(np.random.default_rng(18), 12, **NOISE).pairs
+    pairs = simulated(np.random.default_rng(18), 8, **NOISE).pairs
     board = Poses(pairs.camera_from_board.rotation, factor * pairs.camera_from_board.translation)
     pairs = HandEyePoses(pairs.base_from_flange, board)
     assert any(f"as if {unit}: name the columns so" in note for note in handeye(pairs).notes)
@@ -277,42 +263,15 @@ def test_a_board_that_was_moved_half_way_is_said(sets):
     assert said >= 0.9 * sets
 
 
-@pytest.mark.parametrize(("what", "row"), [("camera", 12), ("board", 8)])
+@pytest.mark.parametrize(("what", "row"), [("camera", 5), ("board", 4)])
 def test_what_moved_between_two_poses_is_located(what, row):
-    pairs = simulated(np.random.default_rng(31), 24, **NOISE).pairs
+    pairs = simulated(np.random.default_rng(31), 12, **NOISE).pairs
     away = Rigid.exp([0.02, 0.03, 0.0, 5, -5, 3])
     later = [away @ p if what == "camera" else p @ away for p in pairs.camera_from_board]
     seen = [*list(pairs.camera_from_board)[:row], *later[row:]]
     notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(seen))).notes
     [note] = [note for note in notes if "moved before" in note]
     assert note.startswith(f"the {what} moved before pose {row + 1}")
-
-
-def with_flips(rng, pairs: HandEyePoses, count: int) -> tuple[HandEyePoses, list[int]]:
-    """Some poses replaced by the other pose of the board's plane: tilts about the line of sight with opposite sign."""
-    poses, rows = list(pairs.camera_from_board), sorted(rng.choice(len(pairs.names), count, replace=False).tolist())
-    for row in rows:
-        pose = poses[row]
-        sight = pose.translation / np.linalg.norm(pose.translation)
-        mirror = np.eye(3) - 2 * np.outer(sight, sight)
-        poses[row] = Rigid(mirror @ pose.rotation @ np.diag([1, 1, -1.0]), pose.translation)
-    return HandEyePoses(pairs.base_from_flange, Poses.of(poses)), rows
-
-
-def test_flips_are_named_and_undone_where_asked():
-    rng = np.random.default_rng(41)
-    truth = simulated(rng, 20, **NOISE)
-    pairs, rows = with_flips(rng, truth.pairs, 5)
-    found = handeye(pairs)
-    [note] = [note for note in found.notes if "tilted the other way" in note]
-    assert [int(word) - 1 for word in re.findall(r"pose (\d+)", note)] == rows
-    assert not any("tilted" in note for note in handeye(truth.pairs).notes)
-    mended, said = without_flips(HandEyeInput("poses", pairs))
-    assert said.startswith("tilted the other way, as --undo-flips asks, 5 of 20 poses")
-    again = handeye(mended.pairs)
-    assert not again.outliers.any()
-    off = np.linalg.norm((again.mount_from_camera.inverse() @ FLANGE_FROM_CAMERA).translation)
-    assert off < 4 * np.sqrt(np.trace(again.covariance[3:, 3:]))
 
 
 def test_other_wrong_poses_are_no_flips():
@@ -337,7 +296,7 @@ def test_sound_poses_do_not_move(sets, most):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sets", "least"), [(2, 1), pytest.param(10, 8, marks=FULL)])
+@pytest.mark.parametrize(("sets", "least"), [(1, 1), pytest.param(10, 8, marks=FULL)])
 def test_rough_poses_that_fit_another_setup_better_are_said(sets, least):
     """Errors of 0.5° and 5 mm, and turns of few degrees: no setup fits well, but the right one is named."""
     said = 0
@@ -378,7 +337,7 @@ HALF = Rigid(np.diag([-1.0, -1, 1]), [200, 175, 0])
 
 
 @pytest.mark.parametrize("setup", ONE_QUICK)
-@pytest.mark.parametrize("turned", [[], [2, 5, 9], [0, 1, 3, 4, 6, 7, 8]])
+@pytest.mark.parametrize("turned", [[], [0, 1, 3, 4, 6, 7, 8]])
 def test_turned_views_are_put_right(setup, turned):
     """Up to a turn of all: the numbering of most is kept."""
     truth = simulated(np.random.default_rng(11), 12, setup, **NOISE)

@@ -62,13 +62,13 @@ def test_a_camera_file_that_is_wrong_is_found_out():
 
 @pytest.mark.parametrize(
     ("scale", "said"),
-    sampled([(1.0, ""), (1.02, "% larger than stated"), (2.7, "% larger than stated")], kept=(0, 1)),
+    sampled([(1.0, ""), (1.02, "% larger than stated")], kept=(0, 1)),
 )
 def test_poses_alone_are_chosen_among_too(scale, said):
     truth, pairs = pairs_of_size(scale, 7, 16)
     found = choose(HandEyeProblem(pairs, truth.setup), None, splits(16, None, 8))
     assert found.chosen.name == ("pose + scale" if said else "pose")
-    assert all(part in found.sentence for part in said.split(" … "))
+    assert said in found.sentence
     if said:
         assert found.result.scale == pytest.approx(scale, abs=4 * found.result.sigma_scale)
     assert found.held_out.board_mm is None
@@ -112,19 +112,18 @@ def test_answers_that_contradict_widen_sigma():
 
 
 @pytest.mark.slow
-def test_a_closed_form_is_taken_where_it_predicts_better():
+def test_no_way_predicts_much_better_than_the_one_chosen():
     """The robot's reach errs by 1 %, which is no noise of single poses, and the images are poor."""
-    truth = simulated(np.random.default_rng(0), 14, "eye-in-hand", (2e-3, 1.0), (3e-3, 2.0))
+    truth = simulated(np.random.default_rng(0), 10, "eye-in-hand", (1e-3, 0.5), (1.5e-3, 1.0))
     flange = truth.pairs.base_from_flange
     middle = flange.translation.mean(0)
-    bent = flange.translation + (flange.translation - middle) @ np.random.default_rng(1).normal(0, 0.02, (3, 3))
+    bent = flange.translation + (flange.translation - middle) @ np.random.default_rng(1).normal(0, 0.01, (3, 3))
     pairs = replace(truth.pairs, base_from_flange=replace(flange, translation=bent))
-    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(14, None, 6))
+    found = choose(HandEyeProblem(pairs, truth.setup), None, splits(10, None, 6))
     mean = {each.candidate: each.mean_mm for each in found.tried}
-    best = min(mean, key=mean.__getitem__)
-    assert mean[found.chosen] <= 1.1 * mean[best]
     assert set(CLOSED_FORMS) <= set(mean)
-    assert found.result.covariance is not None
+    assert mean[found.chosen] <= 1.1 * min(mean.values())
+    assert found.result.covariance.shape == (6, 6)
 
 
 @pytest.mark.slow

@@ -33,9 +33,9 @@ CHANCE = 5.8
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("setup", "splits"), [("eye-in-hand", 4), ("eye-to-hand", 15)])
+@pytest.mark.parametrize(("setup", "splits"), [("eye-in-hand", 2), ("eye-to-hand", 15)])
 def test_a_file_of_poses(command, tmp_path, setup, splits):
-    truth = simulated(np.random.default_rng(5), 20, setup, **NOISE)
+    truth = simulated(np.random.default_rng(5), 12, setup, **NOISE)
     source, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "deep" / "handeye.json"
     more = ("--splits", splits) if splits != 15 else ()
     code, shown, _ = command(source, "--setup", setup, "--out", out, *more)
@@ -49,9 +49,10 @@ def test_a_file_of_poses(command, tmp_path, setup, splits):
     assert np.array(data[f"{board}_covariance"]).shape == (6, 6)
     assert [row["name"] for row in data["poses"]][:2] == ["line 2", "line 3"]
     assert data["outliers"] == []
+    assert "time_offset" not in data
     # A board's pose by robot and X is off by about the noise of both, and the error of X.
     assert 0.05 < data["held_out"]["translation_mm"] < 2
-    for text in (camera, board, f"held out ({splits} × 5 of 20 poses)", f"written: {out}"):
+    for text in (camera, board, f"held out ({splits} × 3 of 12 poses)", f"written: {out}"):
         assert text in shown
 
 
@@ -179,7 +180,6 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "code", "parts"),
     [
-        (["0.png", "0.png"], INPUT, ["line 2 and line 3 are both image '0.png'"]),
         (["a.png", "b.png"], INPUT, ["no row is of an image in"]),
         (["0.png", "1.png"], COMPUTATION, ["2 poses, 3 needed", "left out before, first 2.png: no row in poses.csv"]),
     ],
@@ -250,9 +250,9 @@ def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
 
 def test_an_answer_not_to_use_has_a_remedy_and_fails_where_strict(command, tmp_path):
     """Both sides inverted, as after the wrong one of two pieces of advice."""
-    truth = simulated(np.random.default_rng(10), 12, **NOISE)
+    truth = simulated(np.random.default_rng(10), 8, **NOISE)
     sides = {name: poses.inverse() for name, poses in sides_of(truth.pairs).items()}
-    quick = ("--method", "pose", "--splits", 2)
+    quick = ("--method", "pose", "--splits", 1)
     words = (table(tmp_path / "poses.csv", sides), *quick)
     code, out, _ = command(*words)
     starts = ("May I use it?", "what to do:")

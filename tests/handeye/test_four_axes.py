@@ -40,12 +40,12 @@ def test_four_axes_give_all_but_one_number():
 
 @pytest.mark.slow
 def test_four_axes_are_true_to_their_covariance():
-    """40 trials of the 5 numbers that are found."""
+    """15 trials of the 5 numbers that are found: χ² of 75, once in a thousand beyond."""
     found = [
         handeye(scara(np.random.default_rng(s)), "eye-to-hand", options=HandEyeOptions(four_dof=True))
-        for s in range(40)
+        for s in range(15)
     ]
     true = Poses.of([BASE_FROM_CAMERA])
     errors = np.array([Poses.of([f.base_from_camera]).difference(true)[0, :5] for f in found])
     squared = [e @ np.linalg.solve(f.covariance[:5, :5], e) for e, f in zip(errors, found, strict=True)]
-    assert 0.8 < np.sqrt(np.mean(squared) / 5) < 1.25
+    assert 0.76 < np.sqrt(np.mean(squared) / 5) < 1.24

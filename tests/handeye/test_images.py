@@ -185,7 +185,7 @@ rpy_deg = [0.0, 30.0, 0.0]
 def test_several_boards_are_solved_as_one(command, tmp_path):
     """Eye-in-hand, without errors of the robot: within chance of its σ, and within 0.2 mm; `--dry-run` says what the
     board is."""
-    seen = looks(np.random.default_rng(21), 8, np.array([10, 60]), 1.0)
+    seen = looks(np.random.default_rng(21), 5, np.array([10, 60]), 1.0)
     _, sheet, first = charuco()
     files, out = photographs(tmp_path, sheet, first, seen, SET), tmp_path / "h.json"
     for i, pose in enumerate(seen):

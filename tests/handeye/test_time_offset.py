@@ -9,14 +9,13 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from tests.handeye.photographed import BOARD
 from tests.handeye.written import table
 from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.support.handeye import handeye, squared
 from tests.support.handeye_stream import StreamTruth, simulated_stream
-
-SETUPS = ("eye-in-hand", "eye-to-hand")
 
 
 def found_of(truth: StreamTruth) -> TimeOffset:
@@ -86,7 +85,7 @@ def off(data: dict, truth: StreamTruth) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_offset_is_found_and_used(command, tmp_path):
-    truth = simulated_stream(np.random.default_rng(7), 16)
+    truth = simulated_stream(np.random.default_rng(7), 10)
     files = two_files(tmp_path, truth)
     out = tmp_path / "h.json"
     code, shown, error = command(*files, "--time-offset", "--splits", 0, "--method", "pose", "--out", out)
@@ -98,12 +97,8 @@ def test_the_offset_is_found_and_used(command, tmp_path):
     assert all(text in shown for text in ("robot's clock minus camera's: the robot's is ahead of the camera's", taken))
     wrong = off(found, truth)
     assert wrong @ np.linalg.solve(np.array(found["covariance"]), wrong) < 22.5  # χ² of 6, once in a thousand
-    code, shown, _ = command(*files, "--splits", 0, "--method", "pose", "--out", tmp_path / "plain.json")
-    plain = json.loads((tmp_path / "plain.json").read_text())
-    assert code == 0
-    assert "time_offset" not in plain
-    assert plain["rms"]["translation_mm"] > 5 * found["rms"]["translation_mm"]
-    assert "poses by time: 16 times in 1200 samples of robot.txt: 16 interpolated (cubic; samples 0.02 s apart" in shown
+    assert found["rms"]["translation_mm"] < 1  # plain, of 23 ms: several mm
+    assert "poses by time: 10 times in 1200 samples of robot.txt: 10 interpolated (cubic; samples 0.02 s apart" in shown
 
 
 def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:
@@ -128,6 +123,9 @@ def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
     assert "poses by time: 4 times in 40 samples of robot.csv: 1 at a sample, 2 interpolated" in shown
     assert "images: 3 of 4 with a pose of the robot" in shown
     assert "left out 200.5.png: 99.72 s after the samples of robot.csv" in shown
+    code, shown, error = command(*given, "--dry-run", "--time-tolerance", 100)
+    assert code == 0, error
+    assert "images: 4 of 4 with a pose of the robot" in shown
 
 
 def test_times_of_images_in_a_file(command, tmp_path):
@@ -140,16 +138,10 @@ def test_times_of_images_in_a_file(command, tmp_path):
     assert "left out c.png: no time in" in shown
     said = "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)"
     assert_error(command(*given, "--dry-run"), INPUT, said)
-    for row, said in (("a,soon", "time_s of a.png is 'soon', a number of"), ("z,1.5", "no row is of an image: z")):
+    for row, said in (
+        ("a,soon", "time_s of a.png is 'soon', a number of"),
+        ("z,1.5", "no row is of an image: z"),
+        ("a,9.5", "no image has a pose: a.png"),
+    ):
         times.write_text(f"image,time_s\n{row}\n")
         assert_error(command(*given, "--dry-run", "--image-times", times), INPUT, said)
-
-
-def test_the_nearest_sample_stands_within_the_tolerance(command, tmp_path):
-    given = photographs(tmp_path, ["100.05.png", "102.3.png", "103.9.png"], 100 + np.arange(6) * 1.0)
-    code, shown, error = command(*given, "--dry-run", "--time-tolerance", 0.15)
-    assert code == 0, error
-    assert "2 by the nearest sample, up to 0.1 s away (0.15 s allowed), 1 left out" in shown
-    assert "left out 102.3.png: in a gap of 1 s of robot.csv, 0.25 s allowed; the nearest sample is 0.3 s away" in shown
-    outcome = command(*given, "--dry-run", "--time-tolerance", 0.01)
-    assert_error(outcome, INPUT, "no image has a pose: 100.05.png")

@@ -203,35 +203,24 @@ FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "TUM": tum,
     "columns of angles": euler_columns,
     "KUKA": robots("kuka-abc", "ZYX", ("a", "b", "c")),
-    "Kinova": robots("kinova", "xyz", ("theta_x", "theta_y", "theta_z"), "deg"),
     "roll, pitch, yaw": robots("rpy", "xyz", ("roll", "pitch", "yaw"), "rad"),
-    "rotation vector": robots("rotvec", "rotvec", ("rx", "ry", "rz"), "rad"),
     "rotation vector in capitals": robots("ur-rotvec", "rotvec", ("RX", "RY", "RZ")),
     "UR": of_ur,
 }
 EYE = "1 0 0 0.1\n0 1 0 0.2\n0 0 1 0.3\n0 0 0 1\n"
 LISTED = [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
 MESSAGE = "{translation: {x: 0.1, y: 0.2, z: 0.3}, rotation: {x: 0.0, y: 0.0, z: 0.0, w: 1.0}}"
-MATRIX = f"!!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [ {', '.join(EYE.split())} ]\n"
 SIX = "0.1 0.2 0.3 0.1 0.2 0.3"
 REFUSED = {
     "matrices as text": EYE,
-    "KITTI": " ".join(EYE.split()[:12]),
-    "a count before": f"2\n{EYE}{EYE}",
     "a name and six numbers": f"a.png {SIX}",
     "decimal commas": SIX.replace(" ", ";").replace(".", ","),
     "EuRoC's ground truth": f"#timestamp [ns]\n1403636579763555584,{SIX.replace(' ', ',')},0,0,0,0",
     "JSON lines": f'{{"base_from_flange": {LISTED}, "camera_from_board": {LISTED}}}\n' * 2,
-    "matrices 3×4 in JSON": str([LISTED[:3]] * 2),
-    "rotations and translations of each pose": '[{"R": [[1,0,0],[0,1,0],[0,0,1]], "t": [1,2,3]}]',
     "rotation vectors in JSON": '{"R_gripper2base": [[0.1,0.2,0.3]], "t_gripper2base": [[1,2,3]]}',
     "rostopic echo": f"transform: {MESSAGE}\n---\ntransform: {MESSAGE}\n---\n",
-    "messages of ROS": f"- {MESSAGE}\n- {MESSAGE}\n",
     "ROS bag": "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,field.pose.orientation.x,"
     "field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w\n1,0.1,0.2,0.3,0,0,0,1\n",
-    "camodocal": f"%YAML:1.0\n---\nframeCount: 1\nT1_0: {MATRIX}T2_0: {MATRIX}",
-    "COLMAP": "# Image list\n1 1 0 0 0 0.1 0.2 0.3 1 a.png\n1.5 2.5 -1\n",
     "FANUC's program": "/PROG  A\n/POS\nP[1]{\n   GP1:\n\tX = 1.0  mm,\tY = 2.0  mm,\tZ = 3.0  mm,\n};\n/END\n",
-    "Doosan's program": "posx(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)\nposx(1.5, 2.5, 3.5, 4.5, 5.5, 6.5)\n",
 }
 """Poses in formats that are not read."""

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from stcal.geometry.rigid import Poses, Rigid, UncertainRigid
 from stcal.io.rotations import INVERTED
 from stcal.io.table import COVARIANCE, POSE, pose_cells
 from stcal.locate.base_chain import GoalChain, goal_chain, on_chain
+from tests.levels import sampled
+from tests.outcome import refuses
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
@@ -60,8 +63,7 @@ def test_a_fixed_camera_needs_no_robot_poses(files, tmp_path):
     fixed.write_text(json.dumps({"base_from_camera": MOUNT.matrix().tolist(), "covariance": None}))
     goal = read_chain(fixed, None).base_from_goal("any", SEEN)
     assert np.allclose(goal.rigid.matrix(), (MOUNT @ SEEN.rigid).matrix())
-    with pytest.raises(InputError, match="camera is fixed"):
-        read_chain(fixed, files[1])
+    refuses("E-OPTION-NEEDS … fixed.json … the camera is fixed", read_chain, fixed, files[1])
 
 
 def registered(path, b_from_a, model="rigid", covariance=None):
@@ -90,16 +92,14 @@ def test_a_registration_leads_to_the_base_too(files, tmp_path):
 )
 def test_a_registration_that_is_no_rigid_motion_is_refused(tmp_path, matrix, model, size):
     file = registered(tmp_path / "register.json", matrix, model, np.eye(size))
-    with pytest.raises(InputError, match=f"no rigid motion \\({model}: .*register with --model rigid"):
-        goal_chain(registration=file)
+    refuses(f"E-REGISTER-FILE … {model} … --model rigid", goal_chain, registration=file)
 
 
 def test_scenes_are_found_by_another_column(files):
     hand_eye, poses, _ = files
     poses.write_text(poses.read_text().replace("scene", "image"))
     assert list(read_chain(hand_eye, poses, key="image").flange) == ["a"]
-    with pytest.raises(InputError, match="no column scene"):
-        read_chain(hand_eye, poses)
+    refuses("E-TABLE-COLUMN-MISSING … scene", read_chain, hand_eye, poses)
 
 
 @pytest.mark.parametrize(
@@ -122,13 +122,10 @@ def test_what_is_wrong_in_a_hand_eye_file_is_named(files, content, reason):
 
 def test_what_does_not_lead_to_the_base_is_named(files):
     hand_eye, poses, offset = files
-    with pytest.raises(InputError, match="on the flange; robot poses"):
-        read_chain(hand_eye, None)
-    with pytest.raises(InputError, match="none of scene b"):
-        read_chain(hand_eye, poses).base_from_goal("b", SEEN)
+    refuses("E-OPTION-MISSING … on the flange", read_chain, hand_eye)
+    refuses("E-ROBOT-POSES-SCENE … scene b", read_chain(hand_eye, poses).base_from_goal, "b", SEEN)
     poses.write_text(poses.read_text() + poses.read_text().splitlines()[1] + "\n")
-    with pytest.raises(InputError, match="line 3: scene a again"):
-        read_chain(hand_eye, poses)
+    refuses("E-TABLE-ROW-REPEATED … line 3: scene a", read_chain, hand_eye, poses)
     offset.write_text("{}")
     hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
     with pytest.raises(InputError, match="no 'obj_from_goal'"):
@@ -194,24 +191,22 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-@pytest.mark.parametrize("count", [2, 3, 12])
+@pytest.mark.parametrize("count", [2, 12])
 def test_a_target_that_stands_still_shows_the_mistake(name, count):
     wrong, says = MISTAKES[name]
-    for seed in range(4):
+    for seed in range(2):
         flange, seen = looks(seed, count)
         flange, mount = wrong(flange, CAMERA_ON_FLANGE)
         with pytest.raises(InputError, match=rf"varies by .* \(RMS of {count} scenes\), but by .* if {says}"):
             judged(flange, seen, mount)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2, 3, 12])
-@pytest.mark.parametrize("turn_rad", [0.0, 0.02, 0.5])
-@pytest.mark.parametrize("moves", [0.0, 3.0, 200.0])
-def test_good_poses_pass(count, turn_rad, moves):
+@pytest.mark.parametrize("sets", sampled([2, 12]))
+def test_good_poses_pass(sets):
     """Flanges that turn and that do not, targets that stand and that move."""
-    for seed in range(12):
-        assert judged(*looks(seed, count, turn_rad, moves)) == ()
+    for count, turn_rad, moves in product((1, 2, 3, 12), (0.0, 0.02, 0.5), (0.0, 3.0, 200.0)):
+        for seed in range(sets):
+            assert judged(*looks(seed, count, turn_rad, moves)) == ()
 
 
 def test_lengths_in_metres_are_said():

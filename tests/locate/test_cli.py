@@ -109,11 +109,6 @@ def test_options_that_make_no_sense(run, arguments, reason):
     assert error.count("\n") == 1
 
 
-def test_schedule(locate):
-    assert locate("schedule", "1", "100", "3")[1] == "1\n10\n100\n"
-    assert locate("schedule", "3", "1", "3")[0] == 2
-
-
 BOARD = 'rows = 4\ncolumns = 9\npitch_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
 
 

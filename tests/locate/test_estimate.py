@@ -80,7 +80,7 @@ def test_no_flipped_pose_is_accepted():
     rng = np.random.default_rng(3)
     layout = example_layout(0.03, 0.2)
     accepted = flipped = ambiguous = turned = 0
-    for _ in range(200):
+    for _ in range(100):
         truth = random_pose(rng, 1500.0, (15, 50))
         seen = merge(simulated_exposures(layout, truth, rng, shown=((0,),)), layout).seen
         pose, verdict = judge(locate(seen, layout, CAMERA), VerdictOptions(max_sigma_deg=10))
@@ -90,8 +90,8 @@ def test_no_flipped_pose_is_accepted():
         ambiguous += verdict.decision == "ambiguous"
         flipped += off and verdict.decision == "accept"
     assert flipped == 0
-    assert turned > 10  # or the test would say nothing
-    assert ambiguous > 50
+    assert turned > 5  # or the test would say nothing
+    assert ambiguous > 25
 
 
 def test_both_minima_are_refined_and_covered_by_one_covariance_where_they_are_one():

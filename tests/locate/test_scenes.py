@@ -14,6 +14,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import SceneTags, detect, find_scenes, locate_image, locate_scene, run
 from stcal.synthetic.optics import Light, expose
+from tests.levels import sampled
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.outcome import fails_with, refuses
 from tests.support.areas import homography, rendered
@@ -111,9 +112,8 @@ def test_scenes_of_a_folder(tmp_path, plain):
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path / "far" / "1.png")] == [("1", 1)]
 
 
-@pytest.mark.parametrize("shift", [1.0, pytest.param(8.0, marks=pytest.mark.slow)])
-def test_a_scene_that_moved(located, plain, shift):
-    matrix = np.array([[1.0, 0, shift], [0, 1, 0]])
+def test_a_scene_that_moved(located, plain):
+    matrix = np.array([[1.0, 0, 1.0], [0, 1, 0]])
     turned = cv2.warpAffine(plain, matrix, plain.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     result = located([*expose(plain, [0.5, 1.0]), *expose(turned, [0.7])])
     assert result.verdict.decision == "reject"
@@ -154,18 +154,19 @@ def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
     return dataclasses.replace(LAYOUT, corners_mm=about + middle * [1, flip])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layout", "remedy"),
-    [
-        (turned(180), "add 180 to each angle_deg"),
-        (turned(-90), "add 90 to each angle_deg"),
-        (turned(90), "subtract 90 from each angle_deg"),
-        (turned(0, -1, -1), "change the signs of y_mm and angle_deg"),
-        (turned(0, -1), "change the signs of y_mm"),
-        (sized(1.25), "every tag were 0.80"),
-        (sized(0.5), "every tag were 2"),
-    ],
+    sampled(
+        [
+            (turned(-90), "add 90 to each angle_deg"),
+            (turned(0, -1, -1), "change the signs of y_mm and angle_deg"),
+            (sized(0.5), "every tag were 2"),
+            (turned(180), "add 180 to each angle_deg"),
+            (turned(90), "subtract 90 from each angle_deg"),
+            (turned(0, -1), "change the signs of y_mm"),
+        ],
+        (0, 1, 2),
+    ),
 )
 def test_tags_that_are_turned_in_the_layout(seen, layout, remedy):
     result = locate_scene(seen, layout, MODEL)
@@ -193,10 +194,8 @@ def two_tags():
     return rendered(TWO, place, (320, 240), np.random.default_rng(1))
 
 
-@pytest.mark.parametrize(
-    "camera", [SMALL, CameraModel((500, 500), (159.5, 119.5), np.zeros(8), "PINHOLE", 320, 240, "")]
-)
-def test_an_array_is_located(two_tags, camera):
+def test_an_array_is_located(two_tags):
+    camera = CameraModel((500, 500), (159.5, 119.5), np.zeros(8), "PINHOLE", 320, 240, "")
     result = locate_image(two_tags, TWO, camera)
     assert result.verdict.decision == "accept"
     error = Poses.of([result.pose.camera_from_obj]).difference(Poses.of([PLACE]))[0]

@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.consensus import MODELS, problem_of
 from stcal.register.doubts import WIDER_THAN, mirrored_ratio, moved_meanwhile, single_supports, spreads, symmetry
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 from tests.scripts import load_script
 from tests.support.point_pairs import B_FROM_A, scene
 
@@ -42,6 +42,9 @@ def test_a_plane_is_solved_rigidly_and_refused_affinely():
         refuses("E-POINTS-COPLANAR", register, a, seen_of(a), model="affine", method=method)
     thin = a + np.random.default_rng(2).normal(0, 0.05, a.shape)
     refuses("E-POINTS-COPLANAR … 25", register, thin, seen_of(thin), model="affine")
+    raised = np.vstack([a[:12], [[0, 0, 90]]])
+    found = register(raised, seen_of(raised), model="affine", method="least-squares", folds=0)
+    assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
 
 
 def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
@@ -54,15 +57,7 @@ def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
     a = np.vstack([along_a_line(20, 0.02), np.random.default_rng(5).uniform(-100, 100, (4, 3))])
     b = seen_of(a)
     b[20:] += np.random.default_rng(6).uniform(-60, 60, (4, 3))
-    with fails_with("E-POINTS-COLLINEAR"):
-        register(a, b, folds=0)
-
-
-def test_one_point_off_a_plane_is_named_for_the_affine_model():
-    flat = np.random.default_rng(3).uniform(-100, 100, (12, 3)) * [1, 1, 0]
-    a = np.vstack([flat, [[0, 0, 90]]])
-    found = register(a, seen_of(a), model="affine", method="least-squares", folds=0)
-    assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
+    refuses("E-POINTS-COLLINEAR", register, a, b, folds=0)
 
 
 SQUARE = np.array([[100.0, 0, 0], [0, 100, 0], [-100, 0, 0], [0, -100, 0]])
@@ -79,8 +74,7 @@ def test_a_symmetric_layout_is_told():
     assert np.degrees(angle) == pytest.approx(90, abs=1) or np.degrees(angle) == pytest.approx(180, abs=1)
 
 
-@pytest.mark.parametrize("model", ["rigid", "affine"])
-@pytest.mark.parametrize("width", [0.4, 0.6])
+@pytest.mark.parametrize(("model", "width"), [("rigid", 0.4), ("affine", 0.6)])
 def test_supports_are_those_of_leaving_out_one_after_the_other(model, width):
     """Most points are passed over, as none alone could matter: the others must be the right ones."""
     rng = np.random.default_rng(round(10 * width))
@@ -102,7 +96,7 @@ def lengths():
     return a, B_FROM_A @ a, rng.normal(0, 0.05, (80, 3))
 
 
-@pytest.mark.parametrize("scale", [1.5, 1.002, 0.99809, 1.0002])
+@pytest.mark.parametrize("scale", [1.5, 1.0002])
 def test_another_scale_is_named_with_its_sigma(scale):
     a, b, noise = lengths()
     notes = register(a, scale * b + noise).notes
@@ -127,8 +121,10 @@ def test_an_axis_that_is_scaled_is_told_from_a_scale_and_a_bend_is_said_beside_i
     assert register(a, a).notes == register(a, b).notes == ()
 
 
-@pytest.mark.parametrize("method", ["robust", "least-squares"])
-@pytest.mark.parametrize(("factor", "unit"), [(1000, "m"), (25.4, "inches"), (10, "cm")])
+@pytest.mark.parametrize(
+    ("factor", "unit", "method"),
+    [(1000, "m", "robust"), (25.4, "inches", "least-squares"), (10, "cm", "least-squares")],
+)
 def test_another_unit_is_named(factor, unit, method):
     s = scene(0, 40, 0.3)
     with pytest.raises(InputError, match=rf"distances in b are [\d.]+ times those in a .*is a in {unit} "):
@@ -137,33 +133,31 @@ def test_another_unit_is_named(factor, unit, method):
         register(s.xyz_a, s.xyz_b / factor, method=method)
 
 
-def test_a_similarity_takes_any_scale_and_tells_units():
+def test_points_in_metres_are_doubted_and_a_similarity_tells_units():
     s = scene(1, 20)
     found = register(s.xyz_a / 25.4, s.xyz_b, model="similarity", folds=0)
     assert any("the scale is 25.4" in note and "is a in inches" in note for note in found.notes)
     assert not any("scale" in note for note in register(s.xyz_a, s.xyz_b, model="similarity", folds=0).notes)
+    for factor in (1, 1000):
+        notes = register(s.xyz_a / factor, s.xyz_b / factor, folds=0).notes
+        assert any("if lengths are metres" in note for note in notes) == (factor == 1000)
 
 
 @pytest.mark.parametrize(
     ("mirror", "share", "method"),
     [
-        (np.diag([1.0, 1, -1]), 0, "robust"),
         (np.diag([1.0, 1, -1]), 0.35, "robust"),
-        (np.diag([1.0, 1, -1]), 0, "least-squares"),
-        (np.diag([1.0, -1, 1]), 0, "robust"),
+        (np.diag([1.0, -1, 1]), 0, "least-squares"),
         (np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), 0, "robust"),
     ],
 )
 def test_a_mirrored_frame_is_refused(mirror, share, method):
-    for seed in range(2):
-        s = scene(seed, 60, share)
-        with fails_with("E-REGISTER-MIRRORED … 60"):
-            register(s.xyz_a @ mirror.T, s.xyz_b, method=method)
+    s = scene(0, 60, share)
+    refuses("E-REGISTER-MIRRORED … 60", register, s.xyz_a @ mirror.T, s.xyz_b, method=method)
 
 
-@pytest.mark.slow
 def test_planes_and_few_points_are_not_called_mirrored():
-    for seed in range(40):
+    for seed in range(12):
         s = scene([seed, 5], 5)
         register(s.xyz_a, s.xyz_b, folds=0)
         flat = s.xyz_a * [1, 1, 0]
@@ -194,35 +188,18 @@ def test_least_squares_tells_that_rows_are_far_off():
     assert register(clean.xyz_a, clean.xyz_b, method="least-squares", folds=0).notes == ()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"model": "projective"}, "E-OPTION-VALUE … 'projective' … rigid, similarity, affine"),
-        ({"method": "magic"}, "E-OPTION-METHOD … 'magic' … robust"),
-        ({"threshold_mm": -1}, "E-OPTION-RANGE … -1"),
-        ({"method": "liu2017", "weights": np.ones(30)}, "E-REGISTER-WEIGHTS"),
-    ],
-)
-def test_options_that_cannot_be(options, message):
+def test_options_and_points_that_cannot_be():
     s = scene(12, 30)
-    with fails_with(message):
-        register(s.xyz_a, s.xyz_b, **options)
-
-
-def test_points_that_cannot_be():
-    s = scene(13, 30)
+    a, b = s.xyz_a, s.xyz_b
+    refuses("E-OPTION-VALUE … 'projective' … rigid, similarity, affine", register, a, b, model="projective")
+    refuses("E-OPTION-METHOD … 'magic' … robust", register, a, b, method="magic")
+    refuses("E-OPTION-RANGE … -1", register, a, b, threshold_mm=-1)
+    refuses("E-REGISTER-WEIGHTS", register, a, b, method="liu2017", weights=np.ones(30))
     refuses("E-ARRAY-SHAPE … (30, 3) … (29, 3)", register, s.xyz_a, s.xyz_b[1:])
     bad = s.xyz_b.copy()
     bad[5, 1] = np.nan
     refuses("E-ARRAY-NOT-FINITE … 6", register, s.xyz_a, bad)
     refuses("E-POINTS-FEW … 0 … 3", register, np.zeros((0, 3)), np.zeros((0, 3)))
-
-
-def test_points_in_metres_are_doubted():
-    s = scene(2, 20)
-    said = "if lengths are metres"
-    assert any(said in note for note in register(s.xyz_a / 1000, s.xyz_b / 1000, folds=0).notes)
-    assert not any(said in note for note in register(s.xyz_a, s.xyz_b, folds=0).notes)
 
 
 MOVE = Rigid.exp([0, 1e-3, 0, 0.6, -0.8, 0])
@@ -239,8 +216,9 @@ def moved_from(row: int, b: np.ndarray, by: Rigid) -> np.ndarray:
     return np.concatenate([b[:row], by @ (b[row:] - middle) + middle])
 
 
-@pytest.mark.parametrize("model", ["rigid", "similarity", "affine"])
-@pytest.mark.parametrize("method", ["robust", "least-squares"])
+@pytest.mark.parametrize(
+    ("model", "method"), [("rigid", "robust"), ("similarity", "least-squares"), ("affine", "robust")]
+)
 def test_a_move_is_located_with_its_size(model, method):
     a, b = points(1)
     b = moved_from(25, b, MOVE)
@@ -253,8 +231,7 @@ def test_a_move_is_located_with_its_size(model, method):
 
 def test_a_large_move_is_located_too_and_two_transforms_refused_with_the_row_between_them():
     a, b = points(2)
-    with fails_with("E-REGISTER-TWO-TRANSFORMS … from row 26 on … separately"):
-        register(a, moved_from(25, b, MOVE), folds=0)
+    refuses("E-REGISTER-TWO-TRANSFORMS … from row 26 on … separately", register, a, moved_from(25, b, MOVE), folds=0)
     found = register(a, moved_from(26, b, Rigid.exp([0, 0, 0.01, 10, 0, 0])), folds=0, allow_ambiguous=True)
     assert any(note.startswith("from row 27 on") for note in found.notes)
 
@@ -326,10 +303,10 @@ def test_the_covariance_holds_either_group():
     assert error @ np.linalg.solve(clean.covariance[3:, 3:], error) > 30
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0, 5])
 def test_clean_rows_and_few_wrong_ones_are_not_two_groups(wrong):
-    for seed in range(20):
+    """The study below has more sets."""
+    for seed in range(5):
         assert not any(SAID in note for note in register(*pairs(seed, wrong), folds=0).notes)
 
 
@@ -347,9 +324,8 @@ def test_study_of_two_groups(capsys):
     assert counts[2:, 2:].sum() == 0
 
 
-@pytest.mark.parametrize("off_mm", [0.0, 5.0])
 @pytest.mark.parametrize(
-    ("n", "model", "more"), [(3, "rigid", 3), (4, "rigid", 2), (4, "similarity", 2), (5, "affine", 2)]
+    ("n", "model", "more", "off_mm"), [(3, "rigid", 3, 0.0), (4, "similarity", 2, 5.0), (5, "affine", 2, 5.0)]
 )
 def test_one_wrong_of_so_few_is_said_to_be_beyond_telling(n, model, more, off_mm):
     """Any but one of them fit: whichever was wrong, the same residuals."""

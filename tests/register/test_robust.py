@@ -7,6 +7,7 @@ from stcal.geometry.rigid import align_rigid
 from stcal.register import Liu2017Options, register
 from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER
 from stcal.register.registration import affine_least_squares, liu2017
+from tests.levels import sampled
 from tests.outcome import fails_with, refuses
 from tests.support.point_pairs import SIGMA_MM, directions, scene
 
@@ -16,13 +17,10 @@ def cost_ratio(s, found) -> float:
     return ((b - found.b_from_a @ a) ** 2).sum() / ((b - align_rigid(b, a) @ a) ** 2).sum()
 
 
-@pytest.mark.parametrize(
-    ("share", "sets"),
-    [(0, 2), (0.4, 2), *(pytest.param(x, 6, marks=pytest.mark.slow) for x in (0, 0.1, 0.2, 0.3, 0.4))],
-)
+@pytest.mark.parametrize("share", sampled([0.4, 0, 0.1, 0.2, 0.3]))
 @pytest.mark.parametrize("n", [20, 100])
-def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share, sets):
-    for trial in range(sets):
+def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share):
+    for trial in range(3):
         s = scene([trial, n], n, share)
         found = register(s.xyz_a, s.xyz_b, folds=0)
         assert cost_ratio(s, found) > 1 - 1e-12
@@ -32,11 +30,16 @@ def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share, sets):
 
 
 @pytest.mark.slow
-def test_clean_points_are_kept():
-    """One set in a thousand may lose a point: of 40 more than 1 would with a chance of 1e-3."""
-    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(40)))
+def test_clean_points_are_kept_and_not_called_bent():
+    """One set in a thousand may lose a point: of 25 one would with a chance of 2.5 %. One in ten thousand is bent."""
     assert CLEAN_SETS_WITH_OUTLIER == 0.001
-    assert lost <= 1
+    for n, sets in ((12, 20), (100, 5)):
+        for trial in range(sets):
+            s = scene([trial, 7], n)
+            found = register(s.xyz_a, s.xyz_b, folds=0)
+            assert found.inliers.all()
+            assert not any("bent" in note for note in found.notes)
+    assert found.notes == ()
 
 
 def test_outliers_just_beyond_noise_are_found():
@@ -48,7 +51,7 @@ def test_outliers_just_beyond_noise_are_found():
     assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.2)  # 129 degrees of freedom: ± 6 %
 
 
-@pytest.mark.parametrize("size", [1e4, 1e6, 1e15])
+@pytest.mark.parametrize("size", [1e4, 1e15])
 def test_outliers_of_two_sizes(size):
     s = scene(4, 80)
     b = s.xyz_b.copy()
@@ -66,14 +69,11 @@ def test_more_wrong_than_right_is_said():
 
 
 @pytest.mark.parametrize("kind", ["one shift", "other motion"])
-@pytest.mark.parametrize(
-    ("share", "sets"), [(0.5, 2), *(pytest.param(x, 4, marks=pytest.mark.slow) for x in (0.4, 0.5, 0.6))]
-)
-def test_two_transforms_are_refused_or_told(kind, share, sets):
-    for trial in range(sets):
+@pytest.mark.parametrize("share", sampled([0.5, 0.4, 0.6]))
+def test_two_transforms_are_refused_or_told(kind, share):
+    for trial in range(2):
         s = scene([trial, 11], 40, share, kind)
-        with fails_with("E-REGISTER-TWO-TRANSFORMS"):
-            register(s.xyz_a, s.xyz_b, folds=0)
+        refuses("E-REGISTER-TWO-TRANSFORMS", register, s.xyz_a, s.xyz_b, folds=0)
         found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
         assert found.ambiguous
         assert found.notes[0].startswith("AMBIGUOUS") or found.notes[1].startswith("AMBIGUOUS")
@@ -96,7 +96,7 @@ def test_groups_that_no_consensus_tells_apart():
 
 def test_noise_along_one_axis_is_not_two_groups():
     """Half of it is on either side, but what two transforms take off it, one covariance explains as well."""
-    for trial, n, along in ((0, 12, 3), (1, 30, 5), (2, 100, 3), (3, 200, 10), (4, 100, 30)):
+    for trial, n, along in ((0, 12, 3), (3, 200, 10), (4, 100, 30)):
         rng = np.random.default_rng([trial, 6])
         s = scene([trial, 6], n, sigma_mm=0.02)
         b = s.xyz_b + rng.normal(0, along * 0.02, (n, 1)) * [0.6, 0, 0.8]
@@ -134,14 +134,6 @@ def test_a_bent_frame_is_not_two_motions():
     assert any("bent" in note for note in found.notes)
     away = np.sqrt((((found.b_from_a @ a) - plain.b_from_a @ a) ** 2).sum(1).mean())
     assert away < 0.1 * plain.inlier_errors.rms_mm
-
-
-@pytest.mark.slow
-def test_noise_is_not_called_bent():
-    """One case in ten thousand is."""
-    for trial in range(15):
-        s = scene([trial, 8], 100)
-        assert register(s.xyz_a, s.xyz_b, folds=0).notes == ()
 
 
 def test_the_same_seed_gives_the_same_answer_and_rows_in_any_order_the_same_points():
@@ -229,13 +221,11 @@ def test_too_few(model, n, needed):
 
 def test_points_without_correspondence_are_refused():
     rng = np.random.default_rng(21)
-    for n in (8, 40, 200):
-        with fails_with("E-REGISTER-CHANCE"):
-            register(rng.uniform(-100, 100, (n, 3)), rng.uniform(-100, 100, (n, 3)))
+    for n in (8, 200):
+        refuses("E-REGISTER-CHANCE", register, *rng.uniform(-100, 100, (2, n, 3)))
     a, b = rng.uniform(-100, 100, (2, 30, 3))  # least squares: σ is as large as the cloud, along all of its axes
     for model in ("rigid", "affine"):
-        with fails_with("E-REGISTER-CHANCE … 30"):
-            register(a, b, model=model, method="least-squares")
+        refuses("E-REGISTER-CHANCE … 30", register, a, b, model=model, method="least-squares")
 
 
 def test_twelve_parameters_are_the_normal_equations():
@@ -292,15 +282,8 @@ def test_samples_of_thirty_never_find_a_clean_draw():
     refuses("E-LIU-SAMPLE … 3 … 3", liu2017, s.xyz_a, s.xyz_b, Liu2017Options(tries=20, orthogonal_within=1e-9))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sample": 3}, "E-LIU-OPTIONS … 3"),
-        ({"share": 1.5}, "E-LIU-OPTIONS … 1.5"),
-        ({"limit_mm": 0}, "E-LIU-OPTIONS … limit_mm … 0"),
-        ({"tries": 0}, "E-LIU-OPTIONS … tries … 0"),
-    ],
-)
-def test_liu2017_options_that_cannot_be(options, message):
-    with fails_with(message):
-        Liu2017Options(**options)
+def test_liu2017_options_that_cannot_be():
+    refuses("E-LIU-OPTIONS … 3", Liu2017Options, sample=3)
+    refuses("E-LIU-OPTIONS … 1.5", Liu2017Options, share=1.5)
+    refuses("E-LIU-OPTIONS … limit_mm … 0", Liu2017Options, limit_mm=0)
+    refuses("E-LIU-OPTIONS … tries … 0", Liu2017Options, tries=0)

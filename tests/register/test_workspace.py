@@ -42,9 +42,9 @@ def fitted(a, b):
 
 @pytest.mark.slow
 def test_noise_is_not_taken_for_a_field():
-    """One case in a hundred may be: more than one of 20 has a chance of 2 %."""
+    """One case in a hundred may be: more than one of 8 has a chance of 0.3 %."""
     seen = 0
-    for seed in range(20):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         a = rng.uniform(-100, 100, (30, 3))
         seen += fitted(a, B_FROM_A @ a + rng.normal(0, SIGMA, a.shape))[1].seen
@@ -149,7 +149,7 @@ def test_points_in_the_cube_are_held_out():
         rng = np.random.default_rng(seed)
         a = np.vstack([rng.uniform(-50, 50, (10, 3)), rng.uniform(-50, 50, (10, 3)) + np.array([0, 0, 150])])
         b = B_FROM_A @ a + rng.normal(0, 1, a.shape)
-        found = register(a, b, threshold_mm=50.0, folds=0)
+        found = register(a, b, method="least-squares", folds=0)
         result = cubes(found, inputs(found, a, b), folds=10)
         inside.append(result.errors[-1][-1].rms_mm if result.errors[-1][-1] else np.nan)
     # 20 points: held out 1 + 6/60 of the noise's variance of 3, in sample 1 − 6/60
@@ -227,7 +227,7 @@ def test_a_bent_frame_is_said():
     assert re.search(r"fitted in the cube of \d+ mm it holds within [\d.]+ mm there, [\d.]+ mm to \d+ mm", text)
 
 
-@pytest.mark.parametrize("model", ["rigid", "similarity", "affine"])
+@pytest.mark.parametrize("model", ["rigid", "affine"])
 def test_json_is_the_result(model):
     result = found_of(model=model)
     content = json.loads(json_text(RegistrationFile.model_validate(result)))
@@ -235,7 +235,7 @@ def test_json_is_the_result(model):
     matrix = np.array(content["b_from_a"])
     a = result.xyz_a
     np.testing.assert_allclose(a @ matrix[:3, :3].T + matrix[:3, 3], result.b_from_a @ a, atol=1e-9)
-    p = {"rigid": 6, "similarity": 7, "affine": 12}[model]
+    p = {"rigid": 6, "affine": 12}[model]
     assert np.shape(content["covariance"]) == (p, p)
     assert len(content["covariance_of"]) == p
     assert content["inliers"] == result.inliers.tolist()

@@ -9,7 +9,7 @@ from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 
 from stcal.sfm.report.run_page import report_html
-from tests.report.browser import faults, opened, show, sideways_px
+from tests.report.browser import faults, opened, show
 from tests.sfm.report.test_report import by_image, make
 
 NAMES = ["a/9.jpg", "a/10.jpg", "a/1.jpg"]
@@ -124,10 +124,3 @@ def test_vectors_stand_where_the_circles_are(opened_page):
     scale = photo["width"] / 2592
     assert x == pytest.approx(photo["x"] + scale * (centre[0] + 0.5), abs=0.1)
     assert y == pytest.approx(photo["y"] - top + scale * (centre[1] + 0.5), abs=0.5)
-
-
-@pytest.mark.parametrize("width", [400, 1280])
-def test_the_page_is_never_wider_than_its_window(chrome, page, width):
-    show(chrome, page, width)
-    assert sideways_px(chrome) == 0
-    assert faults(chrome) == []

@@ -19,7 +19,7 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml, save_robot
 from stcal.robot.kinematics.robot_model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.arms import two_arms
 
 UR5E = {
@@ -125,16 +125,10 @@ def test_the_yaml_of_ur_calibration(universal, convention):
         assert found.robot.rows[1].theta == pytest.approx(UR5E["upper_arm"][5], abs=1e-12)
 
 
-@pytest.mark.parametrize("with_nominal", [False, True])
-def test_calibration_conf(universal, with_nominal):
-    """Tools and base of the nominal arm stay."""
-    lists = (f"{key} = {list(map(float, values))}\n" for key, values in (("a", A), ("d", D), ("alpha", ALPHA)))
-    text = CONF if with_nominal else "[DH]\n" + "".join(lists) + CONF
-    base = tool = Rigid()
-    if with_nominal:
-        base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
-    given = nominal(world_from_base=base, tools={"": tool}) if with_nominal else None
-    robot = universal(text, given, name="calibration.conf").robot
+def test_calibration_conf(universal):
+    """Tools and base of the nominal arm stay; with the nominal lengths in it: `tests/test_python_functions.py`."""
+    base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
+    robot = universal(CONF, nominal(world_from_base=base, tools={"": tool}), name="calibration.conf").robot
     wanted = [base.matrix() @ by_rows(q) @ tool.matrix() for q in Q]
     np.testing.assert_allclose(poses(robot), wanted, atol=ROUNDING_MM)
     assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
@@ -152,15 +146,13 @@ def test_calibration_conf(universal, with_nominal):
     ],
 )
 def test_mistakes_in_files_of_universal_robots(universal, text, given, error):
-    with fails_with(error):
-        universal(text, given)
+    refuses(error, universal, text, given)
 
 
 def test_other_files_of_robots_are_to_be_converted(tmp_path, universal):
     for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
         (tmp_path / name).write_text(yaml_of(UR5E))
-        with fails_with(f"E-ROBOT-FORM … {name} … robot convert"):
-            load_robot(tmp_path / name)
+        refuses(f"E-ROBOT-FORM … {name} … robot convert", load_robot, tmp_path / name)
     robot = universal(yaml_of(UR5E)).robot
     save_robot(tmp_path / "ur.toml", robot)
     np.testing.assert_allclose(poses(load_robot(tmp_path / "ur.toml")), poses(robot), atol=ROUNDING_MM)
@@ -241,8 +233,7 @@ def test_a_file_that_leads_elsewhere_is_refused(tmp_path):
     text = robot_urdf(EXAMPLE)
     assert text.count('xyz="0.145 0.0 0.54"') == 1
     (tmp_path / "a.urdf").write_text(text.replace('xyz="0.145 0.0 0.54"', 'xyz="0.14501 0.0 0.54"'))
-    with fails_with("E-WRITTEN-DIFFERS … a.urdf"):
-        require_urdf_written(tmp_path / "a.urdf", EXAMPLE)
+    refuses("E-WRITTEN-DIFFERS … a.urdf", require_urdf_written, tmp_path / "a.urdf", EXAMPLE)
 
 
 OTHER = """<?xml version="1.0" ?>
@@ -344,11 +335,9 @@ def test_mistakes_are_named(tmp_path, change, options, words):
 
 
 def test_robots_that_a_urdf_cannot_hold_are_refused():
-    with fails_with("E-ROBOT-NAME … '\\x1b[31mred' has control characters"):
-        robot_urdf(replace(EXAMPLE, name="\x1b[31mred"))
+    refuses("E-ROBOT-NAME … '\\x1b[31mred' has control characters", robot_urdf, replace(EXAMPLE, name="\x1b[31mred"))
     none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
-    with fails_with("E-ROBOT-ELASTICITY"):
-        robot_urdf(replace(EXAMPLE, elasticity=none))
+    refuses("E-ROBOT-ELASTICITY", robot_urdf, replace(EXAMPLE, elasticity=none))
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
@@ -392,5 +381,4 @@ def test_two_arms_that_stand_at_two_places(tmp_path):
 def test_links_in_a_circle_are_refused(tmp_path):
     circle = ARM.format(arm="a", x=0.0).replace('<parent link="world"/>', '<parent link="a_tool"/>')
     (tmp_path / "circle.urdf").write_text(TWO_ARMS.format(arms=circle))
-    with fails_with("E-URDF-LINKS … is below itself"):
-        load_urdf(tmp_path / "circle.urdf", from_link="a_base")
+    refuses("E-URDF-LINKS … is below itself", load_urdf, tmp_path / "circle.urdf", from_link="a_base")

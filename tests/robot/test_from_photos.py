@@ -22,8 +22,7 @@ from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows import from_photos as work
 from stcal.workflows.from_photos import FromPhotos, files_of, story
-from tests.outcome import fails_with
-from tests.scripts import load_script
+from tests.outcome import refuses
 from tests.support.image_poses import known_target, see
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
@@ -92,8 +91,10 @@ def swept(cell):
     """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
-    targets, options = wanted(cell.about(12)), IdentifyOptions(folds=3, repeats=1)
-    return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
+    targets, options = wanted(cell.about(12)), IdentifyOptions(folds=2, repeats=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)  # of rows left out the result knows by their influence
+        return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
 
 
 @pytest.mark.slow
@@ -212,8 +213,7 @@ SEVEN = "E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_
     ],
 )
 def test_what_is_refused(given, head, rows, options, error):
-    with fails_with(error):
-        given(head, rows, **options)
+    refuses(error, given, head, rows, **options)
 
 
 def test_joint_values_by_another_column_are_those_of_the_photographs(tmp_path):
@@ -244,28 +244,3 @@ def test_all_files_are_written_or_none(tmp_path):
     with pytest.raises((InputError, OSError)):
         save_folder(tmp_path / "arm", {"poses.csv": "a", "n" * 300: "too long a name"})
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture
-def study(monkeypatch):
-    module = load_script("reproduce_robot")
-    monkeypatch.setattr(module, "VERIFIED", 15)
-    monkeypatch.setattr(module, "POOL", 15)
-    return module
-
-
-@pytest.mark.full
-def test_one_arm_is_calibrated_by_the_target_on_its_flange(study):
-    draw = study.one_draw(3, 0, 0.0)
-    shift = np.linalg.norm(draw.pose_error[:, 3:], axis=1)
-    assert 0.02 < np.sqrt((shift**2).mean()) < 0.06  # 0.037 over 100 arms; each has a target of its own
-    for kind in (study.REACH, study.TRUE):
-        nominal, axes, cmmk = draw.sets[kind].values()
-        assert 0.1 < nominal.mean_mm < 3  # 0.3 mm and 0.5 mrad at 2 m
-        # At least the 70 % that are asked for. Of 100 arms: axes up to 0.4 mm, the model 0.0003 to 0.014 mm all over
-        # the reach; none errs by less than a hundredth of the photographs' noise.
-        assert 1e-3 < axes.mean_mm < 0.5
-        assert 1e-4 < cmmk.mean_mm < min(0.03, 0.3 * nominal.mean_mm)
-        assert cmmk.max_mm < axes.max_mm
-    seen = draw.sets[study.CAMERA][study.CMMK]
-    assert draw.sets[study.TRUE][study.CMMK].mean_mm < seen.mean_mm < 0.04  # the photographs' own errors

@@ -31,22 +31,14 @@ def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
     assert pairs.names[:2] == ("line 2", "line 3")
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (((2, 0), "nan"), "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
-        (((5, 13), "3"), "E-QUATERNION-LENGTH … line 7"),
-        (((0, 8), "abc"), "E-TABLE-NUMBER … 2 … camera_from_board_y_mm … 'abc'"),
-    ],
-)
-def test_bad_cells_are_named_by_line(tmp_path, truth, edit, message):
-    (row, column), cell = edit
-
-    def change(rows):
-        rows[row][column] = cell
-
-    with fails_with(message):
-        read_poses(poses_file(tmp_path / "poses.csv", truth, change))
+def test_bad_cells_are_named_by_line(tmp_path, truth):
+    for row, column, cell, error in (
+        (2, 0, "nan", "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
+        (5, 13, "3", "E-QUATERNION-LENGTH … line 7"),
+        (0, 8, "abc", "E-TABLE-NUMBER … 2 … camera_from_board_y_mm … 'abc'"),
+    ):
+        path = poses_file(tmp_path / "poses.csv", truth, lambda rows: rows[row].__setitem__(column, cell))  # noqa: B023
+        refuses(error, read_poses, path)
 
 
 def test_missing_and_doubled_sides(tmp_path, truth):

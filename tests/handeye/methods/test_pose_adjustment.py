@@ -8,11 +8,10 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.methods.pose_adjustment import components
 from tests.support.handeye import error, handeye, normalised, simulated, simulated_views
 
-SETUPS = ("eye-in-hand", "eye-to-hand")
 TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)
 
 

@@ -9,13 +9,11 @@ from scipy.stats import chi2
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
-from stcal.handeye.data.pose_pairs import Loop
+from stcal.handeye.data.pose_pairs import SETUPS, Loop
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from tests.outcome import refuses
 from tests.support.handeye import CAMERA, error, handeye, normalised, simulated_views, squared
-
-SETUPS = ("eye-in-hand", "eye-to-hand")
 
 
 def prior(camera, model):

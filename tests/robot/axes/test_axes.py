@@ -161,9 +161,9 @@ def test_errors_of_axes_and_pairs_are_as_large_as_their_covariance(name, rests):
 @pytest.mark.slow
 def test_leaving_out_a_row_is_fitting_without_it():
     nominal = mh80()
-    data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 2)
+    data = measured(arm(nominal), sweep_values(nominal, 4), SIGMA, 2)
     whole = robot_from_sweeps(data, nominal)
-    for instant in (3, 12, 30):
+    for instant in (3, 12):
         rows = np.arange(len(data)) // 3 != instant
         index = whole.without_one.lines.index(2 + 3 * instant)
         again = robot_from_sweeps(data[rows], nominal)
@@ -230,8 +230,7 @@ def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing(quick):
     error = axis_error(result.fits[5].world_from_axis, z[5], origin[5], False)
     assert np.abs(error[2:]).max() < 5 * np.sqrt(np.diag(result.fits[5].covariance)[2:].max())
     alone = replace(true, tools={"D": true.tools["D"]})
-    with fails_with("E-AXES-UNDETERMINED … 6:"):
-        robot_from_sweeps(measured(alone, sweep_values(nominal), SIGMA), nominal)
+    refuses("E-AXES-UNDETERMINED … 6:", robot_from_sweeps, measured(alone, sweep_values(nominal), SIGMA), nominal)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.004, -0.004])
@@ -358,12 +357,11 @@ def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Mea
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("places", [ring(LENGTH_MM), np.add(UNEVEN, [30.0, 50, -100])], ids=PLACES)
-def test_orientations_give_the_pose_of_the_target_too(places, quick):
+def test_orientations_give_the_pose_of_the_target_too(quick):
     nominal = mh80()
     true = arm(nominal)
     true = replace(true, tools={"A": Rigid.exp([0.3, -0.2, 0.5, 180, 20, 150])})
+    places = np.add(UNEVEN, [30.0, 50, -100])
     result = robot_from_sweeps(posed(true, sweep_values(true, rests=2)), nominal, places=places)
     assert list(result.robot.tools) == ["A"]
     q = joint_vectors(nominal, 20, np.random.default_rng(3))
@@ -380,8 +378,7 @@ def test_the_length_is_that_at_which_both_errors_are_alike():
     assert length_of(replace(data, covariance=None)) is None
     with fails_with("E-MEASURED-NO-ORIENTATION"):
         robot_from_sweeps(measured(true, sweep_values(true, 3)), mh80(), places=ring(100.0))
-    with fails_with("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000"):
-        robot_from_sweeps(data, mh80(), places=ring(0.1))
+    refuses("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000", ring, 0.1)
 
 
 @pytest.mark.full

@@ -47,22 +47,21 @@ def test_zeros_alone_are_found_and_nothing_else_moves():
     assert found.rank == 6 + 6 + 4
     assert (found.dh_sigma[:, LENGTHS] == 0).all()
     # 4 poses are 24 numbers: too few for 30 parameters, enough for 16
-    with fails_with("E-IDENTIFY-FEW … 24 numbers for 30 parameters"):
-        identify(mh80(), data[:4])
+    refuses("E-IDENTIFY-FEW … 24 numbers for 30 parameters", identify, mh80(), data[:4])
     assert identify(mh80(), data[:4], IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
 @pytest.mark.slow
 def test_fixed_dimensions_stay_and_are_said(tmp_path):
-    _, data = seen_arm(np.random.default_rng(2), 40)
+    true, data = seen_arm(np.random.default_rng(2), 40)
+    assert abs(true.rows[1].a - mh80().rows[1].a) > 0.01
     joints = list(mh80().joints)
     joints[1] = replace(joints[1], fixed={"a": "measured on a CMM"})
     (tmp_path / "robot.toml").write_text(robot_toml(replace(mh80(), joints=tuple(joints))))
     nominal = load_robot(tmp_path / "robot.toml")
     assert nominal.joints[1].fixed == {"a": "measured on a CMM"}
-    found = identify(nominal, data, IdentifyOptions(folds=3, repeats=1))
+    found = identify(nominal, data, IdentifyOptions(folds=2, repeats=1))
     assert found.robot.rows[1].a == pytest.approx(mh80().rows[1].a, abs=1e-3)
-    assert abs(identify(mh80(), data, IdentifyOptions(folds=0)).robot.rows[1].a - mh80().rows[1].a) > 0.01
     assert any("a of row 2 (measured on a CMM)" in note for note in found.notes)
     assert found.all_held_out is not None
 
@@ -112,23 +111,19 @@ def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
 
 
 @pytest.mark.slow
-def test_stations_taken_for_one_rows_of_another_and_a_station_of_two_rows_are_refused():
+def test_rows_of_another_station_and_a_station_of_two_rows_are_refused():
     data = stationed("position")
     names = list(data.stations)
     names[1:40:4] = ["A"] * len(names[1:40:4])
-    for stations in ((), tuple(names)):
-        with fails_with("E-IDENTIFY-MISFIT … robot MH80 misses the measurements"):
-            identify(mh80(), replace(data, stations=stations))
-    with fails_with("E-STATION-FEW … 2"):
-        identify(mh80(), stationed("position", second=2))
+    with fails_with("E-IDENTIFY-MISFIT … robot MH80 misses the measurements"):
+        identify(mh80(), replace(data, stations=tuple(names)))
+    refuses("E-STATION-FEW … 2", identify, mh80(), stationed("position", second=2))
 
 
 @pytest.mark.slow
 def test_distances_of_positions_go_within_stations():
-    options = IdentifyOptions(observe="distance", folds=0)
-    found = identify(mh80(), stationed("position"), options)
-    one = identify(mh80(), replace(stationed("position", second=0), stations=()), options)
-    assert found.rank == one.rank
+    found = identify(mh80(), stationed("position"), IdentifyOptions(observe="distance", folds=0))
+    assert found.rank == 21  # as from one station
     assert np.sqrt((found.fitted_mm**2).mean()) < 0.15
 
 
@@ -151,7 +146,7 @@ SURFACE = np.column_stack([GRID_X, GRID_Y, 700 + 30 * np.sin(GRID_X / 100)])
 @pytest.mark.parametrize(
     ("places", "observe", "rank"),
     sampled(
-        [(LINE, "pose", 25), (LINE, "position", 15), (SURFACE, "position", 24), (SURFACE, "distance", 18)], kept=(1, 3)
+        [(LINE, "pose", 25), (LINE, "position", 15), (SURFACE, "position", 24), (SURFACE, "distance", 18)], kept=(1,)
     ),
 )
 def test_partial_solves_whatever_is_seen(places, observe, rank):
@@ -184,23 +179,19 @@ def test_six_poses_for_thirty_parameters_are_said():
     assert found.fitted_mm.mean() < 0.1 < 0.3 < found.predicted.ranges_mm.mean()
     assert found.notes[-2].startswith("6 poses give 36 numbers for 30 parameters: none can be held out")
     assert "times that at the measured rows" in found.notes[-1]
-    more = identify(mh80(), drawn(8, 0.6, 0)[1], IdentifyOptions(repeats=1))
+    more = identify(mh80(), drawn(8, 0.6, 0)[1], IdentifyOptions(folds=0))
     assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in more.notes)
 
 
-def test_rows_of_a_small_part_of_the_ranges_are_said():
+def test_rows_of_a_small_part_of_the_ranges_are_said_and_none_over_them():
     """All parameters count as determined; what is least known is named with its σ."""
     found = identify(mh80(), drawn(40, 0.03, 1)[1], IdentifyOptions(folds=0))
     assert found.rank == 30
     assert found.predicted.elsewhere() > 20
     assert "of a small part of the ranges; least known: J" in found.notes[-1]
-
-
-@pytest.mark.parametrize("observe", ["pose", "position"])
-def test_forty_rows_over_the_ranges_are_not_warned_of(observe):
-    found = identify(mh80(), drawn(40, 0.6, 2, observe)[1], IdentifyOptions(folds=0))
-    assert not any("times that at" in note or "held out" in note for note in found.notes)
-    assert found.predicted.elsewhere() < 2.5
+    over = identify(mh80(), drawn(40, 0.6, 2)[1], IdentifyOptions(folds=0))
+    assert not any("times that at" in note or "held out" in note for note in over.notes)
+    assert over.predicted.elsewhere() < 2.5
 
 
 @pytest.mark.full
@@ -226,14 +217,13 @@ CASES = {case.title(): case for case in study.CASES}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", ["position | 40 | 25% | 1–50", "position | 40 | 10% | 5", "pose | 40 | 25% | 1"])
+@pytest.mark.parametrize("text", ["position | 40 | 25% | 1–50", "pose | 40 | 25% | 1"])
 def test_wrong_rows_of_few_are_named_and_do_no_harm(text):
     """What is identified is then what the good rows tell, to rounding: their Huber weights are 1 nearly all."""
-    for seed in range(2):
-        ratio, named, good_called_wrong = study.draw(CASES[text], seed)
-        assert ratio < 1.1
-        assert named
-        assert good_called_wrong == 0
+    ratio, named, good_called_wrong = study.draw(CASES[text], 0)
+    assert ratio < 1.1
+    assert named
+    assert good_called_wrong == 0
 
 
 @pytest.mark.parametrize("case", sampled(study.CASES, kept=()), ids=list(CASES))
@@ -248,12 +238,9 @@ def test_wrong_rows_over_many_draws(case):
 @pytest.mark.slow
 def test_without_the_search_wrong_rows_would_do_harm():
     """The test above can fail: Huber's weights alone follow ten wrong rows of forty."""
-    _, data, bad = study.simulated(CASES["position | 40 | 25% | 1–50"], 0)
+    _, data, _ = study.simulated(CASES["position | 40 | 25% | 1–50"], 0)
     plain = identify(mh80(), data, IdentifyOptions(folds=0, robust=False))
     assert plain.weighting.sigma_mm > 20 * 0.05
-    robust = identify(mh80(), data, IdentifyOptions(folds=0))
-    assert robust.weighting.sigma_mm == pytest.approx(0.05, rel=0.4)  # 90 numbers for 27 parameters: 1/√(2·63) = 9 %
-    assert {row for row, _ in robust.outliers()} == set(bad.tolist())
 
 
 def test_most_rows_wrong_is_not_called_good():

@@ -28,10 +28,10 @@ def left_of(true: Robot, data: Measurements, kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "sets"), sampled([("position", 40), ("position", 200), ("pose", 100), ("distance", 60)])
+    ("kind", "sets"), sampled([("position", 20), ("position", 200), ("pose", 100), ("distance", 60)])
 )
 def test_clean_sets_say_nothing(kind, sets):
-    """At 1 %; of 200 sets five or more once in twenty runs, and 5 % are asked for."""
+    """At 1 %; of 20 sets any with a chance of 18 %, of 200 sets more than five with one of 2 %."""
     said = [found for seed in range(sets) if (found := left_of(*simulated(seed, 40), kind))]
     assert len(said) <= 0.025 * sets
 
@@ -54,17 +54,20 @@ def gravity(q: np.ndarray, true: Robot) -> np.ndarray:
     return 1.5e-7 * np.einsum("mi,mi->m", turned[1][:, :, 2], np.cross(arm, [0, 0, 1.0]))
 
 
-@pytest.mark.parametrize("kind", ["pose", "position"])
 @pytest.mark.parametrize(
-    ("joint", "of", "what"),
+    ("kind", "joint", "of", "what"),
     [
-        (3, lambda q, _: 2e-4 * np.cos(q[:, 2] + 1), "the angle of joint 3, once a turn, along its motion"),
-        (1, lambda q, _: 2e-4 * np.sin(2 * q[:, 0]), "the angle of joint 1, twice a turn, along its motion"),
-        (5, lambda q, _: 3e-4 * np.sin(2 * q[:, 4]), "the angle of joint 5, twice a turn, along its motion"),
-        (2, gravity, "gravity's torque about joint 2"),
+        ("pose", 3, lambda q, _: 2e-4 * np.cos(q[:, 2] + 1), "the angle of joint 3, once a turn, along its motion"),
+        (
+            "position",
+            5,
+            lambda q, _: 3e-4 * np.sin(2 * q[:, 4]),
+            "the angle of joint 5, twice a turn, along its motion",
+        ),
+        ("position", 2, gravity, "gravity's torque about joint 2"),
     ],
 )
-def test_a_cause_is_named_once(joint, of, what, kind):
+def test_a_cause_is_named_once(kind, joint, of, what):
     true, data = bent(5, 120, joint, of)
     [finding] = left_of(true, data, kind)
     assert finding.what == what
@@ -119,8 +122,7 @@ def moved_from(row: int, data: Measurements, by: Rigid) -> Measurements:
     )
 
 
-@pytest.mark.parametrize("kind", ["pose", "position"])
-@pytest.mark.parametrize("row", [8, 20, 34])
+@pytest.mark.parametrize(("row", "kind"), [(8, "position"), (34, "pose")])
 def test_an_instrument_that_moved_is_located_and_a_station_proposed(row, kind):
     true, data = simulated(11, 40)
     finding, *others = left_of(true, moved_from(row, data, JUMP), kind)

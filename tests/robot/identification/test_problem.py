@@ -14,7 +14,7 @@ from stcal.robot.identification.problem import ArmProblem, Spread, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 WEIGHTING = Weighting(0.05, 2e-4)
 
@@ -73,8 +73,7 @@ def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     monkeypatch.setattr(problem, "MAX_STEPS", 1)
     count = jacobian(state, seen).shape[2]
     far = moved(state, np.full(count, 0.05), seen.kind)
-    with fails_with("E-NO-MINIMUM … identification … 1"):
-        ArmProblem(seen, WEIGHTING).solve(far)
+    refuses("E-NO-MINIMUM … identification … 1", ArmProblem(seen, WEIGHTING).solve, far)
 
 
 @pytest.mark.parametrize("rows", [14, 24, 104])

@@ -7,16 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.robot_file import robot_toml
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.levels import sampled
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.robot.identification.test_solve import simulated
 
 LAST = "quaternions were x, y, z, w in the order of their columns"
@@ -41,12 +39,11 @@ def in_order(data, order, conjugated=False):
     ],
 )
 def test_another_convention_is_named(order, conjugated, said):
-    for count in (8, 30):
-        data = seen(count, count, ("a", "b"))
-        start(mh80(), data)
-        with fails_with("E-ROBOT-ORIENTATIONS") as caught:
-            start(mh80(), in_order(data, order, conjugated))
-        assert str(caught.value).endswith(said)
+    data = seen(8, 8, ("a", "b"))
+    start(mh80(), data)
+    with fails_with("E-ROBOT-ORIENTATIONS") as caught:
+        start(mh80(), in_order(data, order, conjugated))
+    assert str(caught.value).endswith(said)
 
 
 def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
@@ -77,7 +74,6 @@ def as_it_is(q: np.ndarray) -> np.ndarray:
         *sampled(
             [
                 (replace(mh80(), convention="modified"), as_it_is, [], "standard convention"),
-                (WITH_ZERO, as_it_is, [], "theta of joint 4 … +90°"),
                 (WITH_ZERO, as_it_is, [3, 20], "theta of joint 4 … +90° … lines 5, 22 were not there"),
                 (EXCHANGED, as_it_is, [3, 20], "rows 2 and 3 were exchanged … lines 5, 22 were not there"),
                 # joint 1 is square to joint 2: half a turn of the one's zero is the opposite sign of the other
@@ -86,10 +82,9 @@ def as_it_is(q: np.ndarray) -> np.ndarray:
                 (mh80(), lambda q: q[:, ::-1], [], "opposite order"),
                 (mh80(), lambda q: np.roll(q, 1, axis=0), [], "one row further up"),
                 (mh80(), lambda q: np.roll(q, -1, axis=0), [], "one row further down"),
-                (mh80(), lambda q: q + q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by -1"),
                 (mh80(), lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by +1"),
             ],
-            kept=(0, 1, 2, 3, 4, 5, 6, 7, 9),
+            kept=(1, 2, 3, 4, 6),
         ),
     ],
 )
@@ -97,22 +92,7 @@ def test_mistakes_are_named(mistaken, change, wrong, named):
     data = replace(seen(6, 40), rotations=None)
     positions = np.array(data.positions)
     positions[wrong] += np.random.default_rng(0).normal(0, 600.0, (len(wrong), 3))
-    with fails_with(f"E-IDENTIFY-MISFIT … {named}"):
-        start(mistaken, replace(data, q=change(data.q), positions=positions))
-
-
-def test_the_order_of_quaternions_is_an_option(tmp_path, stcal_robot):
-    data = seen(2, 30)
-    (tmp_path / "robot.toml").write_text(robot_toml(mh80()))
-    rows = [
-        [*(repr(float(v)) for v in np.degrees(q)), *cells[:3], *cells[4:], cells[3]]
-        for q, cells in zip(data.q, map(pose_cells, data.poses()), strict=True)
-    ]
-    header = [*(f"q{i}_deg" for i in range(1, 7)), *POSE]
-    (tmp_path / "data.csv").write_text("\n".join(map(",".join, [header, *rows])))
-    words = "identify", tmp_path / "data.csv", "--robot", tmp_path / "robot.toml", "--folds", 0
-    assert stcal_robot(*words)[0] == 2
-    assert stcal_robot(*words, "--quaternions", "xyzw")[0] == 0
+    refuses(f"E-IDENTIFY-MISFIT … {named}", start, mistaken, replace(data, q=change(data.q), positions=positions))
 
 
 @pytest.mark.parametrize("way", ["exchanged", "sign", "line", "random"])
@@ -128,8 +108,7 @@ def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(w
         "line": (Rotation.from_matrix(np.roll(data.rotations, 1, axis=0)), "each orientation were in the line before"),
         "random": (Rotation.random(30, rng), "check the convention of the angles"),
     }[way]
-    with fails_with(f"E-ROBOT-ORIENTATIONS … {said}"):
-        start(robot, replace(data, rotations=rotations.as_matrix()))
+    refuses(f"E-ROBOT-ORIENTATIONS … {said}", start, robot, replace(data, rotations=rotations.as_matrix()))
     third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
     start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
 
@@ -138,7 +117,6 @@ def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(w
     ("starts", "named"),
     [
         ((), "20 rows, from line 22 to 41, did not repeat the position"),
-        ((15,), "the instrument, or the robot's base, had not moved before line 17 … column station"),
         ((12, 27), "the instrument, or the robot's base, had not moved before lines 14, 29 … column station"),
     ],
 )
@@ -150,8 +128,7 @@ def test_rows_that_repeat_a_position_and_an_instrument_that_moved_far_are_named(
         positions[row:] = Rigid.exp([0.3, -0.2, 1.0 + k, 1500, -900, 400]) @ positions[row:]
     if not starts:
         positions[20:] = positions[19]
-    with fails_with(f"E-IDENTIFY-MISFIT … {named}"):
-        start(mh80(), replace(data, positions=positions))
+    refuses(f"E-IDENTIFY-MISFIT … {named}", start, mh80(), replace(data, positions=positions))
 
 
 def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import read_measurements, read_targets
@@ -62,6 +62,13 @@ def test_angles_are_orientations(data, names, rotation):
     targets = read_targets(data.write("t.csv", names, joints=False), mh80(), rotation=rotation)
     assert np.abs(targets.poses.difference(data.seen.poses())).max() < 1e-9
     assert targets.notes == read.notes
+
+
+def test_the_order_of_quaternions_is_an_option(data):
+    wxyz = data.seen.poses().quaternions()
+    path = data.write("data.csv", POSE[3:], poses=Poses.from_quaternions(wxyz[:, [1, 2, 3, 0]], data.seen.points()))
+    read = read_measurements(path, mh80(), quaternions="xyzw")
+    assert np.abs(read.poses().difference(data.seen.poses())).max() < 1e-9
 
 
 def test_an_open_convention_is_refused_and_a_needless_one_too(data):

@@ -21,7 +21,7 @@ from stcal.robot.kinematics.forward import (
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import Conditions, Elasticity, Robot, loaded, mh80
 from stcal.robot.simulated import joint_vectors
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 TOOL = Rigid.exp([0.1, 0.2, 0.3, 50, 60, 70])
 ALONE = ("",) * 20
@@ -166,5 +166,4 @@ def test_hysteresis_is_an_error_of_the_controllers_values():
 
 
 def test_other_directions_are_refused():
-    with fails_with("E-APPROACH-VALUE … 2"):
-        Conditions(approach=np.array([[1.0, 2.0]]))
+    refuses("E-APPROACH-VALUE … 2", Conditions, approach=np.array([[1.0, 2.0]]))

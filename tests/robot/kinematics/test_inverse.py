@@ -77,7 +77,7 @@ def test_nearest_of_all_branches_and_turns():
     rng = np.random.default_rng(8)
     turn = 2 * np.pi
     low, high = robot.limits().T
-    for q in joint_vectors(robot, 5, rng, 0.9):
+    for q in joint_vectors(robot, 2, rng, 0.9):
         pose = forward(robot, q)
         near = joint_vectors(robot, 1, rng, 0.9)[0]
         every = branches(robot, pose[0]).q
@@ -112,7 +112,7 @@ def test_eight_branches_of_an_arm_with_a_spherical_wrist():
     robot = replace(mh80(), joints=(Joint(),) * 6)
     rng = np.random.default_rng(4)
     counts = []
-    for q in joint_vectors(mh80(), 10, rng, 0.5):
+    for q in joint_vectors(mh80(), 4, rng, 0.5):
         found = branches(robot, forward(robot, q)[0])
         counts.append(len(found))
         apart = (found.q - q + np.pi) % (2 * np.pi) - np.pi

@@ -25,8 +25,7 @@ def test_units_and_targets(tmp_path):
     assert data.targets == ("N1", "N2")
     assert list(data.lines) == [4, 5]
     assert data.rotations is None
-    with fails_with("E-MEASURED-NO-ORIENTATION"):
-        data.poses()
+    refuses("E-MEASURED-NO-ORIENTATION", data.poses)
 
 
 def test_poses_with_covariance(tmp_path):
@@ -88,8 +87,7 @@ def test_distances_from_rows(tmp_path):
     ],
 )
 def test_mistakes_are_named(tmp_path, text, words):
-    with fails_with(words):
-        read(tmp_path, text)
+    refuses(words, read, tmp_path, text)
 
 
 def test_ambiguous_poses_are_left_out_and_told(tmp_path):
@@ -101,5 +99,4 @@ def test_ambiguous_poses_are_left_out_and_told(tmp_path):
     data = read(tmp_path, text)
     assert list(data.lines) == [2, 3, 4, 6, 7, 9]
     assert "2 of 8 rows left out, first line 5: their status is ambiguous" in data.notes[0]
-    with fails_with("E-MEASURED-REACH … 8 … 8"):
-        read(tmp_path, text.replace("certain", "ambiguous"))
+    refuses("E-MEASURED-REACH … 8 … 8", read, tmp_path, text.replace("certain", "ambiguous"))

@@ -33,8 +33,7 @@ def test_indices_by_hand():
     assert ObservabilityIndices.of(sigma, 1).o1 == pytest.approx(1)
     assert ObservabilityIndices.of(sigma[::-1], 1).o4 == pytest.approx(1e-36)
     for sigma, count in (([], 3), ([1.0, -1.0], 3), ([1.0], 0), ([np.nan], 1)):
-        with fails_with("E-ARRAY-SHAPE"):
-            ObservabilityIndices.of(sigma, count)
+        refuses("E-ARRAY-SHAPE", ObservabilityIndices.of, sigma, count)
 
 
 @pytest.mark.parametrize(("limits", "low", "high"), [({"upper": 1.0}, 1.0 - 2 * np.pi, 1.0), ({}, -np.pi, np.pi)])
@@ -45,24 +44,22 @@ def test_a_joint_without_limits_turns_once(limits, low, high):
     assert high - 1 < q.max() <= high
 
 
-@pytest.mark.parametrize(("observe", "parameters"), [("position", 27), ("pose", 30)])
-def test_chosen_poses_beat_every_random_set(observe, parameters):
-    result = design(ARM, DesignOptions(count=30, observe=observe, candidates=600, seed=3))
-    assert (result.seen, result.parameters) == (parameters, parameters)
+def test_chosen_poses_beat_every_random_set():
+    result = design(ARM, DesignOptions(count=30, observe="pose", candidates=600, seed=3))
+    assert (result.seen, result.parameters) == (30, 30)
     assert len(result.random) == 20
     assert result.chosen.o1 > 1.02 * max(each.o1 for each in result.random)
     assert result.sigma_mm < 0.97 * result.random_sigma_mm
     assert result.exchanges > 0
 
 
-@pytest.mark.parametrize("observe", ["position", "pose"])
-def test_identification_states_the_indices_that_the_design_promised(observe):
+def test_identification_states_the_indices_that_the_design_promised():
     """With σ₀ out of the σ that the residuals tell; the arm as made differs from its drawing by a thousandth."""
-    options = DesignOptions(count=40, observe=observe, candidates=300, sigma_mm=0.05, sigma_rad=2e-4)
+    options = DesignOptions(count=40, observe="pose", candidates=300, sigma_mm=0.05, sigma_rad=2e-4)
     planned = design(ARM, options)
     true, rng = made(ARM, np.random.default_rng(2)), np.random.default_rng(3)
     data = measured(true, planned.q, rng, 0.05, 2e-4)
-    found = identify(ARM, data, IdentifyOptions(observe, 0.05, 2e-4, folds=0))
+    found = identify(ARM, data, IdentifyOptions("pose", 0.05, 2e-4, folds=0))
     for name, value in planned.chosen.values().items():
         scale = 1.0 if name == "O2" else found.sigma0
         assert found.observability.values()[name] * scale == pytest.approx(value, rel=0.02)

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.identify import identify
-from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_model import Joint, Robot, mh80
 from stcal.robot.robot_report import evaluated_csv, evaluation_report, names_of
@@ -132,7 +130,7 @@ def test_wrong_rows_are_named_and_not_fitted_to():
     assert float(plain[4]) > 3 > 0.2 > float(robust[6])
 
 
-@pytest.mark.parametrize("sets", sampled([8, 40]))
+@pytest.mark.parametrize("sets", sampled([4, 40]))
 def test_clean_rows_are_hardly_ever_wrong(sets):
     robots = [arm(seed) for seed in range(sets)]
     assert sum(evaluate({"a": robot}, seen(robot, seed)).wrong.sum() for seed, robot in enumerate(robots)) == 0
@@ -153,7 +151,7 @@ def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("refit", REFITS)
+@pytest.mark.parametrize("refit", ["none", "base-tool"])
 def test_distances_have_their_own_errors(refit):
     true = arm()
     data = of_distances(seen(true, 8, 50))
@@ -198,18 +196,6 @@ def test_identify_and_verify_read_what_was_written(tmp_path):
     read = read_measurements(tmp_path / "d.csv", true)
     assert read.lengths()[0] == pytest.approx(distances.lengths()[0], abs=1e-6)
     assert (read.lengths()[1] == 0).all()
-
-
-@pytest.mark.slow
-def test_rokae_on_the_half_that_was_not_identified_from(rokae):
-    robot, data = rokae
-    half = np.random.default_rng(1).permutation(30)
-    identified = identify(robot, data[np.sort(half[:15])], IdentifyOptions(folds=0)).robot
-    result = evaluate({"nominal": robot, "identified": identified}, data[np.sort(half[15:])])
-    assert result.best == "identified"
-    nominal, own = (each.position_mm.mean for each in result.robots)
-    assert 1.4 < nominal < 2.2
-    assert 0.05 < own < 0.15
 
 
 def test_stations_leave_base_and_tool_as_they_are_and_errors_in_its_axes():

@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Targets
-from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, on_targets, robots_apart
-from tests.outcome import fails_with
+from tests.levels import sampled
+from tests.outcome import refuses
+from tests.support.arms import scara
 
 TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])
 
@@ -25,10 +27,8 @@ def arm(seed: int, size: float = 1.0) -> Robot:
     return replace(nominal, rows=tuple(rows), tools={"": TOOL})
 
 
-def scara(_: int) -> Robot:
-    rows = DHRow(300, 0, 200, 0), DHRow(250, np.pi, 0, 0), DHRow(0, 0, 0, 0), DHRow(0, 0, 0, 0)
-    turning = Joint("revolute", -2.5, 2.5)
-    return Robot("scara", "standard", rows, (turning, turning, Joint("prismatic", 0, 200), turning), tools={"": TOOL})
+def sliding(_: int) -> Robot:
+    return replace(scara(), tools={"": TOOL})
 
 
 def targets(poses: Poses, q=None) -> Targets:
@@ -44,12 +44,13 @@ def times(poses: Poses, factor: float) -> Poses:
     return Poses(poses.rotation, factor * poses.translation)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [arm, scara])
-@pytest.mark.parametrize(("count", "share"), [(1, 0.02), (1, 0.6), (2, 0.02), (30, 0.6)])
+@pytest.mark.parametrize(
+    ("make", "count", "share"),
+    sampled([(make, *each) for make in (arm, sliding) for each in ((1, 0.02), (1, 0.6), (2, 0.02), (30, 0.6))], (0, 7)),
+)
 def test_good_targets_and_arms_as_made_pass(make, count, share):
     """Far apart and all near one another; with their own joint values, with others that choose a branch, with none."""
-    for seed in range(6):
+    for seed in range(3):
         nominal, rng = make(seed), np.random.default_rng([seed, count])
         q, poses = commanded(nominal, count, seed, share)
         assert on_targets(nominal, targets(poses, q)) == (True, ())
@@ -80,8 +81,9 @@ def test_joint_values_that_lead_elsewhere_are_said():
     assert "joint values of 3 of 6 rows, first line 5, lead elsewhere than their poses, by" in notes[0]
 
 
-@pytest.mark.parametrize(("factor", "words"), [(1e-3, "metres, call the columns x_m"), (1 / 25.4, "inches")])
-@pytest.mark.parametrize("count", [1, 12])
+@pytest.mark.parametrize(
+    ("factor", "words", "count"), [(1e-3, "metres, call the columns x_m", 1), (1 / 25.4, "inches", 12)]
+)
 def test_targets_in_the_arms_foot_are_said(factor, words, count):
     for seed in range(4):
         nominal = arm(seed, 0.3 + 0.4 * seed)
@@ -96,8 +98,7 @@ def test_a_nominal_robot_of_another_arm_is_refused():
     real = made(nominal, np.random.default_rng(4))
     q, poses = commanded(nominal, 3, 4)
     for given in (targets(poses, q), targets(poses), Targets("t", [2, 3, 4], ("",) * 3, None, q)):
-        with fails_with("E-ROBOT-MISMATCH"):
-            compensate(real, given, arm(5))
+        refuses("E-ROBOT-MISMATCH", compensate, real, given, arm(5))
 
 
 def test_files_unusually_far_apart_are_said():

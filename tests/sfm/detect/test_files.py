@@ -75,18 +75,6 @@ def test_a_detection_of_another_image_is_not_used(detected, sample):
     np.testing.assert_array_equal(found.images[1].detection.centres.centre_px, own)
 
 
-def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
-    detect, folder, _ = detected
-    shutil.copy(folder / IMAGE, folder / "12" / "copy.jpg")
-    (folder / "12" / "no.jpg").write_bytes(b"not an image")
-    found, _ = detect()
-    assert [image.file.name for image in found.images] == [IMAGE]
-    reasons = {each.name: each.reason for each in found.skipped}
-    assert set(reasons) == {"12/copy.jpg", "12/no.jpg"}
-    assert reasons["12/copy.jpg"] == f"the same image as {IMAGE}"
-    assert {each.name: each.gate for each in found.skipped}["12/copy.jpg"] == "copy"  # by which no group is missed
-
-
 @pytest.mark.parametrize("in_its_place", ["nothing", "a folder", "a file for its folder"])
 def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch, in_its_place):
     """It was there when the folder was looked at: a result without it would be another one."""

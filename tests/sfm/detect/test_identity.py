@@ -73,16 +73,14 @@ def found_in(ellipses, target=TARGET):
 
 
 @pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
-@pytest.mark.parametrize(
-    ("tilt", "azimuth", "roll"), [(0, 0, 0), pytest.param(45, 80, 100, marks=pytest.mark.slow), (68, 200, 250)]
-)
+@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (68, 200, 250)])
 def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
     (found,), _ = found_in(face_ellipses(face_id, pose(tilt, azimuth, roll)))
     assert found.face == face_id
     assert found.rows.tolist() == found.circles.tolist() == list(range(10))
 
 
-@pytest.mark.parametrize("hidden", ["1", "a", "35", "67", "b4", "126", "457b"])
+@pytest.mark.parametrize("hidden", ["1", "a", "126", "457b"])
 def test_up_to_four_hidden_circles_leave_the_name(hidden):
     """Six circles are left at least: four make a homography, two confirm it, and nothing else reads like them."""
     (found,), _ = found_in(face_ellipses("4", pose(50, 120, 30), hidden))
@@ -126,9 +124,7 @@ def test_faces_differ_in_brightness(ratio):
     assert {r.face for r in found_in(joined(dim, other))[0]} == {"5", "2"}
 
 
-@pytest.mark.parametrize(
-    "radius", [5.66, *(pytest.param(radius, marks=pytest.mark.slow) for radius in (4.0, 5.0, 8.0))]
-)
+@pytest.mark.parametrize("radius", [4.0, 5.66, 8.0])
 def test_a_printed_grid_of_equal_discs_is_no_face(radius):
     """Between the large and the small circles' radius, equal discs are of neither size by less than 1.45."""
     grid = np.array([[x, y] for x in range(0, 120, 20) for y in range(0, 120, 20)], float)
@@ -138,10 +134,9 @@ def test_a_printed_grid_of_equal_discs_is_no_face(radius):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_random_discs_are_no_faces_and_hide_none(seed):
-    assert found_in(junk(150, seed))[0] == []
-    (found,), _ = found_in(joined(junk(150, seed), face_ellipses("2", pose(60, 40, 200))))
+def test_random_discs_are_no_faces_and_hide_none():
+    assert found_in(junk(150))[0] == []
+    (found,), _ = found_in(joined(junk(150), face_ellipses("2", pose(60, 40, 200))))
     assert found.face == "2"
     assert (found.rows >= 150).all()
 
@@ -200,7 +195,7 @@ def cells_of(reading, keep, board, numbering=0):
     return {keep[c]: tuple(rc) for c, rc in zip(reading.rows, reading.numberings[numbering], strict=True)}
 
 
-@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (45, 80, 100), (65, 200, 30)])
+@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (65, 200, 30)])
 def test_a_plain_board_is_numbered_up_to_half_a_turn(tilt, azimuth, roll):
     keep, ellipses = board_ellipses(BOARD, pose(tilt, azimuth, roll, facing=False))
     (reading,) = find(ellipses, BOARD)
@@ -215,7 +210,7 @@ def test_a_plain_board_is_numbered_up_to_half_a_turn(tilt, azimuth, roll):
     assert len(reading.numberings) == 4
 
 
-@pytest.mark.parametrize("corner", [(0, 0), (0, 9), (9, 0), (9, 9)])
+@pytest.mark.parametrize("corner", [(0, 0), (0, 9)])
 def test_a_larger_corner_dot_settles_the_numbering(corner):
     board = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner, 7.5)
     keep, ellipses = board_ellipses(board, pose(40, 60, 70, facing=False))
@@ -251,11 +246,10 @@ def test_a_strip_cut_off_by_the_image_is_known():
     assert len(numberings) == 2
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_discs_around_the_board_are_not_taken_into_it(seed):
+def test_discs_around_the_board_are_not_taken_into_it():
     keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False))
-    assert find(junk(300, seed), BOARD) == []
-    readings = find(joined(ellipses, junk(120, seed)), BOARD)
+    assert find(junk(300), BOARD) == []
+    readings = find(joined(ellipses, junk(120)), BOARD)
     assert len(readings) == 1
     assert set(readings[0].rows) == set(range(len(keep)))
 

@@ -24,11 +24,10 @@ def read(bench, pixels):
     )
 
 
-@pytest.mark.parametrize("face", ["1", "2"])
-def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench, face):
+def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench):
     """No other image helps: circles of 35 grey values beside the other face's and the board's of 180."""
     photo = bench.groups("12").photographs[0]
-    (dark,) = [plane for plane in photo.faces if plane.name == face]
+    (dark,) = [plane for plane in photo.faces if plane.name == "1"]
     reading = read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
     assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
     assert [len(board.rows) for board in reading.boards] == [63]
@@ -58,7 +57,7 @@ def test_all_circles_are_labelled_whatever_light_a_plane_has(bench, kind, value,
 
 @pytest.mark.parametrize(
     ("group", "count", "share"),
-    sampled([(group, *how) for group in ("12", "14", "15", "23") for how in ((3, 1.0), (4, 0.8))], kept=(0, 2, 3, 4)),
+    sampled([(group, *how) for group in ("12", "14", "15", "23") for how in ((3, 1.0), (4, 0.8))], kept=(0, 3)),
 )
 def test_some_of_ten_circles_of_every_face_hidden_in_every_image(bench, group, count, share):
     """Others in each image, at random: of those in view all are found, and none of the hidden ones. Six circles are the
@@ -98,7 +97,7 @@ def test_images_that_show_other_halves_of_the_board_number_it_together(bench):
 
 
 @pytest.mark.parametrize("value", sampled([0.2, 0.3, 0.4], kept=(1,)))
-@pytest.mark.parametrize("group", sampled(["12", "14", "15", "23"], kept=(0, 3)))
+@pytest.mark.parametrize("group", sampled(["12", "14", "15", "23"], kept=(3,)))
 def test_circles_cut_by_a_part_of_their_area_take_no_other_with_them(bench, value, group):
     """Four of ten of every face, and a tenth of the board: every other one is found, and none is labelled whose ellipse
     is off. That of what is left of a circle is 0.25 radii off at a fifth of its area, 0.42 at two fifths."""

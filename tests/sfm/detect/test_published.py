@@ -29,7 +29,7 @@ def detect(image, target=TARGET):
     return detect_published(image, CAMERA, target, None, EllipseOptions())
 
 
-@pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
+@pytest.mark.parametrize("face_id", ["1", "5"])
 def test_faces_seen_from_the_front_are_named_as_published(face_id):
     ellipses = face_ellipses(face_id, pose(5, 40, 30.0 * int(face_id)))
     found = detect(drawn(ellipses))

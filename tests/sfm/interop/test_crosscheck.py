@@ -18,7 +18,7 @@ from stcal.cli.main import main_sfm
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop.crosscheck import find_colmap, mapper_options
 from stcal.sfm.mapping.incremental import pipeline_options
-from stcal.sfm.runs.saved import load_run, verify
+from stcal.sfm.runs.saved import verify
 from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 from tests.shared import own_copy
 
@@ -85,13 +85,8 @@ def test_the_differences_are_small_but_there(checked):
     COLMAP leaves a model it lacks our weights and the joint adjustment."""
     run, _, _ = checked
     check = json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
-    worst = {
-        key: max(row["translation_um"] for row in check[key]["faces"].values())
-        for key in ("mapping", "result", "plain")
-    }
-    assert 1e-4 < worst["mapping"] < 2
-    assert worst["result"] < 0.05
-    assert 2 < worst["plain"] < 50
+    for key, low, high in (("mapping", 1e-4, 2), ("result", 0, 0.05), ("plain", 2, 50)):
+        assert low <= max(row["translation_um"] for row in check[key]["faces"].values()) < high
     assert 1e-4 < max(check["mapping"]["circles_um"].values()) < 2
     assert 1e-3 < max(row["position_um"] for row in check["mapping"]["cameras"]) < 20
     assert 0.001 < check["residual_rms_px"]["native"] < 0.02
@@ -121,7 +116,6 @@ def test_outside_the_tolerances_it_says_where(colmap, checked, stcal_sfm, tmp_pa
     assert any(re.match(r"circle \d:\w \(mapped by both\) \d\.\d µm; 0 µm allowed", each) for each in differences)
     assert re.search(r"camera 1[24]/IMG_100\d.jpg: position \d\.\d µm; 0 µm allowed", line)
     assert "exceeded" in outcome[1]
-    assert json.loads((run / "report.json").read_text(encoding="utf-8"))["crosscheck"]["differences"]
     assert "They differ: face " in (run / "report.html").read_text(encoding="utf-8")
 
 
@@ -197,11 +191,10 @@ def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
 
 def test_programs_that_are_not_there_or_not_colmap(refused, tmp_path):
     (tmp_path / "text").write_text("no program")
-    for place in (tmp_path / "none", tmp_path, tmp_path / "text"):
+    for place in (tmp_path / "none", tmp_path / "text"):
         refused(place, INPUT, f"native COLMAP: no program at {place} that can be executed", INSTALL)
     refused(shutil.which("true"), INPUT, "does not say a COLMAP version", INSTALL, "or give another --colmap")
     refused(shutil.which("false"), INPUT, "help` ended with code 1: no message", INSTALL)
-    refused(sys.executable, INPUT, " help` ended with code 2: ", INSTALL)
 
 
 FAILURES = {
@@ -241,12 +234,6 @@ def has_ended(pid: int) -> bool:
     return False
 
 
-def assert_all_ended(pids: Path, count: int) -> None:
-    found = [int(word) for word in pids.read_text().split()]
-    assert len(found) == count
-    assert all(map(has_ended, found))
-
-
 @pytest.mark.slow
 def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     pids = tmp_path / "pids"
@@ -255,7 +242,9 @@ def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     said = "E-COLMAP-TIMEOUT", "mapper` is still running after 1 s; raise --timeout"
     refused(path, COMPUTATION, *said, more=("--timeout", 1))
     assert 1 < time.monotonic() - start < 30
-    assert_all_ended(pids, 2)
+    mapper, child = map(int, pids.read_text().split())
+    assert has_ended(mapper)
+    assert has_ended(child)
 
 
 def test_what_the_mapper_is_given(own_run, refused, tmp_path):
@@ -287,61 +276,6 @@ def test_a_model_that_lacks_an_image(own_run, stcal_sfm, colmap, tmp_path):
     check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
     assert check["images"]["only_pycolmap"] == ["12/IMG_1002.jpg", "14/IMG_1002.jpg"]
     assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # resected by its labels
-
-
-SPOIL = """
-import json, os, shutil, sqlite3, subprocess, sys
-import numpy as np
-colmap, spoilt, *words = sys.argv[1:]
-database = words[words.index("--database_path") + 1]
-shutil.copy(database, database + ".spoilt")
-with sqlite3.connect(database + ".spoilt") as opened:
-    for image, keypoints in json.loads(spoilt).items():
-        (data, columns) = opened.execute("SELECT data, cols FROM keypoints WHERE image_id = ?", [image]).fetchone()
-        xy = np.frombuffer(data, np.float32).reshape(-1, columns).copy()
-        xy[keypoints, 0] += 0.3
-        opened.execute("UPDATE keypoints SET data = ? WHERE image_id = ?", [xy.tobytes(), image])
-opened.close()
-words[words.index("--database_path") + 1] = database + ".spoilt"
-subprocess.run([colmap, *words], check=True)
-import pycolmap
-place = words[words.index("--output_path") + 1] + "/0"
-model = pycolmap.Reconstruction(place)
-for image_id, image in model.images.items():
-    for k in json.loads(spoilt).get(str(image_id), []):
-        image.points2D[k].xy = image.points2D[k].xy - [np.float32(0.3), 0]
-model.write_binary(place)
-"""
-
-
-def spoiling(tmp_path, colmap: str, run) -> Path:
-    """The true program on a copy of the database where the circles of face 2 are 0.3 px to the right; the model has
-    the run's keypoints."""
-    observations = load_run(run).observations
-    spoilt = {
-        i: [k for k, label in enumerate(image.labels) if label.startswith("2:")]
-        for i, image in enumerate(observations, start=1)
-    }
-    (tmp_path / "spoil.py").write_text(SPOIL)
-    words = f"'{sys.executable}' '{tmp_path / 'spoil.py'}' {colmap} '{json.dumps(spoilt)}'"
-    return program(tmp_path, f'exec {words} "$@"', asked=answers_of(colmap))
-
-
-@pytest.mark.usefixtures("no_page")
-@pytest.mark.slow
-def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
-    """Face 2 is where the others are not. At 1 m and f = 1393 px, 0.3 px are 0.2 mm across; the images see it from
-    sides that differ."""
-    path = spoiling(tmp_path, colmap, own_run)
-    outcome = stcal_sfm("crosscheck", own_run, "--colmap", path)
-    line = assert_error(outcome, COMPUTATION, "face 2 (mapped by both)", " σ; 3 σ allowed", "circle 2:")
-    assert 70 < float(re.search(r"face 2 \(mapped by both\) ([\d.]+) µm", line)[1]) < 600
-    check = json.loads((own_run / "report.json").read_text(encoding="utf-8"))["crosscheck"]
-    assert "face 4 (" not in line  # in group 14, which does not show face 2
-    # A pattern pushed 0.3 px alike in all images leaves a sixth of that as residuals.
-    assert 0.02 < check["residual_rms_px"]["native"] < 0.1
-    assert check["residual_rms_px"]["pycolmap"] < 0.01
-    assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # from our own centres again
 
 
 def test_a_report_that_cannot_be_added_to(own_run, refused_page_and_all, tmp_path):

@@ -184,7 +184,6 @@ def content_of_gltf(path) -> tuple[dict, bytes]:
         ("box", "", "target", "E-OUTPUT-SUFFIX … missing"),
         ("box.csv", "stl", "target", "E-OPTION-FORM … --form … stl … urdf"),
         ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
-        ("box.csv", "", "", "E-FRAME-NAME … --name … ''"),
         ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
         ("mine.csv", "", "target", "E-OUTPUT-EXISTS"),
     ],

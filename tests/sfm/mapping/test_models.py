@@ -3,10 +3,8 @@
 import json
 import random
 import shutil
-import sqlite3
 import subprocess
 import sys
-from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -90,30 +88,6 @@ def mapped(saved, tmp_path_factory):
     return folder
 
 
-def float32_step(xy: np.ndarray) -> np.ndarray:
-    """Half the distance of neighbouring float32 numbers at COLMAP's coordinates: the largest rounding error."""
-    return np.spacing(np.abs(xy + 0.5).astype(np.float32)).astype(float) / 2
-
-
-def test_a_pixel_comes_back_from_database_and_model_to_float32_rounding(saved, mapped):
-    """OpenCV's pixel + 0.5 in the database and in the model; both are read here without our functions."""
-    model = pycolmap.Reconstruction(str(mapped / "model"))
-    with closing(sqlite3.connect(mapped / "copy.db")) as opened:
-        select = "SELECT name, data, cols FROM keypoints JOIN images USING (image_id)"
-        stored = {name: np.frombuffer(data, "<f4").reshape(-1, cols) for name, data, cols in opened.execute(select)}
-        (params,) = opened.execute("SELECT params FROM cameras").fetchone()
-    of = {image.name: image for image in model.images.values()}
-    worst = 0.0
-    for image, xy in zip(saved.observations, saved.corrected_px, strict=True):
-        assert (np.abs(stored[image.name][:, :2].astype(float) - 0.5 - xy) <= float32_step(xy)).all()
-        if image.group == "12":
-            back = np.array([each.xy for each in of[image.name].points2D]) - 0.5
-            assert (np.abs(back - xy) <= float32_step(xy)).all()
-            worst = max(worst, np.abs(back - xy).max())
-    assert 1e-5 < worst < 1e-4  # there was a rounding, of half a step of 2⁻¹³ px at x > 1024
-    assert np.array_equal(np.frombuffer(params, "<f8")[2:4] - 0.5, saved.camera.centre)
-
-
 def test_the_model_read_back_has_our_float64_centres_by_label(saved, mapped):
     found = read(mapped / "model", saved)
     (group,) = found.groups
@@ -186,15 +160,6 @@ def test_points_that_were_edited_are_counted(saved, model, plain, edited):
     assert found.notes == (f"model {path}: {note}", NOT_THERE)
     if not gone:
         assert_same_faces(found, plain)
-
-
-def test_a_deregistered_image(saved, model, plain):
-    """One that does not show face 5, which only two images do."""
-    gone = next(i for i in model.images.values() if not any(x.startswith("5:") for x in model.labels[i.name]))
-    model.deregister_frame(gone.frame_id)
-    found = calibrate_models(model.as_binary(), saved)
-    assert_same_faces(found, plain)
-    assert found.models[0].images == tuple(n for n in plain.models[0].images if n != gone.name)
 
 
 def test_a_deleted_board(saved, model):
@@ -350,8 +315,8 @@ def test_a_name_with_a_space_in_a_text(saved, model):
 @pytest.mark.parametrize(
     ("name", "places", "words"),
     [
-        *(("points3D", [1], [wrong]) for wrong in ("nan", "1e300", "inf")),
-        *(("frames", [6], [wrong]) for wrong in ("nan", "1e300", "inf")),
+        ("points3D", [1], ["1e300"]),
+        ("frames", [6], ["nan"]),
         ("frames", range(2, 6), "0000"),
     ],
 )

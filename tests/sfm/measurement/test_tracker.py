@@ -17,7 +17,7 @@ from tests.support.film import filmed
 from tests.support.image_poses import pose_error
 
 pytestmark = pytest.mark.slow
-IMAGES = 6
+IMAGES = 4
 OTHER_BAND = 1.0
 """σ by which a pose may move when the bands of the same rims, mostly the same pixels, lie about another start: two fits
 of independent pixels would differ by √2."""
@@ -25,14 +25,14 @@ of independent pixels would differ by √2."""
 
 @pytest.fixture(scope="module")
 def film():
-    """Six images that follow each other, and two of another part of the film."""
+    """Four images that follow each other, and one of another part of the film."""
     scene = make_scene(SceneOptions(seed=5, width=1296, height=864, images_per_group=6))
     return filmed(scene, "12", 30, seed=1)
 
 
 @pytest.fixture(scope="module")
 def frames(film):
-    return {i: render(film, "12", i, RenderOptions(noise=0.01)) for i in (*range(IMAGES), 25, 26)}
+    return {i: render(film, "12", i, RenderOptions(noise=0.01)) for i in (*range(IMAGES), 25)}
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
 def test_what_jumps_is_searched_and_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     truth = film.groups["12"].camera_from_target
-    for i, searched in ((0, True), (1, False), (25, True), (26, False), (3, True)):
+    for i, searched in ((0, True), (1, False), (25, True), (3, True)):
         pose = tracker.locate(frames[i])
         assert tracker.searched == searched
         assert np.linalg.norm(pose.camera_from_target.translation - truth[i].translation) < 1
@@ -84,15 +84,10 @@ def test_what_jumps_is_searched_and_found(film, frames, target, model):
 def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     seen = tracker.locate(frames[0])
-    hidden = frames[1].copy()
-    pose = tracker.locate(frames[1])
-    face = seen.faces[0]
-    tracker.forget()
-    tracker.locate(frames[0])
-    own = [label for label in pose.labels if label.face == face]
-    where = pose.camera_from_target @ target.xyz[[target.place[label] for label in own]]
-    low, high = (f(tracker.camera.pixel_from_normalised(where[:, :2] / where[:, 2:]), axis=0) for f in (np.min, np.max))
-    (left, top), (right, bottom) = (low - 30).astype(int), (high + 30).astype(int)
+    hidden, face = frames[1].copy(), seen.faces[0]
+    xyz = [film.circles_target[label] for label in seen.labels if label.face == face]
+    at = film.camera.project(film.groups["12"].camera_from_target[1] @ np.array(xyz))
+    (left, top), (right, bottom) = (at.min(0) - 30).astype(int), (at.max(0) + 30).astype(int)
     hidden[max(top, 0) : bottom, max(left, 0) : right] = hidden[:20, :20].mean()
     left_over = tracker.locate(hidden)
     assert face not in left_over.faces

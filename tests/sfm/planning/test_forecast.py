@@ -35,8 +35,7 @@ from stcal.sfm.planning.forecast import (
     true_models,
     variance_shares,
 )
-from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
-from stcal.sfm.planning.session import plan as make_plan
+from stcal.sfm.planning.session import PlanOptions, plan, widest_aperture_mm
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import second_design, tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
@@ -107,26 +106,11 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
     assert low < square < high, square / errors.size
 
 
-@pytest.mark.full
-@pytest.mark.parametrize(("common", "draws"), [(0.0, 60), (0.99, 25)])
-def test_forecast_is_the_spread_of_simulations(exact, common, draws):
-    setup, models = setup_of(exact, common=common), models_of(exact)
-    expected = forecast(models, setup)
-    errors, _ = errors_of(models, setup, expected, draws, 1)
-    assert set(errors) == {"2", "4"}
-    for face, rows in errors.items():
-        require_chi2(rows, expected.face_covariance[face])
-        require_chi2(rows[:, 3:], expected.face_covariance[face][3:, 3:])
-
-
-def doubled(model: MetricModel) -> MetricModel:
-    return model.plus(replace(model, images=tuple(f"{name} again" for name in model.images)))
-
-
 def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact):
     models = models_of(exact)
+    doubled = [m.plus(replace(m, images=tuple(f"{name} again" for name in m.images))) for m in models]
     setups = [setup_of(exact, board_sigma_mm) for board_sigma_mm in (1e-4, 1.0)]
-    once, twice = ([forecast(m, own) for own in setups] for m in (models, [doubled(model) for model in models]))
+    once, twice = ([forecast(m, own) for own in setups] for m in (models, doubled))
     assert twice[0].worst()[1] / once[0].worst()[1] == pytest.approx(0.708, abs=1e-3)
     assert 0.85 <= twice[1].scale_sigma / once[1].scale_sigma <= 1
 
@@ -152,7 +136,7 @@ def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
     assert PRACTICE * bound == pytest.approx(CentreNoise.expected().edge / np.sqrt(np.pi * radius), rel=0.01)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 45.0, 76.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 76.0])
 def test_what_a_rim_tells_is_the_integral_around_it(tilt_deg):
     """Against a polygon of 4096 sides, which errs by (π/4096)²/6, a part in ten million."""
     camera = Camera(4000, 3000, [3000.0, 3000.0], [2000.0, 1500.0], np.zeros(8))
@@ -202,9 +186,7 @@ def after(known: KnownRun, views: list[PlannedView], now: Forecast) -> Forecast:
     return forecast(list(models.values()), known.setup, now.derivatives)
 
 
-@pytest.mark.parametrize(
-    ("flatness_mm", "common", "refined"), [(None, 0.0, False), (0.01, 0.6, False), (None, 0.6, True), (0.01, 0.0, True)]
-)
+@pytest.mark.parametrize(("flatness_mm", "common", "refined"), [(0.01, 0.6, False), (None, 0.0, True)])
 def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, common, refined):
     prior = CameraPrior("OPENCV", np.diag([2.0] * 4 + [1e-3] * 4) ** 2) if refined else None
     setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
@@ -348,12 +330,6 @@ def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(small_run):
     assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
 
 
-def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):
-    """Of faces 1, 2 and 3, the last two groups away from the first."""
-    options = PlanOptions(width=2592, images=images, groups=groups, noise=noise)
-    return make_plan(options, reference_target(), reference_board(), reference_target().rough_poses())
-
-
 @pytest.mark.slow
 def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):
     """By differences of the squared blur between two points of a circle's plane, a hundredth of a px apart in the
@@ -377,7 +353,10 @@ def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigm
 
 
 def test_plan_remedies_are_plans_of_their_own():
-    two, four = plan(), plan(images=4)
+    """Of faces 1, 2 and 3, the last two groups away from the first."""
+    options = PlanOptions(width=2592, images=2, groups=(("1", "2"), ("2", "3")), noise=NOISE)
+    designs = reference_target(), reference_board(), reference_target().rough_poses()
+    two, four = (plan(replace(options, images=images), *designs) for images in (2, 4))
     assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
 
@@ -431,16 +410,11 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
         monkeypatch.setattr(equations, "is_dots_first_cheaper", lambda _, first=first: first)
         found.append(unmoved(models, board, exact.camera, 0.02, prior, common).result(1.0))
     dots, cameras = found
-    np.testing.assert_allclose(
-        dots.covariance_mm2, cameras.covariance_mm2, rtol=0, atol=1e-8 * cameras.covariance_mm2.max()
-    )
+    largest = cameras.covariance_mm2.max()
+    np.testing.assert_allclose(dots.covariance_mm2, cameras.covariance_mm2, rtol=0, atol=1e-8 * largest)
     unit = np.sqrt(np.diag(cameras.camera_covariance)) if refined else np.ones(len(cameras.camera_covariance))
-    np.testing.assert_allclose(
-        dots.camera_covariance / np.outer(unit, unit),
-        cameras.camera_covariance / np.outer(unit, unit),
-        rtol=0,
-        atol=1e-6,
-    )
+    scaled = [each.camera_covariance / np.outer(unit, unit) for each in found]
+    np.testing.assert_allclose(*scaled, rtol=0, atol=1e-6)
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
 
 
@@ -448,7 +422,7 @@ def test_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
     """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
     board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
     board = replace(board, corner_radius_mm=None)
-    options, target = PlanOptions(images=4), reference_target()
+    options, target = PlanOptions(images=2), reference_target()
     found = []
     for most in (session.MOST_DOTS, 1000):
         monkeypatch.setattr(session, "MOST_DOTS", most)

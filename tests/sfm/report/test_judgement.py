@@ -15,16 +15,8 @@ from tests.sfm.report.test_report import make
 
 
 def check(key: str, verdict: str, names: tuple[str, ...] = (), remedy: str = "") -> dict:
-    return {
-        "key": key,
-        "title": f"Check {key}",
-        "verdict": verdict,
-        "reason": f"because of {key}",
-        "measured": [],
-        "tested": 3,
-        "names": list(names),
-        "remedy": remedy,
-    }
+    own = {"key": key, "title": f"Check {key}", "verdict": verdict, "reason": f"because of {key}"}
+    return own | {"measured": [], "tested": 3, "names": list(names), "remedy": remedy}
 
 
 def report(*checks: dict, source: str = "board", share: float = 0.36, **sigma_um: list[float]) -> dict:
@@ -82,10 +74,7 @@ WHOLE_SET = check(CAUSE, "failed", remedy="look") | {"title": OF_WHOLE_SET + "Ch
 @pytest.mark.parametrize(
     ("others", "count"),
     [
-        (
-            (check("a", "suspicious", remedy="wait"), check("b", "failed", remedy="look"), check("c", "passed")),
-            "1 of 3",
-        ),
+        ((check("a", "suspicious"), check("b", "failed", remedy="look"), check("c", "passed")), "1 of 3"),
         # One that names an image comes first, one that does not tell what is wrong last, the cause of all before all.
         ((check("a", "failed", ("face 2",)), check("b", "failed", ("a/1.jpg",), "look")), "2 of 2"),
         ((check("agreement", "failed", ("all",)), check("b", "failed", (), "look")), "2 of 2"),
@@ -151,19 +140,21 @@ def test_each_source_has_its_own_remedy(source, edge_share, words, not_said):
     assert not_said not in found.next
 
 
-def test_results_for_comparison_are_not_for_use():
-    own = report()
-    for solve, remedy in (("paper", "--solve paper"), ("chain", "--no-eccentricity")):
-        own["options"] |= {"solve": solve, "eccentricity": False}
-        found = judgement_of(own)
-        assert (found.verdict, remedy in found.next) == ("no", True)
-
-
-def test_without_sigma():
-    own = make(sigma=False)
+@pytest.mark.parametrize(
+    ("own", "verdict", "part", "words"),
+    [
+        (report() | {"options": {"solve": "paper", "eccentricity": False}}, "no", "next", "--solve paper"),
+        (report() | {"options": {"solve": "chain", "eccentricity": False}}, "no", "next", "--no-eccentricity"),
+        (make(sigma=False), "with care", "next", "--solve joint"),
+        (report() | {"crosscheck": {"differences": ["face 2 is off"]}}, "with care", "limit", "COLMAP differs: face 2"),
+        # The dots of the board tell it where groups are lost.
+        (report(check(CAUSE, "failed"), check("camera", "passed")), "no", "use", "Check cause"),
+    ],
+)
+def test_results_that_are_for_comparison_or_not_without_care(own, verdict, part, words):
     found = judgement_of(own)
-    assert (found.verdict, found.position_sigma_um, found.position_face) == ("with care", None, None)
-    assert "--solve joint" in found.next
+    assert found.verdict == verdict
+    assert words in getattr(found, part)
 
 
 def test_the_board_alone_and_one_face():
@@ -188,12 +179,6 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
     assert judgement_of(own).use == "With care: focus changed, though no check failed."
 
 
-def test_a_difference_from_the_native_program_calls_for_care():
-    found = judgement_of(report() | {"crosscheck": {"differences": ["face 2 is 9 µm off"]}})
-    assert found.verdict == "with care"
-    assert found.limit == "The native COLMAP differs: face 2 is 9 µm off."
-
-
 def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
@@ -215,11 +200,8 @@ def test_checks_that_nobody_can_make_possible_are_not_missed():
 def test_photographs_that_do_not_test_one_another_are_no_yes():
     """Two of five checks passed, but none that residuals decide."""
     keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
-    own = report(
-        check("pitch", "passed"),
-        check("radius", "passed"),
-        *(check(k, v, remedy="add images") for k, v in keys.items()),
-    )
+    missed = [check(key, verdict, remedy="add images") for key, verdict in keys.items()]
+    own = report(check("pitch", "passed"), check("radius", "passed"), *missed)
     told = judgement_of(own)
     assert told.verdict == "with care"
     assert told.use == "With care: the photographs are too few to test one another, 3 checks were not possible."
@@ -282,10 +264,3 @@ def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
     assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
     own["options"]["refine_camera"] = True
     assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")
-
-
-def test_a_cause_that_no_check_saw_is_no():
-    """The dots of the board tell it where groups are lost."""
-    found = judgement_of(report(check(CAUSE, "failed"), check("camera", "passed")))
-    assert found.verdict == "no"
-    assert "checks" not in found.use

@@ -170,11 +170,6 @@ def chained() -> str:
     return report_html(make(sigma=False, eccentricity=False), OVERLAYS)
 
 
-@pytest.fixture(params=["joint", "chained"])
-def page(request) -> str:
-    return request.getfixturevalue(request.param)
-
-
 def rows_of(page: str, section: str) -> list[list[str]]:
     part = page.split(f'<section id="{section}">')[1].split("</section>")[0]
     lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
@@ -183,7 +178,9 @@ def rows_of(page: str, section: str) -> list[list[str]]:
     ]
 
 
-def test_the_page_is_whole_and_stands_alone(page):
+@pytest.mark.parametrize("kind", ["joint", "chained"])
+def test_the_page_is_whole_and_stands_alone(kind, request):
+    page = request.getfixturevalue(kind)
     parsed = Page(page)
     assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
     assert len(parsed.ids) == len(set(parsed.ids))

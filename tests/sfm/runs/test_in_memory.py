@@ -1,6 +1,7 @@
 """A run on arrays gives what the same pixels in files give, and leaves no file."""
 
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def scratch(tmp_path, monkeypatch):
 @SLOW
 @pytest.mark.usefixtures("no_page")
 def test_arrays_give_what_files_give(tmp_path, scratch):
-    scene = synthetic.make_scene(SMALL)
+    scene = synthetic.make_scene(replace(SMALL, groups=(("1", "2"),)))
     write_dataset(tmp_path / "data", scene, image_format="png")
     from_files = sfm.run(tmp_path / "data" / "images", scene.camera, tmp_path / "run")
     result = sfm.run(synthetic.render_all(scene), scene.camera)

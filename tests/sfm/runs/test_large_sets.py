@@ -55,20 +55,12 @@ def solve(scene, observations, kind, out):
     return list(solved.values()), calibration
 
 
-def parts_of_tracks(pairs, seen) -> list[list[int]]:
-    return [track_parts(pairs, np.flatnonzero(column)).tolist() for column in seen.T]
-
-
-def partition(parts: list[int]) -> set[frozenset[int]]:
-    """Sets of places that share a number, whatever the numbers are."""
-    return {frozenset(np.flatnonzero(np.array(parts) == p).tolist()) for p in set(parts)}
-
-
 def require_same_tracks(scene, images) -> None:
-    seen = incidence(images)
-    every, sparse = (image_graph(images, scene.board, kind) for kind in ("all", "sparse"))
-    for a, b in zip(parts_of_tracks(every.pairs, seen), parts_of_tracks(sparse.pairs, seen), strict=True):
-        assert partition(a) == partition(b)
+    """Images of a track share a number, whatever the numbers are."""
+    every, sparse = (image_graph(images, scene.board, kind).pairs for kind in ("all", "sparse"))
+    for column in incidence(images).T:
+        a, b = (track_parts(pairs, np.flatnonzero(column)) for pairs in (every, sparse))
+        np.testing.assert_array_equal(a[:, None] == a, b[:, None] == b)
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9))
@@ -134,10 +126,10 @@ def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
 def test_sparse_gives_the_same_faces_as_all_pairs(crowd, tmp_path):
     """Both end in the minimum of the same adjustment: the difference is what stopping leaves, 1e-8 px in 2592."""
     scene, observations = crowd
-    some = [image for image in observations if int(image.name[-4:]) < 30]  # of each group
+    some = [image for image in observations if int(image.name[-4:]) < 24]  # of each group
     mapped_all, every = solve(scene, some, "all", tmp_path / "all")
     mapped_sparse, sparse = solve(scene, some, "sparse", tmp_path / "sparse")
-    assert sum(len(s.model.images) for s in mapped_all) == sum(len(s.model.images) for s in mapped_sparse) == 60
+    assert sum(len(s.model.images) for s in mapped_all) == sum(len(s.model.images) for s in mapped_sparse) == 48
     for face_id, pose in every.target.target_from_face.items():
         other = sparse.target.target_from_face[face_id]
         assert np.abs(pose.matrix() - other.matrix()).max() < 1e-6

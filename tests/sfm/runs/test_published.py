@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from stcal.errors import InputError
 from stcal.sfm.pipeline import run
+from stcal.sfm.runs import comparisons
 from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS
 from stcal.sfm.runs.run_options import RunOptions
 from tests.outcome import fails_with
@@ -79,13 +81,9 @@ def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
         RunOptions(compare="x")
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_page")
-def test_another_design_is_compared_without_the_published_row(tmp_path, shared_data):
-    data = shared_data("stereo_target/white_block")
-    designs = data / "target.toml", data / "board.toml"
-    result = run(data / "images", data / "cameras.txt", tmp_path / "run", *designs, RunOptions(compare="paper"))
-    first, *others = result.comparison.rows
-    assert first.faces == {}
-    assert "not read by the rules of Zhang & Wei" in first.reason
-    assert all(row.reason is None for row in others)
+def test_where_there_is_no_published_answer_the_others_are_compared(small_result, monkeypatch):
+    monkeypatch.setattr(comparisons, "in_steps", lambda _: {})
+    error = InputError("E-TARGET-NOT-PUBLISHED", "target other: not read by the rules of Zhang & Wei")
+    first, last = comparisons.compare_with_paper(small_result, error).rows
+    assert (first.method, first.faces, first.reason) == (AS_PUBLISHED, {}, str(error))
+    assert (last.reason, last.residual_rms_px > 0) == (None, True)

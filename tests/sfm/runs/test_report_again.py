@@ -33,8 +33,8 @@ def test_the_same_files_make_the_same_page(own_run, small_run, stcal_sfm, monkey
     assert verify(own_run).notes() == []
 
 
-@pytest.mark.slow
-def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm):
+def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm, monkeypatch):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
     before = (own_run / RUN_MARKER).read_bytes()
     code, out, _ = stcal_sfm("report", own_run, "--pdf", "--out", tmp_path / "for the lab.html")
     assert (code, out) == (0, f"report: {tmp_path}/for the lab.html\nreport: {tmp_path}/for the lab.pdf\n")

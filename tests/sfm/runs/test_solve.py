@@ -14,13 +14,9 @@ from tests.outcome import fails_with, refuses
 
 
 @pytest.fixture(scope="module")
-def all_groups(scene, labels_only):
-    return labels_only.observations(scene, 0.01, np.random.default_rng(0))
-
-
-@pytest.fixture(scope="module")
-def group(all_groups):
-    return [image for image in all_groups if image.group == all_groups[0].group]
+def group(scene, labels_only):
+    images = labels_only.observations(scene, 0.01, np.random.default_rng(0))
+    return [image for image in images if image.group == images[0].group]
 
 
 def only(group, board: bool):
@@ -61,10 +57,10 @@ def test_a_folder_of_copies_or_of_notes_is_no_group(group):
 
 
 @pytest.mark.slow
-def test_an_error_of_photographs_that_cannot_be_solved_says_what_of_the_file_is_wrong(scene, all_groups):
+def test_an_error_of_photographs_that_cannot_be_solved_says_what_of_the_file_is_wrong(scene, group):
     file = Camera.of(scene.camera, "OPENCV")
     file = replace(file, focal=1.25 * file.focal)
-    with pytest.raises(MappingError) as error, explained(all_groups, file, scene.board):
+    with pytest.raises(MappingError) as error, explained(group, file, scene.board):
         raise MappingError("E-GROUP-CONTRADICTS", "group 12: a symptom")
     symptom, _, cause = str(error.value).partition(LIKELY)
     assert symptom == "group 12: a symptom"
@@ -73,11 +69,11 @@ def test_an_error_of_photographs_that_cannot_be_solved_says_what_of_the_file_is_
     assert "px RMS" in cause
 
 
-def test_an_error_names_no_cause_that_the_photographs_do_not_tell(scene, all_groups):
+def test_an_error_names_no_cause_that_the_photographs_do_not_tell(scene, group):
     """A camera file that fits the dots; the board out of view; and a mistake in the input."""
     file = Camera.of(scene.camera, "OPENCV")
-    assert wrong_file(all_groups, file, scene.board) is None
-    assert wrong_file(only(all_groups, board=False), replace(file, focal=2 * file.focal), scene.board) is None
-    with pytest.raises(InputError) as error, explained(all_groups, replace(file, focal=2 * file.focal), scene.board):
+    assert wrong_file(group, file, scene.board) is None
+    assert wrong_file(only(group, board=False), replace(file, focal=2 * file.focal), scene.board) is None
+    with pytest.raises(InputError) as error, explained(group, replace(file, focal=2 * file.focal), scene.board):
         raise InputError("E-OPTION-VALUE", "a symptom")
     assert str(error.value) == "a symptom"

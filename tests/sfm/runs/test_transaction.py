@@ -3,7 +3,6 @@ wrote it is named."""
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -217,15 +216,12 @@ def link(path):
 
 SPOILT = {
     "missing": (lambda run: (run / "overlays/12/a.jpg").unlink(), "missing", "overlays/12/a.jpg"),
-    "a folder gone": (lambda run: shutil.rmtree(run / "colmap/models"), "missing", "colmap/models/12/images.bin"),
     "one letter": (lambda run: (run / "faces.json").write_text("faces.jsoN"), "changed", "faces.json"),
     "a link": (lambda run: link(run / "faces.json"), "changed", "faces.json"),
     "a pipe": (lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")), "changed", "report.json"),
     "the marker": (lambda run: edit_marker(run, lambda c: c.update(images="/elsewhere")), "changed", RUN_MARKER),
     "its hashes": (lambda run: edit_marker(run, lambda c: c["sha256"].popitem()), "changed", RUN_MARKER),
     "a file among the results": (lambda run: (run / "colmap/models/new.bin").touch(), "added", "colmap/models/new.bin"),
-    "a link among the results": (lambda run: (run / "colmap/models/new").symlink_to("/"), "added", "colmap/models/new"),
-    "a comparison by hand": (lambda run: (run / "compare.json").touch(), "added", "compare.json"),
     "a database's journal": (lambda run: (run / "colmap/database.db-wal").touch(), "added", "colmap/database.db-wal"),
 }
 

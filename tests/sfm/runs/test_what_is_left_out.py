@@ -27,10 +27,8 @@ pytestmark = pytest.mark.usefixtures("no_page")
 
 def calibrate(folder, out, **options):
     """Chained: what is left out, and what is kept, is seen before faces are adjusted together."""
-    data = [folder / name for name in ("images", "cameras.txt")]
-    return run(
-        *data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, solve="chain", **options)
-    )
+    options = RunOptions(workers=1, solve="chain", **options)
+    return run(folder / "images", folder / "cameras.txt", out, options=options)
 
 
 def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
