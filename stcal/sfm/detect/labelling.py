@@ -368,8 +368,9 @@ def detect_circles(
     camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)
     board = None if board is None else board_of(board)
     found = detect_image(grey, camera, target, board, options or EllipseOptions())
-    ((images, _),) = label_groups([[("image", "", found)]], target.with_faces(printed=False), board, _focal_px(camera))
-    sharp = without_defocus([_with_corners(images[0], found, target)], camera, patterns_of(target, board))[0]
+    circles, focal_px = target.with_faces(printed=False), _focal_px(camera)
+    (([labelled], _),), _ = label_groups([[("image", "", found)]], circles, board, focal_px)
+    sharp = without_defocus([_with_corners(labelled, found, target)], camera, patterns_of(target, board))[0]
     seen = sharp.observations
     return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
 
