@@ -81,14 +81,10 @@ def opencv_board(path: Path, size: tuple[int, int], areas: tuple[float, float]) 
 
 
 def render(folder: Path, images: int, width: int, film: bool = False) -> None:
-    """Render a data set unless it is there; ``film``: a camera that moves by up to 7.5 mm and 0.75° between images."""
+    """Render a data set; ``film``: a camera that moves by up to 7.5 mm and 0.75° between images."""
     scene = make_scene(SceneOptions(width=width, height=width * 2 // 3, images_per_group=images // GROUPS))
-    if not (folder / "truth.json").exists():
-        print(f"rendering {images} images {width}×{width * 2 // 3} …", file=sys.stderr)
-        write_dataset(folder, filmed(scene, "12", images) if film else scene)
-    held = len(list((folder / "images").glob("*/*"))), read_camera(folder / "cameras.txt").width
-    if held != (images, width):
-        sys.exit("error: {} holds {} images {} px wide; give another folder".format(folder, *held))
+    print(f"rendering {images} images {width}×{width * 2 // 3} …", file=sys.stderr)
+    write_dataset(folder, filmed(scene, "12", images) if film else scene)
 
 
 def call(words: list) -> float:
@@ -244,7 +240,7 @@ def large(images: int) -> str:
 
 def main() -> None:
     """Command line."""
-    given = options_of(__doc__, images=40, width=5184, keep=Path, rounds=5, large=10_000, json=Path)
+    given = options_of(__doc__, images=40, width=5184, rounds=5, large=10_000)
     if given.images % GROUPS or given.images < 4 * GROUPS:
         sys.exit(f"error: --images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a user's modules are compiled from the second start on
@@ -252,8 +248,7 @@ def main() -> None:
     remarks: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as temporary:
         os.environ.setdefault("PYTHONPYCACHEPREFIX", str(Path(temporary) / "compiled"))
-        keep = given.keep or Path(temporary)
-        data, stream, film = keep / "photographs", keep / "stream", keep / "film"
+        data, stream, film = (Path(temporary) / name for name in ("photographs", "stream", "film"))
         render(data, given.images, given.width)
         render(stream, *STREAM)
         render(film, *STREAM, film=True)
@@ -283,8 +278,6 @@ def main() -> None:
     print(f"peak memory of the run: largest process {peak:.0f} MiB")
     if given.large:
         print(large(given.large))
-    if given.json:
-        given.json.write_text(json.dumps(seconds, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

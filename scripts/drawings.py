@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from scripts.runner import ROOT, face_errors, script
-from stcal.design import reference_board, reference_target
+from scripts.studies.noise_study import designs
+from stcal.design import reference_target
 from stcal.geometry.plane import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.report.svg import COLOURS, FAINT, INK, LETTER, Axes, Drawing, arrows, limits, save
@@ -87,9 +88,7 @@ def residuals() -> Drawing:
     """Residuals and errors of the faces with and without the correction, for circles of several sizes."""
     sizes, rows = (0.5, 0.75, 1.0, 1.5), []
     for size in sizes:
-        target, board = reference_target(), reference_board()
-        target = replace(target, faces=tuple(replace(face, radius_mm=size * face.radius_mm) for face in target.faces))
-        board = replace(board, radius_mm=size * board.radius_mm)
+        target, board = designs(size)
         scene = make_scene(SceneOptions(seed=1), target, board, reference_target().rough_poses())
         seen = observe(scene, NOISE_PX, np.random.default_rng(1))
         plain = [m.in_world(Similarity(1.0, Rigid())) for m in true_models(scene, seen)]

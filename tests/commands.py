@@ -113,7 +113,7 @@ CALLS = (
     Call("sfm detect", f"{_SET} --out ~detected", 1.5),
     Call("sfm detect", f"{_SET} --out ~detected --solve paper", 2.0),
     Call("sfm init", "+design"),
-    Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --width 1296", 6.0),
+    Call("sfm design", "+own --size 130,120,110 --faces front,right --circles 9 --images 2 --width 1296", 3.0),
     Call("sfm design", "+body --tags cube --size 50 --distance-mm 300 --width 900 --images 10", 1.0),
     Call("sfm draw", "@data/target.toml --out >target.pdf", 2.0),
     Call("sfm draw", "@own.toml --out >net.svg --net"),

@@ -221,8 +221,9 @@ def called(monkeypatch, capsys):
 
 
 @pytest.fixture
-def typed(copied, called):
-    """Runs each command of a case in a copy of its folder."""
+def typed(copied, called, monkeypatch):
+    """Runs each command of a case in a copy of its folder; without a run's page, which other tests look at."""
+    monkeypatch.setattr("stcal.sfm.runs.folder.report_html", lambda *_: "")
 
     def run(case: str, more: str = "") -> list[Outcome]:
         text = (copied(case) / "cmd").read_text()
@@ -282,10 +283,10 @@ def test_a_case_as_typed(typed, shared_case, case):
 
 
 def test_an_elastic_file_predicts_what_was_identified(copied, called):
-    """Of every fifth row of the case that takes a minute as it was typed."""
+    """Of every eighth row of the case that takes a minute as it was typed."""
     folder = copied("elastic_file_differs")
     head, *rows = (folder / "data.csv").read_text().splitlines(keepends=True)
-    (folder / "data.csv").write_text("".join([head, *rows[::5]]))
+    (folder / "data.csv").write_text("".join([head, *rows[::8]]))
     identified, evaluated = (called(words)[1] for words in commands(folder.name, (folder / "cmd").read_text()))
     figures = re.search(r"identified, the same rows +([\d.]+) +([\d.]+)", identified)
     assert figures

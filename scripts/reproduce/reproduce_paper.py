@@ -1,6 +1,6 @@
 """The experiments of Zhang & Wei (2017) in simulation: five trials on the board (Table 1) and five faces (Table 2).
 
-.venv/bin/python scripts/reproduce/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER]
+.venv/bin/python scripts/reproduce/reproduce_paper.py [--trials 5] [--width 5184]
 
 Every trial renders a scene of its own (target, board, camera, noise): four groups of ten photographs. It is solved as
 published (``--solve paper``: detection by the paper's rules, contours' centres alike in weight, no eccentricity, scale
@@ -8,7 +8,7 @@ from the first and last row, faces from three points, single transforms), then w
 and weights added in turn, and by this package with its defaults. Prints the mean length of the board residuals per
 trial and their standard deviation (both columns of Table 1, in every group by itself, against the design; the mean
 against the dots as they really are too), the errors of the faces against the truth, and, for this package, their RMS
-over the trials beside the predicted σ and the goals. With --keep, photographs and detections are used again.
+over the trials beside the predicted σ and the goals.
 """
 
 import tempfile
@@ -23,7 +23,7 @@ from stcal.geometry.rigid import align_rigid
 from stcal.labels import dot_cells
 from stcal.sfm import run
 from stcal.sfm.data.group_model import WorldModel
-from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, Answer, in_steps
+from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS, MethodResult, in_steps
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
@@ -67,7 +67,7 @@ def board_errors(model: WorldModel, mm_per_unit: float, scene: Scene) -> tuple[f
     return float(answers[0].mean()), float(answers[1].mean()), float(answers[0].std())
 
 
-def errors(answer: Answer, scene: Scene, predicted_um: dict[str, float] | None = None) -> Errors:
+def errors(answer: MethodResult, scene: Scene, predicted_um: dict[str, float] | None = None) -> Errors:
     """Errors against the scene."""
     boards = [board_errors(m, answer.scales[m.group].mm_per_unit, scene) for m in answer.models]
     faces = {}
@@ -78,20 +78,17 @@ def errors(answer: Answer, scene: Scene, predicted_um: dict[str, float] | None =
 
 
 def trial(seed: int, width: int, folder: Path) -> dict[str, Errors]:
-    """Render (unless the folder has it) and solve by all methods."""
+    """Render and solve by all methods."""
     scene = make_scene(SceneOptions(seed=seed, width=width, height=round(width / 1.5)))
     data = folder / "data"
-    if not data.is_dir():
-        with tempfile.TemporaryDirectory(dir=folder) as partial:
-            write_dataset(Path(partial) / "data", scene)
-            (Path(partial) / "data").rename(data)
+    write_dataset(data, scene)
     given = data / "images", data / "cameras.txt"
     designs = data / "target.toml", data / "board.toml"
     published = run(*given, folder / "paper", *designs, RunOptions(solve="paper"))
     ours = run(*given, folder / "run", *designs)
     sigma = {f: 1e3 * float(np.sqrt(np.trace(c[3:, 3:]))) for f, c in ours.target.face_covariance.items()}
     paper, own = (
-        Answer(each.target, tuple(solution.model for solution in each.solutions), each.calibration.scales)
+        MethodResult(each.target, tuple(solution.model for solution in each.solutions), each.calibration.scales)
         for each in (published, ours)
     )
     found = {PAPER: paper, **in_steps(ours), OURS: own}
@@ -128,14 +125,12 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
         row(face, f"{um:.2f} ({goal_um:g})", f"{sigma:.2f}", f"{mdeg:.2f} ({goal_mdeg or '–'})")
 
 
-@script(trials=5, width=5184, keep=Path, limited=True)
+@script(trials=5, width=5184, limited=True)
 def main(arguments) -> None:
     trials = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for seed in range(1, arguments.trials + 1):
-            folder = (arguments.keep or Path(scratch)) / f"{arguments.width}-{seed}"
-            folder.mkdir(parents=True, exist_ok=True)
-            trials.append(trial(seed, arguments.width, folder))
-            print(f"trial {seed} of {arguments.trials} done", flush=True)
+    for seed in range(1, arguments.trials + 1):
+        with tempfile.TemporaryDirectory() as scratch:
+            trials.append(trial(seed, arguments.width, Path(scratch)))
+        print(f"trial {seed} of {arguments.trials} done", flush=True)
     print(f"\nSimulated photographs, {arguments.width} px wide, 10 a group, board σ 5 µm")
     print_tables(trials)

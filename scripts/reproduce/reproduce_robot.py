@@ -218,11 +218,6 @@ class Photographs:
     error: np.ndarray
     rows: np.ndarray
 
-    def of(self, rows: np.ndarray) -> "Photographs":
-        """Those of rows of q by a mask."""
-        keep = rows[self.rows]
-        return Photographs(self.data[keep], self.error[keep], self.rows[keep])
-
 
 def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Generator) -> Photographs:
     """The target's pose in a photograph at each joint vector."""
@@ -245,12 +240,6 @@ def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Ge
     return Photographs(Measurements("photographs", range(2, m + 2), q[rows], ("",) * m, *seen), error, np.array(rows))
 
 
-def by_axes(data: Measurements, target: TargetCircles) -> Robot:
-    """The axis method on the middles of the faces, which every pose carries along."""
-    middles = np.array([plane.translation for plane in target.target_from_plane.values()])
-    return robot_from_sweeps(data, rig().nominal, places=middles).robot
-
-
 def squared_error(found: Identified, arm: Arm, q: np.ndarray) -> float:
     """eᵀC⁻¹e over its degrees of freedom, of all parameters that such poses tell of the arm."""
     poses, m = arm.poses(q), len(q)
@@ -266,7 +255,9 @@ def one_draw(seed: int, index: int, gears_rad: float) -> Draw:
     arm, target = made_arm(gears_rad, rng), rig().known.measured(rng)
     q = np.concatenate([sweeps(), random_poses(POSES, rng)])
     every = photograph(arm, target, q, rng)
-    axes = by_axes(every.of(np.arange(len(q)) < len(sweeps())).data, target)
+    # the middles of the faces, which every pose carries along, turn about the axes
+    middles = np.array([plane.translation for plane in target.target_from_plane.values()])
+    axes = robot_from_sweeps(every.data[every.rows < len(sweeps())], rig().nominal, places=middles).robot
     found = [identify(axes, data, IdentifyOptions(folds=0)) for data in (every.data, replace(every.data, common=None))]
     robots = {AXES: axes, CMMK: found[0].robot}
     squared = [squared_error(each, arm, q) for each in found]
@@ -303,11 +294,6 @@ def verified(targets: Targets, reached: dict[str, tuple[np.ndarray, np.ndarray]]
     return {each.name: each for each in verify(data).sets}
 
 
-def figures(draws: list[Draw], kind: str, model: str) -> np.ndarray:
-    """(draws, 3) mean, std, max, mm."""
-    return np.array([(s.mean_mm, s.std_mm, s.max_mm) for s in (draw.sets[kind][model] for draw in draws)])
-
-
 def print_table(draws: list[Draw]) -> None:
     """Markdown; beside the published figures ours, means over the draws."""
     reduced = "mean reduced by", "worst arm", "max by"
@@ -316,9 +302,11 @@ def print_table(draws: list[Draw]) -> None:
     mean, most = (f"{100 * (1 - PUBLISHED[key][1] / PUBLISHED[key][0]):.0f} %" for key in ("mean", "max"))
     print(f"| published, by laser tracker | {CMMK} | {' | '.join(cells)} | {mean} | | {most} |")
     for kind in draws[0].sets:
-        before = figures(draws, kind, NOMINAL)
-        for model in (AXES, CMMK):
-            after = figures(draws, kind, model)
+        before, *found = (
+            np.array([(s.mean_mm, s.std_mm, s.max_mm) for s in (draw.sets[kind][model] for draw in draws)])
+            for model in (NOMINAL, AXES, CMMK)
+        )
+        for model, after in zip((AXES, CMMK), found, strict=True):
             cells = [f"{b:.4f} → {a:.4f}" for b, a in zip(before.mean(0), after.mean(0), strict=True)]
             gain = 100 * (1 - after / before)
             reduced = f"{gain[:, 0].mean():.1f} ± {gain[:, 0].std(ddof=1):.1f} %", f"{gain[:, 0].min():.1f} %"

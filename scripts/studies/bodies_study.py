@@ -7,15 +7,13 @@ Each draw has its own faces (0.3 mm and 0.5° about the nominal ones), poses and
 face's pose against the reference face over its covariance, of 6, mean over faces and draws; 1 where σ are true.
 """
 
-import multiprocessing
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import head, row, script
+from scripts.runner import executor_of, head, row, script
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
@@ -74,23 +72,18 @@ def draw(name: str, seed: int) -> list[FaceErrors] | str:
 def main(arguments) -> None:
     head("body", "draws", "faces found", "error of a position, µm RMS", "of a rotation, mdeg RMS", "NEES")
     names = [name for name in BODIES if arguments.body in f"{name}, {BODIES[name][0].name}"]
-    seeds = range(arguments.draws)
-    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
-    answers = pool.map(draw, *zip(*[(name, seed) for name in names for seed in seeds], strict=True))
-    for name in names:
-        faces, lost = [], 0
-        for seed in seeds:
-            answer = next(answers)
-            if isinstance(answer, str):
-                print(f"draw {seed}: {answer}", flush=True)
-                lost += 1
-            else:
-                faces += answer
-        judged = [face for face in faces if face.normalised_error is not None]
-        position, rotation, sigmas = (
-            float(np.sqrt(np.mean([getattr(face, key) ** 2 for face in judged])))
-            for key in ("translation_um", "rotation_mdeg", "normalised_error")
-        )
-        counts = f"{arguments.draws - lost} of {arguments.draws}", len(faces), len(BODIES[name][0].faces)
-        found = f"{counts[1]} of {counts[2] * arguments.draws}"
-        row(name, counts[0], found, f"{position:.0f}", f"{rotation:.0f}", f"{sigmas**2:.2f}")
+    with executor_of() as pool:
+        for name in names:
+            answers = list(pool.map(draw, [name] * arguments.draws, range(arguments.draws)))
+            good = [answer for answer in answers if not isinstance(answer, str)]
+            for seed, answer in enumerate(answers):
+                if isinstance(answer, str):
+                    print(f"draw {seed}: {answer}", flush=True)
+            judged = [face for faces in good for face in faces if face.normalised_error is not None]
+            position, rotation, sigmas = (
+                float(np.sqrt(np.mean([getattr(face, key) ** 2 for face in judged])))
+                for key in ("translation_um", "rotation_mdeg", "normalised_error")
+            )
+            found = f"{sum(map(len, good))} of {len(BODIES[name][0].faces) * arguments.draws}"
+            counts = f"{len(good)} of {arguments.draws}", found
+            row(name, *counts, f"{position:.0f}", f"{rotation:.0f}", f"{sigmas**2:.2f}")

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -72,20 +73,28 @@ def simulated(board: BoardDesign, sigma_mm: float, bow_mm: float, rng) -> list[I
     made[:, 2] += bow_mm * (((flat - middle) / np.ptp(flat, axis=0) * 2) ** 2).sum(axis=1) / 2
     size, views = np.array(SIZE), []
     while len(views) < VIEWS:
-        angles = [rng.uniform(-180, 180), *rng.uniform(-35, 35, 2)]
-        rotation = Rotation.from_euler("zxy", angles, degrees=True).as_matrix()
-        depth = rng.uniform(300, 700)
-        place = np.append(rng.uniform(-0.42, 0.42, 2) * size / TRUE.focal * depth, depth)
+        rotation, place = held(rng, 700, 0.42)
         xyz = (made - [*middle, 0]) @ rotation.T + place
         xy = TRUE.project(circle_image_offset(xyz, np.tile(rotation[:, 2], (len(xyz), 1)), board.radii_mm()))
         if not ((xy > 10) & (xy < size - 10)).all():
             continue
-        n = len(xy)
-        noise = NOISE_PX * rng.standard_normal((n, 2))
-        shape, covariance = np.tile(np.eye(2), (n, 1, 1)), np.tile(NOISE_PX**2 * np.eye(2), (n, 1, 1))
-        name = f"{len(views):03}.png"
-        views.append(ImageObservations(name, ".", board.labels(), xy + noise, np.zeros((n, 2)), shape, covariance))
+        views.append(view_of(len(views), board.labels(), xy + NOISE_PX * rng.standard_normal(xy.shape)))
     return views
+
+
+def held(rng: np.random.Generator, farthest_mm: float, aside: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and middle of a board that is held by hand from 0.3 m on, up to a share of the image ``aside``."""
+    angles = [rng.uniform(-180, 180), *rng.uniform(-35, 35, 2)]
+    depth = rng.uniform(300, farthest_mm)
+    middle = np.append(rng.uniform(-aside, aside, 2) * [TRUE.width, TRUE.height] / TRUE.focal * depth, depth)
+    return Rotation.from_euler("zxy", angles, degrees=True).as_matrix(), middle
+
+
+def view_of(number: int, labels, xy: np.ndarray) -> ImageObservations:
+    """Measured places (n, 2) px in one photograph."""
+    n = len(xy)
+    shape, covariance = np.tile(np.eye(2), (n, 1, 1)), np.tile(NOISE_PX**2 * np.eye(2), (n, 1, 1))
+    return ImageObservations(f"{number:03}.png", ".", tuple(labels), xy, np.zeros((n, 2)), shape, covariance)
 
 
 def points(views, board: BoardDesign) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -154,12 +163,7 @@ def by_colmap(views, board: BoardDesign, size) -> Camera:
     return camera_from_colmap(MODEL, own.width, own.height, own.params, "COLMAP").calibrated(0, 0)
 
 
-def by_free_mrcal(views, board: BoardDesign, size) -> Camera | None:
-    """Without regularization."""
-    return by_mrcal(views, board, size, "--skip-regularization")
-
-
-def by_mrcal(views, board: BoardDesign, size, *more: str) -> Camera | None:
+def by_mrcal(views, board: BoardDesign, size, more: tuple[str, ...] = ()) -> Camera | None:
     """mrcal's program, with ``more`` options; the board may be bowed."""
     if not shutil.which("mrcal-calibrate-cameras"):
         return None
@@ -231,7 +235,7 @@ def row(name: str, trials: list[dict[str, tuple[float, float]]]) -> None:
 @script(trials=60)
 def main(options) -> None:
     head("px RMS over the image (where dots are)", "trials", *COLUMNS)
-    peers = WAYS | {FREE: by_free_mrcal}
+    peers = WAYS | {FREE: partial(by_mrcal, more=("--skip-regularization",))}
     for name, (board, sigma_mm, bow_mm) in boards().items():
         trials = []
         for seed in range(options.trials):

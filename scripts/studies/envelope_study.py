@@ -1,10 +1,9 @@
 """Where the program's envelope ends: rendered sets degraded as photographs are, at five strengths of each kind.
 
-.venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1 3 5] [--json FILE]
+.venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1 3 5]
 
 Where circles, faces and board lie in the photographs is taken from ``truth.json`` alone. Each degraded set is run, one
-after another. With `--json` every row is kept as it comes, and rows that the file has already are not run again: a
-study that was stopped goes on, and a finished one is printed.
+after another.
 
 recall: circles found of those that must be found; what the degradation hides, cuts or mirrors must not. wrong: labels
 farther than 1.5 px, or a quarter of the circle's radius, from the place of that circle's ellipse, or of circles that
@@ -17,7 +16,6 @@ check failed.
 
 import csv
 import itertools
-import json
 import re
 import tempfile
 import zlib
@@ -149,12 +147,12 @@ def glare(photo: Photograph, value: float, case: Case) -> Picture:
     return Picture(image, waived=whole | part)
 
 
-def chosen(photo: Photograph, case: Case, count: float, at_most: float = 1.0) -> list[str]:
+def chosen(photo: Photograph, case: Case, count: float) -> list[str]:
     """Random circles of every face in view; ``count`` of each, or a share."""
     rng, found = case.rng(photo.name), []
     for face in photo.faces:
         n = int(count) if count >= 1 else int(np.ceil(count * len(face.labels)))
-        found += list(rng.permutation(list(face.labels))[: min(n, int(at_most * len(face.labels)))])
+        found += list(rng.permutation(list(face.labels))[:n])
     return found
 
 
@@ -286,60 +284,23 @@ def visible_share(photo: Photograph, planes: Iterable[Plane], free: np.ndarray) 
     return count
 
 
-def best_motion(photo: Photograph, case: Case, planes_of: Callable, candidates: Callable, key: str = "") -> Motion:
-    """Of a group's candidates that of which its photographs show most; the same for all photographs of the group."""
-    if (name := f"{photo.group}{key}") not in case.shared:
-        group = [p for p in case.data.photographs if p.group == photo.group]
-        frees = [1 - p.foreground() for p in group]
-        scores = []
-        for motion in (found := candidates(group)):
-            shown = [facing(p, planes_of(p), motion) for p in group]
-            scores.append(
-                sum(visible_share(p, planes, free) for p, planes, free in zip(group, shown, frees, strict=True))
-            )
-        case.shared[name] = found[int(np.argmax(scores))]
-    return case.shared[name]
+def motions_behind(case: Case, group: list[Photograph], middle: np.ndarray, turn: float) -> list[Motion]:
+    """Random motions to behind the target, as the group's cameras see it; ``middle`` of what moves, target frame;
+    ``turn`` : about any axis, rad at most."""
+    rng = case.rng(group[0].group)
+    axes = np.mean([p.camera_from_target.rotation for p in group], axis=0)
+    target, found = middle_of_target(case), []
+    for _ in range(60):
+        r = Rigid.exp([*(turn * rng.uniform(-1, 1, 3) / np.sqrt(3)), 0, 0, 0]).rotation
+        to = target + rng.uniform(-350, 350) * axes[0] + rng.uniform(-250, 250) * axes[1]
+        to = to + rng.uniform(200, 450) * axes[2]
+        found.append((r, to - r @ middle))
+    return found
 
 
-def behind_motions(case: Case, own: Callable[[Photograph], np.ndarray], turn: float, *words) -> Callable:
-    """Random motions to behind the target, as the group's cameras see it; ``own`` : middle of what moves, target
-    frame; ``turn`` : about any axis, rad at most."""
-
-    def candidates(group: list[Photograph]) -> list[Motion]:
-        rng = case.rng(group[0].group, *words)
-        axes = np.mean([p.camera_from_target.rotation for p in group], axis=0)
-        middle, found = own(group[0]), []
-        target = case_middle(case)
-        for _ in range(60):
-            r = Rigid.exp([*(turn * rng.uniform(-1, 1, 3) / np.sqrt(3)), 0, 0, 0]).rotation
-            to = target + rng.uniform(-350, 350) * axes[0] + rng.uniform(-250, 250) * axes[1]
-            to = to + rng.uniform(200, 450) * axes[2]
-            found.append((r, to - r @ middle))
-        return found
-
-    return candidates
-
-
-def case_middle(case: Case) -> np.ndarray:
+def middle_of_target(case: Case) -> np.ndarray:
     """Middle of the target's circles, target frame."""
     return np.mean(list(case.data.truth["circles"].values()), axis=0)
-
-
-def mirrors(case: Case) -> Callable:
-    """Mirrors that stand 15 mm off the target's circles, on all sides."""
-    circles = np.array(list(case.data.truth["circles"].values()))
-
-    def candidates(group: list[Photograph]) -> list[Motion]:
-        sides = [np.array(s, float) for s in np.ndindex(3, 3, 3)]
-        found = []
-        for side in (s - 1 for s in sides if (s != 1).any()):
-            n = side / np.linalg.norm(side)
-            at = (circles @ n).min() - 15.0
-            if all((-p.camera_from_target.rotation.T @ p.camera_from_target.translation) @ n > at for p in group):
-                found.append((np.eye(3) - 2 * np.outer(n, n), 2 * at * n))
-        return found
-
-    return candidates
 
 
 def all_faces(photo: Photograph) -> tuple[Plane, ...]:
@@ -347,70 +308,32 @@ def all_faces(photo: Photograph) -> tuple[Plane, ...]:
 
 
 def drawn_behind(
-    photo: Photograph, value: float, case: Case, planes_of: Callable, candidates: Callable, like: Plane
+    photo: Photograph, value: float, case: Case, planes_of: Callable, middle_of: Callable, turn: float
 ) -> Picture:
-    """Planes that stand behind, ``value`` times as bright as ``like``."""
-    planes = facing(photo, planes_of(photo), best_motion(photo, case, planes_of, candidates))
-    circle, plate = photo.levels(like)
+    """The photograph with planes that stand behind, ``value`` times as bright as the first of them where it really is.
+    They move alike in all photographs of a group: of random motions, that of which the group shows most is taken."""
+    if photo.group not in case.shared:
+        group = [p for p in case.data.photographs if p.group == photo.group]
+        frees = [1 - p.foreground() for p in group]
+        scores, motions = [], motions_behind(case, group, middle_of(group[0]), turn)
+        for motion in motions:
+            shown = [(p, facing(p, planes_of(p), motion), free) for p, free in zip(group, frees, strict=True)]
+            scores.append(sum(visible_share(*each) for each in shown))
+        case.shared[photo.group] = motions[int(np.argmax(scores))]
+    planes = facing(photo, planes_of(photo), case.shared[photo.group])
+    circle, plate = photo.levels(planes_of(photo)[0])
     return Picture(degrade.behind(photo, planes, [(value * circle, value * plate)] * len(planes), 15.0))
 
 
-def reflection(photo: Photograph, value: float, case: Case) -> Picture:
-    shown = max(photo.faces, key=lambda face: sum(photo.must_find.get(label, False) for label in face.labels))
-    return drawn_behind(photo, value, case, all_faces, mirrors(case), shown)
-
-
 def second_target(photo: Photograph, value: float, case: Case) -> Picture:
-    motions = behind_motions(case, lambda p: case_middle(case), 1.0)
-    return drawn_behind(photo, value, case, all_faces, motions, photo.faces[0])
+    return drawn_behind(photo, value, case, all_faces, lambda _: middle_of_target(case), 1.0)
 
 
 def second_board(photo: Photograph, value: float, case: Case) -> Picture:
     def middle(p: Photograph) -> np.ndarray:
         return p.camera_from_target.inverse() @ p.board.xyz_camera(p.board.xy_mm.mean(0))
 
-    return drawn_behind(photo, value, case, lambda p: [p.board], behind_motions(case, middle, 0.6), photo.board)
-
-
-def discs(photo: Photograph, case: Case, k: int, hexagonal: bool) -> Plane:
-    """The ``k``-th plate of equal discs, at the target's place, facing the group's cameras."""
-    rng = case.rng(photo.group, k, "discs")
-    radii = sorted(set(case.data.target.radius_of().values()))
-    radius = float(rng.choice([4.0, 5.0, 6.0])) if hexagonal else float(radii[-1] if k == 0 else rng.choice(radii))
-    pitch = radius * float(rng.choice([2.6, 3.0, 3.4] if hexagonal else [2.6, 5.0, 3.5]))
-    if k == 0 and not hexagonal:
-        pitch = 5 * radius  # as the big circles of a face of the reference target
-    n = 11 if hexagonal else 6
-    column, row = np.meshgrid(np.arange(n, dtype=float), np.arange(n, dtype=float))
-    if hexagonal:
-        column, row = column + 0.5 * (row % 2), row * np.sqrt(0.75)
-    xy = pitch * np.column_stack([column.ravel(), row.ravel()])
-    group = [p for p in case.data.photographs if p.group == photo.group]
-    axes = np.mean([p.camera_from_target.rotation for p in group], axis=0)
-    u, _, v = np.linalg.svd(axes)
-    x, y, _ = u @ v
-    at = case_middle(case) - x * xy[:, 0].mean() - y * -xy[:, 1].mean()
-    r, t = photo.camera_from_target.rotation, photo.camera_from_target.translation
-    matrix = np.column_stack([r @ x, r @ -y, r @ at + t])
-    labels = tuple(f"disc:{i}" for i in range(len(xy)))
-    return Plane("discs", matrix, labels, xy, np.full(len(xy), radius))
-
-
-def plates(hexagonal: bool) -> Make:
-    """``value`` plates of equal discs behind; every other one with the contrast turned round."""
-
-    def make(photo: Photograph, value: float, case: Case) -> Picture:
-        drawn, levels = [], []
-        circle, plate = photo.levels(photo.faces[0])
-        for k in range(int(value)):
-            motions = behind_motions(case, lambda p: case_middle(case), 0.6, k)
-            motion = best_motion(photo, case, lambda p, k=k: [discs(p, case, k, hexagonal)], motions, f" {k}")
-            found = facing(photo, [discs(photo, case, k, hexagonal)], motion)
-            drawn += found
-            levels += [(circle, plate) if (k % 2 == 0) != hexagonal else (plate, circle)] * len(found)
-        return Picture(degrade.behind(photo, drawn, levels, 15.0))
-
-    return make
+    return drawn_behind(photo, value, case, lambda p: [p.board], middle, 0.6)
 
 
 KINDS = {
@@ -438,11 +361,8 @@ KINDS = {
         Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), of_photo(degrade.half_darker)),
         Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), simple(degrade.hot_pixels, on_sensor)),
         Kind("dust", "spots", (5, 15, 40, 80, 150), simple(degrade.dusty, on_sensor)),
-        Kind("printed grids", "grids behind", (1, 2, 3, 4, 5), plates(False)),
-        Kind("perforated", "plates behind", (1, 2, 3, 4, 5), plates(True)),
         Kind("second board", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_board),
         Kind("second target", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_target),
-        Kind("reflection", "× brightness", (0.2, 0.35, 0.5, 0.7, 0.9), reflection),
         Kind("mirrored", "", MIRRORED, mirror_images, may_end=(5,)),
         Kind("small circles", "px across", (12, 9, 7.5, 6, 5), small, camera=small_camera),
         Kind("rolling shutter", "px", (0.5, 1, 2, 4, 8), rolling),
@@ -597,24 +517,16 @@ def line_of(row: dict) -> str:
     return text + ("  SILENT" if silent(row) else "")
 
 
-@script(sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+@script(sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2)
 def main(given) -> None:
-    done = json.loads(given.json.read_text()) if given.json and given.json.exists() else []
-    known = {(r["set"], r["kind"], r["strength"]): r for r in done}
     print(f"{'':40}{'circ %':>6} {'dots %':>6} {'wrong':>5} face {'µm':>7} {'σ':>6} {'bad':>4}", flush=True)
     rows = []
     for folder, kind in itertools.product(given.sets, KINDS.values()):
         data = read_set(folder.resolve())
         for strength in given.strengths if re.search(given.only, kind.name) else []:
-            key = (data.folder.name, kind.name, strength)
-            if strength > len(kind.values):
-                continue
-            if key not in known:
-                known[key] = run_case(kind, strength, data, given.workers)
-                if given.json:
-                    given.json.write_text(json.dumps(list(known.values()), indent=1) + "\n")
-            rows.append(known[key])
-            print(line_of(rows[-1]), flush=True)
+            if strength <= len(kind.values):
+                rows.append(run_case(kind, strength, data, given.workers))
+                print(line_of(rows[-1]), flush=True)
     quiet, ended = [r for r in rows if silent(r)], [r for r in rows if "error" in r]
     inside = [r for r in ended if r["strength"] <= KINDS[r["kind"]].goal]
     print(f"{len(rows)} cases: {sum(r['wrong'] for r in rows)} wrong labels, {len(quiet)} silent")

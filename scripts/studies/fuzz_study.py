@@ -1,24 +1,21 @@
 """Whether every file that comes in is judged, and every file that goes out is whole.
 
-.venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--json FILE] [--only CASE]
+.venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--only CASE]
 
 All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Six parts:
 inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for it
 (`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), programs ended by signals, and with a
 full disk (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …), what runs keep
-swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that the file has
-already are not run again: a study that was stopped goes on. The seed and the case's name repeat a case:
-`--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
+swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). The seed and the case's name repeat a
+case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
 
-import json
 import os
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -28,8 +25,6 @@ from stcal.parallel import ONE_THREAD
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
 from scripts.runner import script
-from stcal.io.files import json_text
-from stcal.io.files import save as write
 from tests.commands import CALLS, COMMANDS
 from tests.fuzzing.cases import Judged, option_cases
 from tests.fuzzing.mistakes import MISTAKES
@@ -46,25 +41,10 @@ def names_of(arguments) -> list[str]:
     if arguments.only:
         return [arguments.only]
     valid = [f"v{i}" for i in range(len(CALLS))]
-    mistakes = [] if arguments.no_mistakes else list(MISTAKES)
     options = [f"o{i}" for i in range(len(option_cases()))]
     counts = {"k": arguments.kills, "s": arguments.kept, "d": arguments.closed, "c": arguments.count}
     drawn = [f"{letter}{i}" for letter, count in counts.items() for i in range(count)]
-    return drawn if arguments.drawn_only else [*valid, *mistakes, *options, *drawn]
-
-
-def kept(path: Path | None, seed: int) -> list[Judged]:
-    """Cases of an earlier call."""
-    if not path or not path.exists():
-        return []
-    earlier = json.loads(path.read_text(encoding="utf-8"))
-    if earlier["seed"] != seed:
-        sys.exit(f"{path}: cases of seed {earlier['seed']}, not {seed}; give another file")
-    return [Judged(**each | {"failures": tuple(map(tuple, each["failures"]))}) for each in earlier["cases"]]
-
-
-def save(path: Path, seed: int, found: list[Judged]) -> None:
-    write(path, json_text({"seed": seed, "cases": [asdict(each) for each in found]}))
+    return [*valid, *MISTAKES, *options, *drawn]
 
 
 def show(found: Judged, seed: int) -> None:
@@ -91,27 +71,20 @@ def summary(found: list[Judged], seed: int) -> str:
 
 
 COUNTS = {"count": 1000, "kills": 20, "kept": 60, "closed": 20}
-SWITCHES = {"drawn_only": False, "no_mistakes": False}
 
 
-@script(**COUNTS, **SWITCHES, seed=1, json=Path, only="", workers=os.cpu_count() or 1)
+@script(**COUNTS, seed=1, only="", workers=os.cpu_count() or 1)
 def main(arguments) -> None:
     missing = set(COMMANDS) - {call.command for call in CALLS}
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what it laid out is taken away
     start = time.monotonic()
-    found = kept(arguments.json, arguments.seed)
-    known = {each.name for each in found}
+    found: list[Judged] = []
     with tempfile.TemporaryDirectory(prefix="stcal-stock-") as folder:
         stock = make_stock(Path(folder) / "stock")
-        names = [name for name in names_of(arguments) if name not in known]
-        try:
-            for each in run_all(stock, arguments.seed, names, arguments.workers):
-                found.append(each)
-                show(each, arguments.seed)
-        finally:
-            if arguments.json:
-                save(arguments.json, arguments.seed, found)
+        for each in run_all(stock, arguments.seed, names_of(arguments), arguments.workers):
+            found.append(each)
+            show(each, arguments.seed)
     print(f"\n{summary(found, arguments.seed)}\n\n{time.monotonic() - start:.0f} s")
     sys.exit(any(kind not in ALLOWED for each in found for kind, _ in each.failures))

@@ -2,24 +2,24 @@
 """Are σ true? Random halves of real photographs, two cameras of one body, and simulated views, against stated σ.
 
 Printed is χ² per degree of freedom, 1 where σ are right. Cameras: the views of a set are drawn into two halves, each
-calibrates by itself, and the difference of the two answers is over the sum of their covariances. Bodies: two cameras
-have photographed one cube, each with its own run; the poses of its faces are compared. Use: both cameras measure the
-cube, as the first one calibrated it, and their poses say where the second stands from the first; a hand-eye calibration
-and a robot by halves of their poses, compared where the robot's tool is. Simulated: errors against the
+calibrates by itself, and the difference of the two answers is over the sum of their covariances. Use: two cameras
+measure a cube, as the first one calibrated it, and their poses say where the second stands from the first; a hand-eye
+calibration and a robot by halves of their poses, compared where the robot's tool is. Simulated: errors against the
 truth, `field` with errors of twice the noise that neighbouring places of a photograph have in common, `print` with
 boards stretched, sheared and curved as printers do, `bad` with one photograph whose errors are eight times the noise.
 
-.venv/bin/python scripts/studies/halves_study.py [--part all|cameras|bodies|use|simulated] [--draws N]
+.venv/bin/python scripts/studies/halves_study.py [--part all|cameras|use|simulated] [--draws N]
 """
 
 import tempfile
 from collections.abc import Iterator, Sequence
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
+from camera_peers import NOISE_PX, TRUE, held, view_of
 from real_bodies import pycamset_cube
 from same_results import CHARUCO, prepare, robot_table
-from scipy.spatial.transform import Rotation
 
 from scripts.runner import DATA, head, script
 from scripts.runner import row as print_row
@@ -28,10 +28,9 @@ from stcal.boards.board_file import load_flat_board
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
-from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.print_modes import PrintModes
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, skew
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.read import load_camera
 from stcal.robot.identification.adjustment import tip_jacobian
@@ -57,9 +56,7 @@ CAMERAS = {
 }
 GROUPS = {"f": slice(0, 2), "c": slice(2, 4), "lens": slice(4, None), "all": slice(None)}
 KINDS = ("none", "field", "print", "few", "few print", "bad")
-NOISE_PX = 0.02
 FIELD_PX = 250.0
-TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 
 
 def squares(off: np.ndarray, covariance: np.ndarray) -> list[float]:
@@ -108,21 +105,6 @@ def of_cameras(draws: int) -> None:
         row(f"{name} | {len(calibration.views)}", table, f"{result.differ:.2f}", stretch)
 
 
-def of_bodies(_: int) -> None:
-    """Print χ² of the poses that two cameras find of the faces of one cube."""
-    runs = []
-    for camera in ("cam0", "cam1"):
-        with tempfile.TemporaryDirectory() as scratch:
-            images = DATA / "real" / "pycamset_cube" / camera
-            runs.append(pipeline.run(images, None, Path(scratch) / "run", pycamset_cube()).target)
-    one, two = runs
-    apart = []
-    for face in one.target_from_face.keys() & two.target_from_face.keys() - {one.reference_face}:
-        first, second = (target.target_from_face[face] for target in runs)
-        apart.append(chi2(second, first, one.face_covariance[face] + two.face_covariance[face]))
-    print(f"\ncube of ChArUco faces, real, two cameras: {np.mean(apart):.2f} (faces {np.round(sorted(apart), 2)})")
-
-
 def of_measuring(run: Path, other: Path) -> None:
     """Print χ² of where one camera stands from the other, by the poses that both measure of one cube."""
     circles, poses, roots = read_target(run / "faces.json", pycamset_cube()), [], []
@@ -158,12 +140,6 @@ def of_measuring(run: Path, other: Path) -> None:
     print_row("measure: cube, two cameras, real", len(names), f"{off @ weight @ off / (len(off) - 6):.2f}")
 
 
-def chi2(one: Rigid, two: Rigid, covariance: np.ndarray) -> float:
-    """Of the difference of two poses, per degree of freedom."""
-    (off,) = Poses.of([one]).difference(Poses.of([two]))
-    return float(off @ np.linalg.solve(covariance, off) / 6)
-
-
 def square_root(covariance: np.ndarray) -> np.ndarray:
     """A matrix whose product with its transpose is the covariance."""
     value, vector = np.linalg.eigh(covariance)
@@ -180,7 +156,8 @@ def drawn_halves(count: int, draws: int) -> Iterator[tuple[np.ndarray, np.ndarra
 
 def of_use(draws: int) -> None:
     """Print χ² of what a target is used for."""
-    print("\n| use | poses | χ² |\n|---|---|---|")
+    print()
+    head("use", "poses", "χ²")
     with tempfile.TemporaryDirectory() as name:
         scratch, cube = Path(name), DATA / "real" / "pycamset_cube"
         for camera in ("cam0", "cam1"):
@@ -196,7 +173,8 @@ def of_use(draws: int) -> None:
         for parts in drawn_halves(len(given.pairs), draws):
             halves = (HandEyeProblem(given.pairs[own], "eye-to-hand", given.views[own]) for own in parts)
             one, two = (half.solved("reprojection").result for half in halves)
-            values.append(chi2(one.mount_from_camera, two.mount_from_camera, one.covariance + two.covariance))
+            (off,) = Poses.of([one.mount_from_camera]).difference(Poses.of([two.mount_from_camera]))
+            values.append(float(off @ np.linalg.solve(one.covariance + two.covariance, off) / 6))
         print_row("hand-eye: ChArUco by corners, real", len(given.pairs), f"{np.mean(values):.2f}")
         prepare(scratch)
         robot = load_robot(scratch / "rokae.toml")
@@ -226,11 +204,8 @@ def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
         places += (modes.modes @ (modes.spread_mm * rng.standard_normal(len(modes.spread_mm)))).reshape(63, 3)
     size = np.array([TRUE.width, TRUE.height])
     while len(views) < count:
-        angles = [rng.uniform(-180, 180), *rng.uniform(-35, 35, 2)]
-        depth = rng.uniform(300, 600)
-        middle = np.append(rng.uniform(-0.35, 0.35, 2) * size / TRUE.focal * depth, depth)
-        turned = (places - [120.0, 90.0, 0.0]) @ Rotation.from_euler("zxy", angles, degrees=True).as_matrix().T
-        xy = TRUE.project(turned + middle)
+        rotation, middle = held(rng, 600, 0.35)
+        xy = TRUE.project((places - [120.0, 90.0, 0.0]) @ rotation.T + middle)
         seen = ((xy > 20) & (xy < size - 20)).all(1)
         if seen.sum() < 30:
             continue
@@ -239,9 +214,7 @@ def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
         apart = ((xy[:, None] - xy) ** 2).sum(2)
         root = np.linalg.cholesky(np.exp(-apart / 2 / FIELD_PX**2) + 1e-9 * np.eye(n))
         xy = xy + common * root @ rng.standard_normal((n, 2)) + NOISE_PX * rng.standard_normal((n, 2))
-        labels = tuple(label for label, s in zip(board.labels(), seen, strict=True) if s)
-        shape, covariance = np.tile(np.eye(2), (n, 1, 1)), np.tile(NOISE_PX**2 * np.eye(2), (n, 1, 1))
-        views.append(ImageObservations(f"{len(views)}.jpg", ".", labels, xy, np.zeros((n, 2)), shape, covariance))
+        views.append(view_of(len(views), compress(board.labels(), seen.tolist()), xy))
     return views
 
 
@@ -264,7 +237,6 @@ def of_simulated(draws: int) -> None:
 def main(arguments) -> None:
     for part, needed, print_part in (
         ("cameras", ".", of_cameras),
-        ("bodies", "real/pycamset_cube", of_bodies),
         ("use", "rokae_tracker", of_use),
         ("simulated", ".", of_simulated),
     ):

@@ -56,19 +56,14 @@ def camera_trial(method: str, setup: str, name: str, off: float, seed: int) -> t
     return float(apart @ np.linalg.solve(found.covariance, apart)), float(apart[3:] @ apart[3:])
 
 
-def print_cameras(pool, trials: int, only: str) -> None:
-    """The table of camera files that are off."""
-    print(f"\n{POSES_OFF} poses, σ estimated:\n")
-    head("method", "setup", "noise", "camera off", "calibration", "RMS error, mm")
-    for case in product([name for name in CAMERAS if name.startswith(only)], SETUPS, NOISES, OFF):
-        found = np.array(list(pool.map(partial(camera_trial, *case), range(trials), chunksize=10)))
-        ratio, rms = np.sqrt(found.mean(0) / [6, 1])
-        row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")
-
-
 @script(trials=500, only="", scheduler=str, limited=True)
 def main(given) -> None:
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * given.trials) / (6 * given.trials))
     print(f"{given.trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")
     with executor_of(given.scheduler) as pool:
-        print_cameras(pool, given.trials, given.only)
+        print(f"\n{POSES_OFF} poses, σ estimated:\n")
+        head("method", "setup", "noise", "camera off", "calibration", "RMS error, mm")
+        for case in product([name for name in CAMERAS if name.startswith(given.only)], SETUPS, NOISES, OFF):
+            found = np.array(list(pool.map(partial(camera_trial, *case), range(given.trials), chunksize=10)))
+            ratio, rms = np.sqrt(found.mean(0) / [6, 1])
+            row(*case[:3], f"{case[3]:g} σ", f"{ratio:.3f}", f"{rms:.3g}")

@@ -8,9 +8,7 @@ corners are the truth, and rendered tags.
 ``--only`` : gates that begin so; ``--most`` : subsets of each image, or scenes.
 """
 
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,12 +16,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scripts.runner import DATA, head, row, script
+from scripts.runner import DATA, executor_of, head, row, script
 from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.dictionaries import dictionary_of
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.locate.layout import LayoutPlan
 from stcal.locate.layout_calibration import CalibrationImages
@@ -51,16 +48,10 @@ def charuco_plan() -> LayoutPlan:
     return LayoutPlan("tags of a ChArUco", tags, np.full(TAGS, BOARD.marker_mm), ORIGIN, np.full((TAGS, 4, 2), np.nan))
 
 
-def charuco_camera(folder: Path) -> CameraModel:
-    """Intrinsics of the set, which states no distortion."""
-    return read_camera(folder / "cal_data.yaml")
-
-
 def charuco_images(folder: Path) -> CalibrationImages:
     """All images of the set in the order of their numbers."""
-    found = calibration_images(
-        folder / "images", charuco_camera(folder), BOARD, (BOARD.dictionary,), 1, lambda *_: None
-    )
+    camera = read_camera(folder / "cal_data.yaml")  # of no distortion
+    found = calibration_images(folder / "images", camera, BOARD, (BOARD.dictionary,), 1, lambda *_: None)
     order = sorted(range(len(found.names)), key=lambda i: int(Path(found.names[i]).stem))
     names, views, tags = (tuple(values[i] for i in order) for values in (found.names, found.views, found.tags))
     return replace(found, names=names, views=views, tags=tags)
@@ -92,11 +83,8 @@ def _cells(trials: Sequence[PoseTrial]) -> list:
     if not used:
         return [*counts, "–", "–"]
     rad, mm = np.array([(t.error_rad, t.error_mm) for t in used]).T
-    mean, worst = (
-        f"{np.degrees(rad.mean()):.2f}°, {mm.mean():.2f} mm",
-        f"{np.degrees(rad.max()):.1f}°, {mm.max():.1f} mm",
-    )
-    return [*counts, mean, worst]
+    mean = f"{np.degrees(rad.mean()):.2f}°, {mm.mean():.2f} mm"
+    return [*counts, mean, f"{np.degrees(rad.max()):.1f}°, {mm.max():.1f} mm"]
 
 
 def edges(count: int) -> None:
@@ -105,11 +93,11 @@ def edges(count: int) -> None:
     views = [(turn, 0) for turn in (0, 1, 2, 5, 20, 45)] + [(0, 20), (0, 40), (0, 60), (20, 60)]
     kinds = ("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5)
     cases = [(*kind, *view, count) for kind in kinds for view in views]
-    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
-    for case, (squares, accepted) in zip(cases, pool.map(_edge_scenes, *zip(*cases, strict=True)), strict=True):
-        kind, blur, turn, tilt, _ = case
-        figures = f"{np.mean(squares):.2f}", f"{np.max(squares):.1f}"
-        row(kind, blur, f"{turn}°", f"{tilt}°", *figures, f"{accepted} of {count}")
+    with executor_of() as pool:
+        for case, (squares, accepted) in zip(cases, pool.map(_edge_scenes, *zip(*cases, strict=True)), strict=True):
+            kind, blur, turn, tilt, _ = case
+            figures = f"{np.mean(squares):.2f}", f"{np.max(squares):.1f}"
+            row(kind, blur, f"{turn}°", f"{tilt}°", *figures, f"{accepted} of {count}")
 
 
 @one_thread()

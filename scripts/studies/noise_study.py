@@ -78,19 +78,14 @@ def squared_errors(calibration: Calibration, scene: Scene) -> np.ndarray:
     return np.array([squares[1], squares[0] * np.degrees(1) ** 2])
 
 
-def study(seeds: int, scheduler: str | None = None) -> dict[Point, np.ndarray]:
-    """RMS over the seeds at every point, (4,), in the order of :func:`one_run`."""
-    points = list(dict.fromkeys(Point(**{name: v}) for name, (_, values) in PANELS.items() for v in values))
-    jobs = list(product(range(seeds), points))
-    with executor_of(scheduler) as pool:
-        answers = list(pool.map(one_run, *zip(*jobs, strict=True)))
-    squares = np.reshape(answers, (seeds, len(points), 4))
-    return dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
-
-
 @script(seeds=20, scheduler=str, limited=True)
 def main(given) -> None:
-    found = study(given.seeds, given.scheduler)
+    points = list(dict.fromkeys(Point(**{name: v}) for name, (_, values) in PANELS.items() for v in values))
+    jobs = list(product(range(given.seeds), points))
+    with executor_of(given.scheduler) as pool:
+        answers = list(pool.map(one_run, *zip(*jobs, strict=True)))
+    squares = np.reshape(answers, (given.seeds, len(points), 4))
+    found = dict(zip(points, np.sqrt(squares.mean(0)), strict=True))
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
     titles = "position, µm", "bound, µm", "position / bound", "rotation, mdeg", "uncorrected, µm"
     print(f"| | | {' | '.join(titles)} |\n|{'---|' * 7}")

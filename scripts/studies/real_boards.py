@@ -10,7 +10,7 @@ stcal with the places of its dots and corners estimated from the other views. σ
 Data: `real` of shared/data; a set that is not there is left out. Each set takes minutes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,9 +23,8 @@ from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign
-from stcal.errors import StcalError
 from stcal.io.images import find_images
-from stcal.sfm.camera.calibrate import FOLDS, CameraCalibration, calibrate_camera, residual_rms_px
+from stcal.sfm.camera.calibrate import FOLDS, calibrate_camera, residual_rms_px
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
 SETS = {
@@ -45,23 +44,6 @@ class View:
 
     xyz_board: np.ndarray
     xy_px: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class Fared:
-    """What one way made of a set; lengths in px."""
-
-    views: int
-    points: int
-    rms: float
-    held_out: float
-    focal: float
-    focal_sigma: float
-
-    def cells(self) -> tuple:
-        """The row of the table."""
-        held_out = f"{self.held_out:.3f}" if np.isfinite(self.held_out) else "–"
-        return self.views, self.points, f"{self.rms:.3f}", held_out, f"{self.focal:.1f} ± {self.focal_sigma:.2g}"
 
 
 def found_by_opencv(grey: np.ndarray, board) -> tuple[np.ndarray, np.ndarray] | None:
@@ -96,8 +78,14 @@ def of_opencv(views: Sequence[View], size: tuple[int, int]):
     return cv2.calibrateCameraExtended(xyz, xy, size, None, None, flags=cv2.CALIB_FIX_K3)
 
 
-def by_opencv(views: Sequence[View], size: tuple[int, int]) -> Fared:
-    """OpenCV, with the board as designed."""
+def cells(views: Sequence, rms: float, held_out: Sequence[np.ndarray], focal: float, focal_sigma: float) -> tuple:
+    """Of a row: what one way made of a set; ``held_out`` : residuals by view, px."""
+    residual = float(np.sqrt((np.concatenate(held_out) ** 2).mean()))
+    return len(views), sum(map(len, views)), f"{rms:.3f}", f"{residual:.3f}", f"{focal:.1f} ± {focal_sigma:.2g}"
+
+
+def by_opencv(views: Sequence[View], size: tuple[int, int]) -> tuple:
+    """Cells of OpenCV, with the board as designed."""
     rms, matrix, _, _, _, sigma, *_ = of_opencv(views, size)
     residuals = []
     for fold in range(FOLDS):
@@ -106,24 +94,7 @@ def by_opencv(views: Sequence[View], size: tuple[int, int]) -> Fared:
             _, turn, place = cv2.solvePnP(view.xyz_board, view.xy_px, inner, lens)
             there = cv2.projectPoints(view.xyz_board, turn, place, inner, lens)[0]
             residuals.append(there.reshape(-1, 2) - view.xy_px)
-    held_out = rms_of(residuals)
-    count = sum(len(view.xy_px) for view in views)
-    return Fared(len(views), count, rms / np.sqrt(2), held_out, matrix[0, 0], float(sigma[0, 0]))
-
-
-def rms_of(residuals: Sequence[np.ndarray]) -> float:
-    """Per coordinate."""
-    return float(np.sqrt((np.concatenate(residuals) ** 2).mean()))
-
-
-def by_stcal(found: CameraCalibration) -> Fared:
-    """This package."""
-    own = found.intrinsics
-    held_out = rms_of(found.held_out.residuals_px) if found.held_out else np.nan
-    points = sum(len(view) for view in found.views)
-    return Fared(
-        len(found.views), points, residual_rms_px(own), held_out, float(own.camera.focal[0]), float(own.sigma()[0])
-    )
+    return cells([v.xy_px for v in views], rms / np.sqrt(2), residuals, matrix[0, 0], float(sigma[0, 0]))
 
 
 def rows(name: str) -> None:
@@ -131,26 +102,17 @@ def rows(name: str) -> None:
     images, file = SETS[name]
     place = DATA / "real" / name
     folder, board = place / images, load_flat_board(place / file)
-    count = len(find_images(folder)[0])
     dots = isinstance(board, BoardDesign)
     grid = board if dots else corner_grid(board)
-    ways: dict[str, Callable[[], Fared]] = {}
-    try:
-        found = calibrate_camera(folder, target_of(None), board) if dots else calibrate_camera_by_corners(folder, board)
-        camera = found.intrinsics.camera
-        size = camera.width, camera.height
-        views = [View(grid.places_mm(view.labels), view.centre_px) for view in found.views]
-        ways["stcal"] = lambda: by_stcal(found)
-        ways["OpenCV, stcal's corners"] = lambda: by_opencv(views, size)
-    except StcalError as error:
-        print(f"| {name}: {count} images | stcal | {error} | | | | |", flush=True)
-        return
-    ways["OpenCV"] = lambda: by_opencv(views_of_opencv(folder, board), size)
-    for way, fare in ways.items():
-        try:
-            row(f"{name}: {count} images", way, *fare().cells())
-        except cv2.error:
-            print(f"| {name}: {count} images | {way} | 0 | | | | |", flush=True)
+    found = calibrate_camera(folder, target_of(None), board) if dots else calibrate_camera_by_corners(folder, board)
+    own = found.intrinsics
+    size = own.camera.width, own.camera.height
+    title = f"{name}: {len(find_images(folder)[0])} images"
+    focal = float(own.camera.focal[0]), float(own.sigma()[0])
+    row(title, "stcal", *cells(found.views, residual_rms_px(own), found.held_out.residuals_px, *focal))
+    views = [View(grid.places_mm(view.labels), view.centre_px) for view in found.views]
+    row(title, "OpenCV, stcal's corners", *by_opencv(views, size))
+    row(title, "OpenCV", *by_opencv(views_of_opencv(folder, board), size))
 
 
 @script(sets=list(SETS))

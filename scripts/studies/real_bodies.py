@@ -1,25 +1,20 @@
 #!/usr/bin/env python
-"""Calibrate bodies with printed faces from real photographs, without a board and without a camera file.
+"""Calibrate a cube with printed faces from real photographs, without a board and without a camera file.
 
 No truth is known but the nominal geometry: the faces of a cube are at right angles as far as paper on a cube is. What
 is printed: images used, faces, residuals, the focal length with its σ, how far the normals of neighbouring faces are
 off 90°, and the largest σ of a face's position and rotation.
 
-Data: `real` of shared/data; a set that is not there is left out. A set takes a minute or two.
+Data: `real/pycamset_cube` of shared/data. It takes a minute or two.
 """
-
-import tempfile
-from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, head, script
-from scripts.runner import row as print_row
+from scripts.runner import DATA, head, row, script
 from stcal.boards.board_designs import CharucoDesign
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.sfm import pipeline
-from stcal.sfm.runs.saved import RunResult
 
 SAME_PLANE_DEG = 45.0
 """Smallest angle between the planes of neighbouring faces."""
@@ -31,11 +26,11 @@ def pycamset_cube() -> TargetDesign:
     return TargetDesign("cube", "bright", tuple(printed_face(str(k), board) for k, board in enumerate(boards)))
 
 
-SETS = {"pycamset_cube": ("cam0", pycamset_cube)}
-
-
-def row(name: str, result: RunResult) -> None:
-    """Prints the row of the table."""
+@script()
+def main(_) -> None:
+    neighbours, sigmas = "neighbours off 90°, mean and worst, °", ("σ of a position, µm", "of a rotation, mdeg")
+    head("set", "images", "faces", "residuals, px", "focal length, px", neighbours, *sigmas)
+    result = pipeline.run(DATA / "real" / "pycamset_cube" / "cam0", None, None, pycamset_cube())
     target, joint, camera = result.target, result.calibration.joint, result.refined_camera
     assert joint is not None
     assert camera is not None
@@ -47,8 +42,8 @@ def row(name: str, result: RunResult) -> None:
     residuals = np.concatenate([m.residuals_px(result.calibration.camera).ravel() for m in joint.models])
     images = sum(len(solution.model.images) for solution in result.solutions)
     total = len(result.detection.images) + len(result.detection.skipped)
-    print_row(
-        name,
+    row(
+        "pycamset_cube",
         f"{images} of {total}",
         f"{len(target.target_from_face)} of {len(result.target_design.faces)}",
         f"{np.sqrt((residuals**2).mean()):.3f}",
@@ -57,13 +52,3 @@ def row(name: str, result: RunResult) -> None:
         f"{1e3 * sigma[:, 3:].max():.0f}",
         f"{1e3 * np.degrees(sigma[:, :3].max()):.0f}",
     )
-
-
-@script()
-def main(_) -> None:
-    neighbours, sigmas = "neighbours off 90°, mean and worst, °", ("σ of a position, µm", "of a rotation, mdeg")
-    head("set", "images", "faces", "residuals, px", "focal length, px", neighbours, *sigmas)
-    for name, (folder, design) in SETS.items():
-        if (images := DATA / "real" / name / folder).is_dir():
-            with tempfile.TemporaryDirectory() as scratch:
-                row(name, pipeline.run(images, None, Path(scratch) / "run", design()))

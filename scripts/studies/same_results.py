@@ -169,8 +169,7 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     add("calibrate_camera", f"sfm calibrate-camera {images} --out @/cameras.txt")
     add("advise", f"sfm advise {sample} --count 2 --json @/advice.json")
     add("plan", "sfm plan --images 6 --json @/plan.json")
-    for kind in ("colmap-txt", "nvm", "bundler"):
-        add(f"export_{kind}", f"sfm export-model {sample} @/model --format {kind}")
+    add("export", f"sfm export-model {sample} @/model --format colmap-txt")
     add("faces", "sfm faces {out}/demo/demo/run/colmap/models --run {out}/demo/demo/run --out @/faces.json")
     add("crosscheck", "sfm crosscheck {out}/demo/demo/run")
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scripts.runner import face_errors, head, row, script
-from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
+from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.checks.significance import Evidence
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.group_model import ImageObservations
@@ -32,6 +32,7 @@ NOISE_PX = 0.02
 MISSING = 0.1
 SIZES = (40, 80, 160, 300, 1000, 2000, 10_000)
 ALL_UP_TO = 300
+GROUPS = 4
 
 
 def observe(scene: Scene) -> list[ImageObservations]:
@@ -67,17 +68,9 @@ def ellipse_shapes(scene: Scene, group: str, image: int) -> dict[str, np.ndarray
     return dict(zip(seen.labels, root, strict=True))
 
 
-def evidence(scene: Scene, observations, options: AdjustOptions, solutions, result: Calibration) -> Evidence:
-    """What a run gives to the checks, but for the blur of the edges, which needs pixels."""
-    models, outliers = tuple(s.model for s in solutions), tuple(o for s in solutions for o in s.outliers)
-    designs = scene.camera, scene.target, scene.board
-    return Evidence(models, outliers, tuple(observations), *designs, options, result, None, {})
-
-
 def measure(count: int, kind: str) -> dict:
     """One run over ``count`` images in all."""
-    groups = 4
-    scene = make_scene(SceneOptions(seed=5, images_per_group=count // groups))
+    scene = make_scene(SceneOptions(seed=5, images_per_group=count // GROUPS))
     observations = observe(scene)
     options = RunOptions().settled(scene.target)
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -95,7 +88,10 @@ def measure(count: int, kind: str) -> dict:
         adjustment = options.adjustment(scene.target)
         result = calibrate([s.model for s in solutions], scene.camera, scene.target, scene.board, adjustment)
         marks.append(("adjust", time.perf_counter()))
-        checks = run_checks(evidence(scene, observations, adjustment, solutions, result))
+        # as a run gives it, but for the blur of the edges, which needs pixels
+        outliers = tuple(o for s in solutions for o in s.outliers)
+        given = scene.camera, scene.target, scene.board, adjustment, result, None, {}
+        checks = run_checks(Evidence(tuple(s.model for s in solutions), outliers, tuple(observations), *given))
         marks.append(("check", time.perf_counter()))
         database = out / "database.db"
         write_database(database, scene.camera, observations, graph.pairs)

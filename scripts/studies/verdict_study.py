@@ -1,6 +1,6 @@
 """Planted causes at three strengths on three sets: does the first sentence of the answer name them, is an error silent?
 
-    .venv/bin/python scripts/studies/verdict_study.py [--only WORD] [--sets NAMES] [--sound DRAWS] [--json FILE]
+    .venv/bin/python scripts/studies/verdict_study.py [--only WORD] [--sets NAMES] [--sound DRAWS]
 
 Sets: the sample and `../shared/data/stereo_target/white_block` with the circles that were found in their photographs,
 and a simulated one of three faces with noise of 0.02 px. What is planted changes centres, camera file or designs, and
@@ -11,24 +11,21 @@ group is not "Yes"; an error names a cause only by what it says as the likely ca
 centres of the same sets with new noise of the σ of each centre.
 """
 
-import json
-import multiprocessing
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from scripts.runner import DATA, SAMPLE, face_errors, normalised, script
+from scripts.runner import DATA, SAMPLE, executor_of, face_errors, normalised, script
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Rigid, Similarity, align_rigid
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.labels import CircleLabel, DotLabel
@@ -63,7 +60,6 @@ class Case:
     camera: Camera
     target: TargetDesign
     board: BoardDesign
-    seed: int = 0
 
     def file(self, **change) -> "Case":
         """The case with another camera file."""
@@ -95,7 +91,8 @@ def photographed(folder: Path) -> Case:
     for name, truth in data.truth["groups"].items():
         poses = tuple(Rigid.from_matrix(image["camera_from_target"]) for image in truth["images"].values())
         dots = np.array(truth["board_circles_target"])
-        groups[name] = Group(name, (), np.eye(3), Rigid(), dots, poses)
+        target_from_board = align_rigid(dots, np.pad(data.board.xy_mm(), ((0, 0), (0, 1))))
+        groups[name] = Group(name, (), np.eye(3), target_from_board, dots, poses)
     frames = {face: Rigid.from_matrix(m) for face, m in data.truth["target_from_face"].items()}
     circles = {CircleLabel(*label.split(":")): np.array(xyz) for label, xyz in data.truth["circles"].items()}
     camera = Camera.of(data.camera, "FULL_OPENCV")
@@ -110,6 +107,11 @@ def photographed(folder: Path) -> Case:
     return Case(scene, _seen_twice(_numbered(scene, images)), camera, data.target, data.board)
 
 
+def number(image: ImageObservations) -> int:
+    """Of an image in its group."""
+    return int(image.name.rpartition("/")[2])
+
+
 def _seen_twice(images: list[ImageObservations]) -> list[ImageObservations]:
     """The images without circles that one image of their group alone shows, as mapping would leave them out."""
     count = Counter((image.group, label) for image in images for label in image.labels)
@@ -118,23 +120,19 @@ def _seen_twice(images: list[ImageObservations]) -> list[ImageObservations]:
 
 def _numbered(scene: Scene, images: list[ImageObservations]) -> list[ImageObservations]:
     """The images with the true numbers of the board's dots, which are known up to its symmetry."""
-    numbered = []
-    for name, group in scene.groups.items():
+
+    def off_px(image: ImageObservations) -> float:
+        group = scene.groups[image.group]
         place = dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
+        dots = np.flatnonzero(~on_face(image))
+        xyz = group.camera_from_target[number(image)] @ np.array([place[image.labels[k]] for k in dots])
+        return float(np.linalg.norm(scene.camera.project(xyz) - image.centre_px[dots], axis=1).sum())
+
+    numbered = []
+    for name in scene.groups:
         own = [image for image in images if image.group == name]
-        tried = []
-        for turned in (False, True):
-            renamed = [
-                replace(i, labels=tuple(_turned(x, scene.board) if turned else x for x in i.labels)) for i in own
-            ]
-            off = 0.0
-            for image in renamed:
-                dots = [k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)]
-                pose = group.camera_from_target[int(image.name.rpartition("/")[2])]
-                xyz = pose @ np.array([place[image.labels[k]] for k in dots])
-                off += float(np.linalg.norm(scene.camera.project(xyz) - image.centre_px[dots], axis=1).sum())
-            tried.append((off, turned, renamed))
-        numbered += min(tried, key=lambda each: each[:2])[2]
+        turned = [replace(i, labels=tuple(_turned(x, scene.board) for x in i.labels)) for i in own]
+        numbered += min(own, turned, key=lambda tried: sum(map(off_px, tried)))
     return numbered
 
 
@@ -150,14 +148,13 @@ def simulated(seed: int = 7) -> Case:
     scene = make_scene(options, *second_design())
     camera = Camera.of(scene.camera, "FULL_OPENCV")
     images = observe(scene, NOISE_PX, np.random.default_rng(seed))
-    return Case(scene, [shaped(scene, i) for i in images], camera, scene.target, scene.board)
+    case = Case(scene, images, camera, scene.target, scene.board)
+    return replace(case, images=[shaped(case, i) for i in images])
 
 
-def shaped(scene: Scene, image: ImageObservations) -> ImageObservations:
+def shaped(case: Case, image: ImageObservations) -> ImageObservations:
     """The image with the true shapes of its ellipses."""
-    seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
-    own = [seen.labels.index(label) for label in image.labels]
-    conics = (circle_conic(seen.xyz_camera[k], seen.normal_camera[k], seen.radius_mm[k]) for k in own)
+    conics = map(circle_conic, *_seen(case, image))
     return replace(image, shape=np.array([ellipse_of_conic(conic)[1] for conic in conics]))
 
 
@@ -176,17 +173,10 @@ def drawn(case: Case, seed: int) -> Case:
 
 def _seen(case: Case, image: ImageObservations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres, normals and radii of the true circles of an image, camera frame."""
-    scene, group = case.scene, case.scene.groups[image.group]
-    pose = group.camera_from_target[int(image.name.rpartition("/")[2])]
-    place = scene.circles_target | dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
-    dots = group.board_circles_target
-    of_board = np.linalg.svd(dots - dots.mean(0))[2][2]
-    normal = np.array(
-        [scene.target_from_face[x.plane].rotation[:, 2] if x.plane != "board" else of_board for x in image.labels]
-    )
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    xyz = np.array([place[label] for label in image.labels])
-    return pose @ xyz, normal @ pose.rotation.T, np.array([radius[label] for label in image.labels])
+    circles = image_circles(case.scene, image.group, number(image))
+    place = {label: k for k, label in enumerate(circles.labels)}
+    own = [place[label] for label in image.labels]
+    return circles.xyz_camera[own], circles.normal_camera[own], circles.radius_mm[own]
 
 
 # ---------------------------------------------------------------- causes
@@ -241,7 +231,7 @@ def shifted_points(case: Case, shift_mm: Callable[[ImageObservations, int], np.n
 
     def change(image: ImageObservations, k: int) -> np.ndarray:
         xyz, normal, radius = _seen(case, image)
-        pose = case.scene.groups[image.group].camera_from_target[int(image.name.rpartition("/")[2])]
+        pose = case.scene.groups[image.group].camera_from_target[number(image)]
         shift = shift_mm(image, k) @ pose.rotation.T
         before, after = (circle_image_offset(at, normal, radius) for at in (xyz, xyz + shift))
         return image.centre_px + case.scene.camera.project(after) - case.scene.camera.project(before)
@@ -313,11 +303,8 @@ def radii(which: Callable[[Case, CircleLabel | DotLabel], bool]) -> Callable[[Ca
 def behind_rims(case: Case, value: float) -> Case:
     """Discs of the faces behind a rim of ``value`` mm: half of it higher, and narrower by h tan τ/π."""
     normals = {face: pose.rotation[:, 2] for face, pose in case.scene.target_from_face.items()}
-    zero = np.zeros(3)
-    raised = shifted_points(
-        case,
-        lambda i, _: np.array([value / 2 * normals[x.face] if isinstance(x, CircleLabel) else zero for x in i.labels]),
-    )
+    normals["board"] = np.zeros(3)
+    raised = shifted_points(case, lambda i, _: value / 2 * np.array([normals[x.plane] for x in i.labels]))
     images = []
     for image in raised.images:
         xyz, normal, radius = _seen(case, image)
@@ -504,14 +491,12 @@ def names_it(first: str, words: str) -> bool:
     return key in words.split("; ") or (key == CAUSE and any(word in title for word in words.split("; ")))
 
 
-MAKERS = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(DATA / "stereo_target" / "white_block")}
-MAKERS["own"] = simulated
-
-
 @cache
 def case_of(name: str) -> Case:
     """The set of this name; detection takes seconds, once in each process."""
-    return MAKERS[name]()
+    if name == "own":
+        return simulated()
+    return photographed({"sample": SAMPLE, "block": DATA / "stereo_target" / "white_block"}[name])
 
 
 @one_thread()
@@ -521,7 +506,7 @@ def planted(cause: str, where: str) -> list[dict]:
     runs = []
     for value in strengths:
         found = answer(plant(case_of(where), value))
-        runs.append(found | {"cause": cause, "set": where, "value": value, "named": names_it(found["first"], words)})
+        runs.append(found | {"named": names_it(found["first"], words)})
     return runs
 
 
@@ -531,35 +516,34 @@ def sound(where: str, seed: int) -> dict:
     return answer(drawn(case_of(where), seed))
 
 
-@script(only="", sets="sample,block,own", sound=40, json=Path)
+def counts(runs: list[dict]) -> tuple[int, list[dict], list[dict], int]:
+    """Number of runs that name the cause, those that are not Yes, those that are, and number of silent ones."""
+    asked, quiet = ([r for r in runs if (r["verdict"] == "yes") == yes] for yes in (False, True))
+    return sum(r["named"] for r in asked), asked, quiet, sum(r["sigma"] > SILENT_SIGMA for r in quiet)
+
+
+@script(only="", sets="sample,block,own", sound=40)
 def main(given) -> None:
     sets = given.sets.split(",")
     causes = [name for name in CAUSES if given.only in name]
-    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
-    answers = pool.map(planted, *zip(*[(name, where) for name in causes for where in sets], strict=True))
-    rows, kept = [], []
-    for name in causes:
-        runs = [run for _ in sets for run in next(answers)]
-        kept += runs
-        asked = [r for r in runs if r["verdict"] != "yes"]
-        quiet = [r for r in runs if r["verdict"] == "yes"]
-        silent = [r for r in quiet if r["sigma"] > SILENT_SIGMA]
+    draws = [(where, seed) for where in sets for seed in range(given.sound)]
+    with executor_of() as pool:
+        answers = pool.map(planted, *zip(*[(name, where) for name in causes for where in sets], strict=True))
+        runs = {name: [run for _ in sets for run in next(answers)] for name in causes}
+        drawn_sound = list(pool.map(sound, *zip(*draws, strict=True))) if draws else []
+    rows = []
+    for name, own in runs.items():
+        named, asked, quiet, silent = counts(own)
         others = sorted({r["first"].partition(": ")[2] for r in asked if not r["named"]})
         worst = f" ({max(r['sigma'] for r in quiet):.1f} σ)" if quiet else ""
-        counts = f"{sum(r['named'] for r in asked)}/{len(asked)}", f"{len(quiet)}{worst}", str(len(silent))
-        rows.append([name, *counts, "; ".join(text[:60] for text in others)])
-    asked = [r for r in kept if r["verdict"] != "yes"]
-    named = sum(r["named"] for r in asked)
-    quiet = [r for r in kept if r["verdict"] == "yes"]
+        cells = f"{named}/{len(asked)}", f"{len(quiet)}{worst}", str(silent)
+        rows.append([name, *cells, "; ".join(text[:60] for text in others)])
     print("\n".join(text_table([["<planted cause", "named", "yes", "silent", "<named instead"], *rows])))
+    every = [run for own in runs.values() for run in own]
+    named, asked, _, silent = counts(every)
     print(f"named: {named} of {len(asked)} runs that are not Yes, {100 * named / max(len(asked), 1):.0f} %")
-    print(f"silent: {sum(r['sigma'] > SILENT_SIGMA for r in quiet)} of {len(kept)} runs")
-    draws = [(where, seed) for where in sets for seed in range(given.sound)]
-    drawn_sound = list(pool.map(sound, *zip(*draws, strict=True))) if draws else []
+    print(f"silent: {silent} of {len(every)} runs")
     wrong = [r for r in drawn_sound if r["verdict"] != "yes"]
-    said = sorted({key for r in wrong for key in r["bad"]})
-    share = f"{100 * len(wrong) / max(len(drawn_sound), 1):.1f} %"
-    listed = f": {', '.join(said)}" if said else ""
-    print(f"sound sets: {len(wrong)} of {len(drawn_sound)} answered No or With care, {share}{listed}")
-    if given.json:
-        given.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+    listed = ", ".join(sorted({key for r in wrong for key in r["bad"]}))
+    share = f"{100 * len(wrong) / max(len(draws), 1):.1f} %{': ' * bool(listed)}{listed}"
+    print(f"sound sets: {len(wrong)} of {len(draws)} answered No or With care, {share}")

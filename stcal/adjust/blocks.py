@@ -329,7 +329,7 @@ def numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class FactorRows:
     """Rows of a factor about a state: ``slopes`` (r, w, dim) by block and ``residual`` (r, w), over σ and weighted;
     ``length`` and ``weight`` (r,)."""
 
@@ -343,7 +343,7 @@ class Rows:
     @classmethod
     def of(
         cls, factor: Factor, values: Mapping[str, Any], sigma: Mapping[str, float], kept: Mapping[str, slice]
-    ) -> "Rows":
+    ) -> "FactorRows":
         """Return the rows of a factor about a state; ``kept`` : places of the kept blocks among the unknowns."""
         white = factor.white(values, sigma)
         length = np.sqrt((white**2).sum(1))
@@ -356,7 +356,7 @@ class Rows:
         places = tuple(kept.get(block.name) for block, _ in factor.on)
         return cls(factor, places, slopes, white * root[:, None], length, weight)
 
-    def of_kinds(self, kinds: Collection[str]) -> "Rows | None":
+    def of_kinds(self, kinds: Collection[str]) -> "FactorRows | None":
         own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
         if isinstance(self.factor.kind, str) or not own:
             return self if own else None

@@ -18,10 +18,10 @@ from stcal.adjust.blocks import (
     Components,
     Equations,
     Factor,
+    FactorRows,
     Huber,
     Known,
     Prior,
-    Rows,
     Values,
     numbers,
     sigma_factor,
@@ -214,9 +214,9 @@ class Solution:
         return next((block for block in self.problem.blocks if block.eliminate), None)
 
     @cached_property
-    def rows(self) -> list[Rows]:
+    def rows(self) -> list[FactorRows]:
         """Whitened and weighted rows of all factors."""
-        return [Rows.of(factor, self.values, self.problem.sigma, self.places) for factor in self.problem.factors]
+        return [FactorRows.of(factor, self.values, self.problem.sigma, self.places) for factor in self.problem.factors]
 
     def equations(self, kinds: Collection[str] | None = None) -> Equations:
         """Return the equations of the residuals of some kinds, or of all, without prior knowledge."""
@@ -228,7 +228,7 @@ class Solution:
             square, count = square + float((rows.residual**2).sum()), count + rows.residual.size
         return replace(sums, square=square, count=count)
 
-    def _of(self, kinds: Collection[str] | None) -> list[Rows]:
+    def _of(self, kinds: Collection[str] | None) -> list[FactorRows]:
         return self.rows if kinds is None else [own for rows in self.rows if (own := rows.of_kinds(kinds))]
 
     @cached_property
@@ -312,7 +312,7 @@ class Solution:
         normal, along = _alone(self.normal, self.places[block.name])
         return _by_clusters(normal, self.told(along))
 
-    def effects(self, along: np.ndarray) -> Iterator[tuple[Rows, slice, np.ndarray]]:
+    def effects(self, along: np.ndarray) -> Iterator[tuple[FactorRows, slice, np.ndarray]]:
         """Yield by batches the rows of each factor, the part of them that it is, and the derivatives (r, w, q) of this
         part by changes ``along`` (k, q) of the kept unknowns."""
         ways = self._ways(along)

@@ -27,7 +27,7 @@ from stcal.boards.foreign import KEYS as BUNDLE_KEYS
 from stcal.boards.foreign import Count, Few, Squares, kalibr_board_of, tags_of_bundle, yaml_content
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, Polarity, StatedSize, board_lengths, reference_board
 from stcal.errors import InputError, named
-from stcal.geometry.arrays import Rows, require_covariance
+from stcal.geometry.arrays import CovarianceRows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_of, toml_string, validated
@@ -252,7 +252,7 @@ class TagsFile(Sized):
         if full is not None:
             corners = [f"corner {corner} of tag {tag.id}" for tag in self.tag for corner in range(4)]
             try:
-                require_covariance(full, size, Rows.of(corners, "xy"))
+                require_covariance(full, size, CovarianceRows.of(corners, "xy"))
             except InputError as error:
                 raise mistake(f"covariance_mm2: {error}; calibrate again") from error
         return self

@@ -73,7 +73,7 @@ class PoseFiles:
             source, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing)
             print_each("note", notes)
         else:
-            source = shared.Joined(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
+            source = shared.JoinOptions(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
         return Files(source, self.poses, self.camera, self.board, said, self.quaternions, timing)
 
 

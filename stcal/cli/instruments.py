@@ -244,7 +244,7 @@ def register(
         Opt("--robot"),
     ] = None,
     identified: Annotated[Path | None, "Write the robot identified with --robot to this file (TOML).", WRITES] = None,
-    joined: shared.Joined = shared.JOINED_BY_NAME,
+    joined: shared.JoinOptions = shared.JOINED_BY_NAME,
     out: Annotated[Path | None, "Write all results to this file (JSON).", WRITES] = None,
     report: shared.ReportFile = None,
 ) -> None:

@@ -136,7 +136,7 @@ Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: colum
 
 
 @dataclass(frozen=True, slots=True)
-class Joined:
+class JoinOptions:
     """Options of a table in place of a command's file: two tables joined."""
 
     first: FirstTable = None
@@ -152,7 +152,7 @@ class Joined:
         return tables[0] if isinstance(tables, list) else tables
 
 
-JOINED, JOINED_BY_POSE, JOINED_BY_NAME = Joined(), Joined(key="pose"), Joined(key="name")
+JOINED, JOINED_BY_POSE, JOINED_BY_NAME = JoinOptions(), JoinOptions(key="pose"), JoinOptions(key="name")
 
 
 def several_tables(

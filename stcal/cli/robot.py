@@ -139,7 +139,7 @@ def axes(
         "them by their stated σ, if there are any, and off ignores them.",
     ] = "auto",
     rotation: shared.Rotation = None,
-    joined: shared.Joined = shared.JOINED,
+    joined: shared.JoinOptions = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -221,7 +221,7 @@ def identify(
     quaternions: shared.Quaternions = "wxyz",
     rotation: shared.Rotation = None,
     payload_kg: shared.PayloadKg = None,
-    joined: shared.Joined = shared.JOINED,
+    joined: shared.JoinOptions = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -264,7 +264,7 @@ def evaluate(
     out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
     quaternions: shared.Quaternions = "wxyz",
     payload_kg: shared.PayloadKg = None,
-    joined: shared.Joined = shared.JOINED,
+    joined: shared.JoinOptions = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -335,7 +335,7 @@ def compensate(
     quaternions: shared.Quaternions = "wxyz",
     rotation: shared.Rotation = None,
     payload_kg: shared.PayloadKg = None,
-    joined: shared.Joined = shared.JOINED_BY_POSE,
+    joined: shared.JoinOptions = shared.JOINED_BY_POSE,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:

@@ -17,7 +17,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.parts import (
     LAYERS,
     Disc,
-    Part,
+    Piece,
     Shape,
     Text,
     box_of,
@@ -40,7 +40,7 @@ LETTERS = 2.0
 BAR, SHORT_BAR = 100.0, 50.0  # lengths of scale bars, mm
 
 
-def framed(part: Part, bare: bool = False) -> list[Shape]:
+def framed(part: Piece, bare: bool = False) -> list[Shape]:
     """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions."""
     box = box_of(part.outline)
     shapes: list[Shape] = [*part.shapes, *(part.lines or [line(part.outline, "CUT", width=0.1, closed=True)])]
@@ -119,7 +119,7 @@ MOST_MM = 5000.0  # largest side of a page in a PDF, mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedShapes:
     """Shapes in the sheet's frame, clipped to the box ``clip`` (2, 2) if it is given."""
 
     shapes: tuple[Shape, ...]
@@ -133,11 +133,11 @@ class Sheet:
     title: str
     width: float
     height: float
-    placed: tuple[Placed, ...]
+    placed: tuple[PlacedShapes, ...]
     bare: bool = False  # whether the part is without dimensions, with which it would take more sheets
 
 
-def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
+def one_sheet(parts: Sequence[Piece], title: str) -> Sheet:
     """Return one sheet with all parts, as large as needed."""
     drawn = [framed(part) for part in parts]
     boxes = [extent(shapes) for shapes in drawn]
@@ -155,7 +155,7 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
     return _sheet(title, width, height, placed, [EDGE + SIDE - box[0, 0], EDGE + FOOT - box[0, 1]])
 
 
-def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
+def paper_sheets(parts: Sequence[Piece], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
 
     A part that is larger than a sheet only by its dimensions is drawn without them.
@@ -189,7 +189,7 @@ class _Way:
         return (len(self.seams[0]) + 1) * (len(self.seams[1]) + 1)
 
 
-def _ways(part: Part, paper: str) -> list[_Way]:
+def _ways(part: Piece, paper: str) -> list[_Way]:
     """Return the layouts of a part: portrait and landscape, with dimensions, or bare on one sheet."""
     ways, boxes, (width, height) = [], np.array([shape.box() for shape in part.pattern()]), PAPERS[paper]
     for bare, size in product((False, True), ((width, height), (height, width))):
@@ -260,8 +260,8 @@ def _sheet(title: str, width: float, height: float, shapes: Iterable[Shape], shi
     if clip is not None:
         instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
     words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
-    placed = Placed(tuple(moved(shape, shift) for shape in shapes), clip)
-    return Sheet(title, width, height, (placed, Placed((*bars, *words))))
+    placed = PlacedShapes(tuple(moved(shape, shift) for shape in shapes), clip)
+    return Sheet(title, width, height, (placed, PlacedShapes((*bars, *words))))
 
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
@@ -396,7 +396,7 @@ class Drawn:
     """A drawing that was written."""
 
     path: Path
-    parts: list[Part]
+    parts: list[Piece]
     sheets: list[Sheet]
     paper: str  # its name, or ``own``
 
@@ -475,7 +475,7 @@ def net_text(target: TargetDesign) -> str:
     return f"net to fold, {_size(part)}: {f'one sheet of {paper}' if paper else 'larger than A0'}"
 
 
-def _size(part: Part) -> str:
+def _size(part: Piece) -> str:
     return f"{' × '.join(said_mm(side) for side in np.ptp(part.outline, axis=0))} mm"
 
 
@@ -493,7 +493,7 @@ def load_design(path: str | Path) -> Design:
     return load_target(path) if content is not None and "face" in content else load_boards(path)
 
 
-def paper_for(parts: Sequence[Part]) -> str | None:
+def paper_for(parts: Sequence[Piece]) -> str | None:
     """Return the smallest paper from A4 to A0 that takes each part on one sheet, or None."""
     for paper in ("A4", "A3", "A2", "A1", "A0"):
         try:

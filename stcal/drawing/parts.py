@@ -130,7 +130,7 @@ Spans: TypeAlias = tuple[tuple[int, float, float, str], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class Piece:
     """A flat piece, seen from the side that is photographed, Y upwards."""
 
     name: str
@@ -144,7 +144,7 @@ class Part:
         return [shape for shape in self.shapes if shape.layer == "PATTERN"]
 
 
-def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
+def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Piece:
     """Return the plate of a face, in the face's frame as seen from outside, Y upwards."""
     if face.printed is not None:
         part = board_part(face.printed, f"face {face.id}", margin_mm)  # type: ignore[arg-type]
@@ -162,7 +162,7 @@ def as_seen(face: FaceDesign) -> FaceDesign:
     return replace(face, outline_mm=outline, rough_target_from_face=None if pose is None else pose @ INWARDS)
 
 
-def parts_of(design: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
+def parts_of(design: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Piece]:
     """Return a plate for each face of a target, or a sheet for each board, with a margin of at least ``margin_mm``."""
     if isinstance(design, TargetDesign):
         return [face_part(face, design.polarity, margin_mm) for face in design.faces]
@@ -170,7 +170,7 @@ def parts_of(design: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_m
     return [board_part(board, name, margin_mm) for name, board in boards]
 
 
-def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> Part:
+def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> Piece:
     """Return the sheet of a board; the board's Y, which points down, is inverted."""
     if isinstance(board, BoardDesign | AsymmetricCirclesDesign):
         return _dots(board, name, margin_mm)
@@ -179,7 +179,7 @@ def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> P
     return _part(f"{name}: {description}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
 
 
-def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Part:
+def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Piece:
     xy, radii = board.xy_mm() * [1, -1], board.radii_mm()
     names = board.labels() if isinstance(board, BoardDesign) else [""] * len(xy)
     pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
@@ -242,12 +242,12 @@ def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
     return [Disc(x, y, radius, ink, name=str(name)) for (x, y), radius, name in rows]
 
 
-def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), outline=None) -> Part:
+def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), outline=None) -> Piece:
     if outline is None:
         outline = corners_of(extent(pattern) + margin_mm * np.array([[-1.0], [1.0]]))
     outline = np.asarray(outline)
     ground = [Outline((outline,), "GROUND")] if polarity == "bright" else []
-    return Part(name, outline, (*ground, *pattern), spans)
+    return Piece(name, outline, (*ground, *pattern), spans)
 
 
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
@@ -282,7 +282,7 @@ class _Plate:
             yield (self.face.id, edge), np.array(ends)
 
 
-def net_part(target: TargetDesign) -> Part:
+def net_part(target: TargetDesign) -> Piece:
     """Return the net of all plates: those that share an edge in space, by ``outline_mm`` at rough poses, unfolded into
     one plane."""
     for face in target.faces:
@@ -359,7 +359,7 @@ def _is_clear(one: np.ndarray, others: Iterable[np.ndarray]) -> bool:
     return not any(map(overlaps, others))
 
 
-def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], folds: set[Edge]) -> Part:
+def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], folds: set[Edge]) -> Piece:
     """Return the plates with what is to cut and fold, tabs under their partners, and a sketch with names."""
     grounds: list[Shape] = []
     shapes: list[Shape] = []
@@ -390,7 +390,7 @@ def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], 
             shapes.append(Text(*at, f"under {partner[0]}", LETTERS, "middle", turned=not level))
     box = box_of(np.concatenate(taken))
     sketch = _sketch(plates, np.array([box[1, 0] + BESIDE, box[1, 1]]))
-    return Part("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
+    return Piece("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
 
 
 def _tab(ends: np.ndarray) -> np.ndarray:

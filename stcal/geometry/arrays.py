@@ -270,14 +270,14 @@ TINY = 1e-300  # value that replaces a variance of zero, to avoid division by ze
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class CovarianceRows:
     """The rows of a covariance: ``names``; ``nothing`` : variance of each row that counts as zero (rounding)."""
 
     names: tuple[str, ...]
     nothing: float | tuple[float, ...] = 0.0
 
     @classmethod
-    def of(cls, names: Iterable[str], axes: str) -> "Rows":
+    def of(cls, names: Iterable[str], axes: str) -> "CovarianceRows":
         """Return the rows for the coordinates, in mm, of several named points."""
         return cls(tuple(f"{axis} of {name}" for name in names for axis in axes), NANOMETRE)
 
@@ -287,9 +287,9 @@ TWIST = ("rx", "ry", "rz", "x", "y", "z")
 NANOMETRE = 1e-12  # square of a nanometre in mm²
 NANORADIAN = 1e-18
 """Square of a nanoradian in rad²: a point at a distance of a metre moves by a nanometre."""
-OF_POSE = Rows(TWIST, (*[NANORADIAN] * 3, *[NANOMETRE] * 3))
-OF_POINT = Rows(("x", "y", "z"), NANOMETRE)
-OF_PIXEL = Rows(("x", "y"))
+OF_POSE = CovarianceRows(TWIST, (*[NANORADIAN] * 3, *[NANOMETRE] * 3))
+OF_POINT = CovarianceRows(("x", "y", "z"), NANOMETRE)
+OF_PIXEL = CovarianceRows(("x", "y"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +300,7 @@ class Fault:
     reason: str
 
 
-def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
+def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = False) -> Fault | None:
     """Return the fault of the first of m matrices (m, n, n) that is no covariance, None if all are. A covariance is
     finite, symmetric and without negative eigenvalues of its correlations, up to rounding; without any that are not
     positive if it will be inverted, ``definite``."""
@@ -327,7 +327,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
     return Fault(row, _reason(matrices[row], odd[row], correlation[row], float(lowest[row]), rows, definite) + suffix)
 
 
-def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
+def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, definite: bool = False) -> None:
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
         raise InputError(
@@ -338,7 +338,7 @@ def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool
         raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 
-def _reason(matrix, odd, correlation, lowest: float, rows: Rows, definite: bool) -> str:
+def _reason(matrix, odd, correlation, lowest: float, rows: CovarianceRows, definite: bool) -> str:
     """Return why one matrix is not a covariance; ``odd`` : asymmetry of its correlations."""
     variance, needed = np.diagonal(matrix), "a positive number" if definite else "0 or more"
     if not np.isfinite(matrix).all():

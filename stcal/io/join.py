@@ -17,7 +17,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined(ByValue):
+class JoinedTable(ByValue):
     """Two tables in one.
 
     Parameters
@@ -56,7 +56,7 @@ def join_tables(
     key: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: Order = "wxyz",
-) -> Joined:
+) -> JoinedTable:
     """Returns the rows of two tables that have the same key, side by side, in the order and lines of ``a``.
 
     Parameters
@@ -104,7 +104,7 @@ def join_tables(
             names = ", ".join(unmatched[:SHOWN]) + ", …" * (len(unmatched) > SHOWN)
             notes.append(f"{len(unmatched)} rows of {path} have no partner: {key} {names}")
     where = f"{Path(a).name} with {Path(b).name}"
-    return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
+    return JoinedTable(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
 
 @require_arguments

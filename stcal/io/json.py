@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetCoreSchemaHandle
 from pydantic_core import PydanticCustomError, core_schema
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import OF_POINT, OF_POSE, Rows, frozen, require_covariance
+from stcal.geometry.arrays import OF_POINT, OF_POSE, CovarianceRows, frozen, require_covariance
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, require_unchanged, text_of
 
@@ -141,7 +141,7 @@ class PoseShape(Shape):
 class CovarianceShape(Shape):
     """A covariance: positive semi-definite up to rounding; ``rows`` : names and variances of its rows."""
 
-    rows: Rows
+    rows: CovarianceRows
 
     def checked(self, value: Any) -> np.ndarray:
         try:

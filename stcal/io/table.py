@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import OF_POSE, TWIST, ByValue, Rows, first_fault
+from stcal.geometry.arrays import OF_POSE, TWIST, ByValue, CovarianceRows, first_fault
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 
@@ -170,7 +170,7 @@ class Table(ByValue):
         self.require_covariances(full, OF_POSE)
         return full
 
-    def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
+    def require_covariances(self, full: np.ndarray, rows: CovarianceRows) -> None:
         """Refuse covariances (m, n, n) unless all are positive definite, by the first bad line."""
         if fault := first_fault(full, rows, definite=True):
             where = f"{self.where}: line {self.lines[fault.row]}"

@@ -24,10 +24,10 @@ from stcal.report.document import (
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import MEANING, Observed, State, as_seen, tips_of
-from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
+from stcal.robot.identification.prior import DIMENSIONS, SHOWN, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS
 from stcal.robot.identification.result import ERRORS, Identified
-from stcal.robot.identification.unexplained import Finding
+from stcal.robot.identification.unexplained import Effect
 from stcal.robot.kinematics.forward import joint_motions, links, torques
 from stcal.robot.kinematics.robot_model import Robot
 
@@ -126,7 +126,7 @@ def _verdict(result: Identified) -> Answer:
     return Answer("yes", errs)
 
 
-def left_lines(left: Sequence[Finding] | None) -> list[str]:
+def left_lines(left: Sequence[Effect] | None) -> list[str]:
     """Returns sentences on what residuals depend on."""
     if left is None:
         return ["too few rows to find what the residuals depend on"]
@@ -162,7 +162,7 @@ def _elastic_blocks(result: Identified) -> list[Block]:
     ]
 
 
-def placed_table(placed: Iterable[Placed]) -> Table:
+def placed_table(placed: Iterable[PlacedFrame]) -> Table:
     """Returns value ± σ of translation, mm, and rotation vector, deg, of base and tools; no σ where none is known."""
     rows = []
     for each in placed:
@@ -271,7 +271,7 @@ def joints_figure(
     seen: Observed,
     residuals: np.ndarray,
     good: np.ndarray,
-    findings: Iterable[Finding],
+    findings: Iterable[Effect],
     colour: str = COLOURS[0],
 ) -> Drawing:
     """Returns a figure of residuals (r, w) of good rows (r,), in the world's axes, along each joint's motion by its

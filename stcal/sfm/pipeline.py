@@ -30,7 +30,7 @@ from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
-from stcal.sfm.runs.comparisons import Answer, compare_with_paper
+from stcal.sfm.runs.comparisons import MethodResult, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import RunResult
@@ -247,12 +247,12 @@ def compared(task: Task, result: RunResult) -> RunResult:
         return result
     options = replace(task.options, **published, refine_camera=False, compare=None).settled(task.target)
     task = replace(task.named("{}, as published"), options=options)
-    answer: Answer | StcalError
+    answer: MethodResult | StcalError
     try:
         groups = map_groups(task, groups_of(task, detect_with(task, model)))
         calibration = calibration_by(task, groups)
         models = tuple(solution.model for solution in groups.solutions)
-        answer = Answer(calibration.target, models, calibration.scales)
+        answer = MethodResult(calibration.target, models, calibration.scales)
     except StcalError as error:
         answer = error
     return replace(result, comparison=compare_with_paper(result, answer))

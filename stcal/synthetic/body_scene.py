@@ -95,7 +95,7 @@ class BodyScene:
     options: BodyOptions = field(default_factory=BodyOptions)
     off_mm: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def drawings(self) -> dict[str, "Drawing"]:
+    def drawings(self) -> dict[str, "FacePicture"]:
         """Returns the drawings of the faces, as they are printed."""
         polarity = self.target.polarity
         return {face.id: drawing_of(face, polarity, self.off_mm.get(face.id)) for face in self.target.faces}
@@ -274,7 +274,7 @@ def _lacking(tilts_deg: Sequence[float]) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawing:
+class FacePicture:
     """A face as a picture."""
 
     grey: np.ndarray  # (h, w) brightness
@@ -284,7 +284,7 @@ class Drawing:
     bend: np.ndarray | None = None  # (h, w) mm along Z, None of a plane
 
 
-def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarray | None = None) -> Drawing:
+def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarray | None = None) -> FacePicture:
     """Returns the drawing of a face with the plate about it; ``off_mm`` : (n, 3) how far printed points are off."""
     if face.printed is None:
         around = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
@@ -308,10 +308,10 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarr
     grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
     solid = covered_share([[(plate - low) * px_mm]], size)
     if off_mm is None:
-        return Drawing(grey, solid, px_mm, low)
+        return FacePicture(grey, solid, px_mm, low)
     x, y = (low[k] + (np.arange(n) + 0.5) / px_mm for k, n in ((0, width), (1, height)))
     bend = _off_at(np.stack(np.meshgrid(x, y), axis=-1), face.xy_mm, off_mm[:, 2])
-    return Drawing(grey, solid, px_mm, low, bend.astype(np.float32))
+    return FacePicture(grey, solid, px_mm, low, bend.astype(np.float32))
 
 
 def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.ndarray:
@@ -352,7 +352,7 @@ def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.nd
     return (-added.cumsum(1)[:, :-1]).clip(0, 1).astype(np.float32)
 
 
-def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
+def render_body(scene: BodyScene, image: int, drawings: dict[str, FacePicture]) -> np.ndarray:
     """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face."""
     camera, pose, options = scene.camera, scene.camera_from_target[image], scene.options
     lattice = np.column_stack([np.arange(SAMPLES), LATTICE * np.arange(SAMPLES)]) / SAMPLES

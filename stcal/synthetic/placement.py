@@ -36,15 +36,15 @@ class GroupShape:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Views:
+class _CandidateViews:
     """Candidate views: camera_from_target as rotations (n, 3, 3) and camera centres (n, 3) in the target frame."""
 
     rotations: np.ndarray
     centres: np.ndarray
 
-    def rows(self, index: np.ndarray) -> "_Views":
+    def rows(self, index: np.ndarray) -> "_CandidateViews":
         """Returns the views that a mask or indices select."""
-        return _Views(self.rotations[index], self.centres[index])
+        return _CandidateViews(self.rotations[index], self.centres[index])
 
     def to_camera(self, xyz_target: np.ndarray) -> np.ndarray:
         """Returns points (k, 3) in the frame of every camera, (n, k, 3)."""
@@ -119,7 +119,7 @@ def _board_place(shape: GroupShape, rng) -> Rigid:
     return Rigid(rotation, middle + shift @ shape.axes - rotation @ shape.outline_board.mean(0))
 
 
-def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spread_rad, rng) -> _Views:
+def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spread_rad, rng) -> _CandidateViews:
     azimuth, elevation = rng.uniform(-spread_rad, spread_rad, (2, n))
     local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
     direction = np.column_stack(local) @ shape.axes
@@ -127,7 +127,7 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
     points = np.vstack([shape.body, target_from_board @ shape.outline_board])
     aim = (points.min(0) + points.max(0)) / 2
     centres = aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None]
-    views = _Views(look_along(-direction, shape.axes[1], roll), centres)
+    views = _CandidateViews(look_along(-direction, shape.axes[1], roll), centres)
     free = np.array([camera.width, camera.height]) / camera.focal / 2 - IMAGE_MARGIN * camera.width / camera.focal
     place = rng.uniform(-0.7, 0.7, (n, 2))
     for step in range(3):
@@ -139,7 +139,7 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
         towards_middle = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
         forward = np.einsum("nji,nj->ni", views.rotations, towards_middle)
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        views = _Views(look_along(forward, shape.axes[1], roll), views.centres)
+        views = _CandidateViews(look_along(forward, shape.axes[1], roll), views.centres)
     return views
 
 
@@ -153,7 +153,7 @@ def look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.ndar
     return np.stack([c * x - s * y, s * x + c * y, forward], axis=1)
 
 
-def _board_seen(shape, target_from_board, views: _Views, camera: Camera) -> np.ndarray:
+def _board_seen(shape, target_from_board, views: _CandidateViews, camera: Camera) -> np.ndarray:
     """Returns the mask of the views that show the board, (n,). What takes most time is tested last, of what is left."""
     outline = target_from_board @ shape.outline_board
     # The tangent of the tilt grows with the distance from the camera's foot, which is largest at a corner of the dots.

@@ -78,7 +78,7 @@ def test_six_neighbours_are_one_spacing_away():
     np.testing.assert_allclose(lattice.places_mm(lattice.labels())[:, :2], lattice.xy_mm(), atol=1e-12)
 
 
-@pytest.mark.parametrize(("rows", "tilt"), sampled([(r, t) for r in (7, 8) for t in TILTS], kept=(0, 1, 6, 7)))
+@pytest.mark.parametrize(("rows", "tilt"), sampled([(r, t) for r in (7, 8) for t in TILTS], kept=(1, 7)))
 def test_a_view_has_its_circles_where_they_are(rows, tilt):
     """An even number of rows looks the same after half a turn, an odd one does not."""
     board = HexagonalCirclesDesign(rows, 8, 20.0, 6.0, "dark")
@@ -123,7 +123,7 @@ def with_holes(board: HexagonalCirclesDesign, rings, share: float, tilt, hidden_
     return cv2.resize(fine, image.shape[::-1], interpolation=cv2.INTER_AREA), pose
 
 
-@pytest.mark.parametrize(("share", "tilt"), sampled([(s, t) for s in (0.35, 0.6) for t in TILTS[1:]], kept=(0, 2, 4)))
+@pytest.mark.parametrize(("share", "tilt"), sampled([(s, t) for s in (0.35, 0.6) for t in TILTS[1:]], kept=(2,)))
 def test_rings_tell_the_ends_of_a_board(share, tilt):
     """The board has an even number of rows and looks the same turned, but for its rings."""
     rings = ((1, 2), (1, 3), (4, 6))

@@ -52,6 +52,12 @@ def call_of(command: str, place: str) -> Call:
     return next(call for call in CALLS if call.command == command and place in call.inputs)
 
 
+def answer_of(command: str, place: str) -> Call:
+    """The same without the files that it need not write: mistakes are told in what is printed."""
+    call = call_of(command, place)
+    return replace(call, words=re.sub(r" --(?!out)[a-z]+ >\S+", "", call.words))
+
+
 def rewritten(place: str, change: Callable[[str], str]) -> Edit:
     return lambda read: (read / place).write_text(change((read / place).read_text()))
 
@@ -198,7 +204,7 @@ def camera_times(place: str, size: float, focal: float = 1.0) -> Edit:
 
 def _robot() -> list[Mistake]:
     data, places, robot = "robot/poses.csv", "[xyz]_mm", "robot/robot.toml"
-    identify = call_of("robot identify", data)
+    identify = answer_of("robot identify", data)
     found = [
         Mistake(f"identify: {name}", identify, edit)
         for name, edit in {
@@ -226,7 +232,7 @@ def _robot() -> list[Mistake]:
     ]
     sweeps = "robot/sweeps.csv"
     found += [
-        Mistake(f"axes: {name}", call_of("robot axes", sweeps), edit)
+        Mistake(f"axes: {name}", answer_of("robot axes", sweeps), edit)
         for name, edit in {
             "metres as mm": times(sweeps, places, 1e-3),
             "rad as deg": times(sweeps, r"q\d_deg", np.pi / 180),
@@ -239,7 +245,7 @@ def _robot() -> list[Mistake]:
     ]
     targets = "robot/targets.csv"
     found += [
-        Mistake(f"compensate: {name}", call_of("robot compensate", targets), edit, says=says)
+        Mistake(f"compensate: {name}", answer_of("robot compensate", targets), edit, says=says)
         for name, edit, says in (
             ("metres as mm", times(targets, places, 1e-3), "metres|unit"),
             ("inches as mm", times(targets, places, INCH), "inch|unit"),
@@ -257,7 +263,7 @@ def _robot() -> list[Mistake]:
     ]
     verify, before, after = "robot/verify.csv", "commanded_[xyz]_mm", "[xyz]_mm"
     return found + [
-        Mistake(f"verify: {name}", call_of("robot verify", verify), edit, why)
+        Mistake(f"verify: {name}", answer_of("robot verify", verify), edit, why)
         for name, edit, why in (
             ("commanded in metres", times(verify, before, 1e-3), ""),
             ("measured in metres", times(verify, after, 1e-3), ""),
@@ -279,7 +285,7 @@ def _handeye() -> list[Mistake]:
     robot, board = "handeye/robot.csv", "handeye/board.toml"
     flange, camera = "base_from_flange_", "camera_from_board_"
     found = [
-        Mistake(f"handeye, poses: {name}", call_of("handeye", data), edit, why)
+        Mistake(f"handeye, poses: {name}", answer_of("handeye", data), edit, why)
         for name, edit, why in (
             ("robot in metres", times(data, flange + "[xyz]_mm", 1e-3), ""),
             ("camera in metres", times(data, camera + "[xyz]_mm", 1e-3), ""),
@@ -296,7 +302,7 @@ def _handeye() -> list[Mistake]:
             ("decimal commas", decimal_commas(data), ""),
         )
     ]
-    chessboard, pairs = call_of("handeye", images), call_of("handeye", data)
+    chessboard, pairs = answer_of("handeye", images), answer_of("handeye", data)
     chessboard = replace(chessboard, words=chessboard.words.replace("checker.yaml", "board.toml"))
     found.append(Mistake("handeye: other setup", replace(pairs, words=f"{pairs.words} --setup eye-to-hand"), both()))
     return found + [
@@ -317,7 +323,7 @@ def _handeye() -> list[Mistake]:
 
 
 def _locate() -> list[Mistake]:
-    scenes, images = call_of("locate run", "locate/scenes"), call_of("locate calibrate", "locate/images")
+    scenes, images = answer_of("locate run", "locate/scenes"), answer_of("locate calibrate", "locate/images")
     layout, robot, camera = "locate/layout.toml", "locate/robot.csv", "locate/cameras.txt"
     one = "one pose and no other source: any place within reach may be meant"
     return [
@@ -347,8 +353,8 @@ def _locate() -> list[Mistake]:
 
 
 def _register() -> list[Mistake]:
-    pairs, call = "register/pairs.csv", call_of("register", "register/pairs.csv")
-    arm = call_of("register", "register/arm.csv")
+    pairs, call = "register/pairs.csv", answer_of("register", "register/pairs.csv")
+    arm = answer_of("register", "register/arm.csv")
     found = {
         "a in metres": times(pairs, "a[xyz]_mm", 1e-3),
         "a in inches": times(pairs, "a[xyz]_mm", INCH),

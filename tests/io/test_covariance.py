@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.geometry.arrays import OF_POSE, ROUNDING, Rows, first_fault, require_covariance
+from stcal.geometry.arrays import OF_POSE, ROUNDING, CovarianceRows, first_fault, require_covariance
 from stcal.io.json import Part, PoseCovariance, checked
 from tests.outcome import fails_with, refuses
 
@@ -71,7 +71,7 @@ def test_all_ranks_pass_with_six_digits(seed, rank, size):
     root = rng.standard_normal((size, rank)) * 10.0 ** rng.uniform(-6, 2, size)[:, None]
     full = root @ root.T
     written = np.vectorize(lambda v: float(f"{v:.6g}"))(full)
-    require_covariance((written + written.T) / 2, size, Rows(tuple("abcdefghijkl")))
+    require_covariance((written + written.T) / 2, size, CovarianceRows(tuple("abcdefghijkl")))
 
 
 @given(st.integers(0, 2**32 - 1))

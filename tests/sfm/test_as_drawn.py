@@ -12,10 +12,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
-from stcal.sfm.mapping.body import Corners, place_with_camera, wrong_sizes
+from stcal.sfm.mapping.body import BodyCorners, place_with_camera, wrong_sizes
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import tag_cube
@@ -85,7 +84,7 @@ def test_groups_that_show_other_faces_than_their_names_say():
 
 
 @pytest.mark.parametrize("what", sampled(["size", "id"]))
-def test_one_tag_of_another_size_or_id_is_named(tmp_path, what):
+def test_one_tag_of_another_size_or_id_is_named(tmp_path, no_page, what):
     write_body(
         tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
     )
@@ -95,7 +94,7 @@ def test_one_tag_of_another_size_or_id_is_named(tmp_path, what):
         what
     ]
     (path := tmp_path / "target.toml").write_text(text.replace(old, new), encoding="utf-8")
-    result = pipeline.run(tmp_path / "set/images", None, tmp_path / "run", path, None, RunOptions())
+    result = pipeline.run(tmp_path / "set/images", tmp_path / "set/cameras.txt", tmp_path / "run", path)
     scales = next(check for check in result.checks if check.key == "scales")
     if what == "size":
         assert (scales.verdict, scales.names) == ("failed", ("face 2",))
@@ -129,7 +128,7 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(face
     rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
 
     def named(design: TargetDesign) -> dict[int, float]:
-        return wrong_sizes(Corners.of(noisy, design.faces), rough)[0]
+        return wrong_sizes(BodyCorners.of(noisy, design.faces), rough)[0]
 
     assert named(CUBE) == {}
     drawn = list(CUBE.faces)

@@ -349,8 +349,8 @@ def test_tags_of_other_dictionaries_or_ids_are_named(tmp_path, stcal_sfm):
 
 
 @pytest.mark.slow
-def test_a_run_of_photographs_without_board_and_camera(tmp_path):
-    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=14, distance_mm=300, seed=2))
+def test_a_run_of_photographs_without_board_and_camera(tmp_path, no_page):
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=10, distance_mm=300, seed=2))
     write_body(tmp_path / "set", scene)
     result = pipeline.run(
         tmp_path / "set/images", None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions()
@@ -378,12 +378,12 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
 
 
 @pytest.mark.slow
-def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
+def test_few_photographs_end_in_a_line_or_a_result(tmp_path, no_page):
     """As many as one takes first: what they do not determine is an error, what they do not test is "not possible"."""
     scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=6, distance_mm=300, seed=5))
     write_body(tmp_path / "set", scene)
     solved, refusals = 0, []
-    for count in (2, 4, 6):
+    for count in (2, 6):
         taken = tmp_path / f"{count}"
         taken.mkdir()
         for path in sorted((tmp_path / "set/images").iterdir())[:count]:
@@ -398,7 +398,7 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
             assert tested or result.judgement.verdict != "yes"
             named = {name for s in result.solutions for name in (*s.left_out, *s.model.images)}
             assert named == {image.observations.name for image in result.labelled}
-    assert 0 < solved < 3
+    assert (solved, len(refusals)) == (1, 1)
     assert all("; add " in line or "take " in line for line in refusals), refusals
 
 
@@ -412,7 +412,7 @@ def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
+def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path, no_page):
     """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
     options = BodyOptions(images=7, distance_mm=420, seed=4, noise=0.005)
     scene = make_body_scene(second_design()[0], body_camera(560), options)

@@ -118,18 +118,6 @@ def test_simulate_says_which_faces_have_no_place(command, designs, tmp_path):
     assert f"does not say where face {second.id} is; add approximate rough_pose = {{ origin_mm, x, normal }}" in err
 
 
-@pytest.mark.full
-def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
-    code, text, _ = command("demo", "--out", tmp_path / "demo")
-    assert code == 0
-    assert "simulated" in text
-    from stcal.sfm.report.compare import compare
-
-    comparison = compare(tmp_path / "demo" / "run", tmp_path / "demo" / "data" / "truth.json").content()
-    for face_id in ("2", "3", "4", "5"):
-        assert 0.1 < comparison["faces"][face_id]["normalised_error"] < 2.0
-
-
 def test_versions_for_reports_of_faults(command, monkeypatch):
     """Also where COLMAP is not there, or a library does not load."""
     code, out, _ = command("--versions", entry=main)

@@ -179,9 +179,9 @@ def test_the_published_method_needs_dots(option):
 @pytest.mark.parametrize(
     "kind", ["charuco", *(pytest.param(kind, marks=pytest.mark.full) for kind in BOARDS if kind != "charuco")]
 )
-def test_faces_beside_a_board_of_corners_are_right(tmp_path, kind):
+def test_faces_beside_a_board_of_corners_are_right(tmp_path, no_page, kind):
     board = BOARDS[kind]
-    scene = scene_with(board, seed=5, width=1728, height=1152, images_per_group=4)
+    scene = scene_with(board, seed=5, width=1728, height=1152, images_per_group=3)
     data = tmp_path / "data"
     write_dataset(data, scene, image_format="png")
     for group, where in scene.groups.items():

@@ -75,9 +75,9 @@ def test_design_target(stcal_sfm, monkeypatch, tmp_path):
 
 
 def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
-    words = "--images", "10", "--distance", "300", "--width", "900"
+    words = "--images", "6", "--distance", "300", "--width", "900"
     _, said, _ = stcal_sfm("design", tmp_path / "one", "--tags", "cube", "--size", "50", *words)
-    session = sfm.PlanOptions(10, distance_mm=300.0, width=900)
+    session = sfm.PlanOptions(6, distance_mm=300.0, width=900)
     found = sfm.design_tag_body("cube", 50.0, session=session)
     assert plan_text(found.forecast, found.source) in said
     assert found.files == ()

@@ -15,6 +15,7 @@ from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, second_design
+from tests.levels import FULL, SLOW
 from tests.outcome import fails_with
 
 CIRCLES = AsymmetricCirclesDesign(11, 5, 20.0, 6.0, "dark")
@@ -46,9 +47,8 @@ SETS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SETS)
-def test_labels_are_right_and_faces_within_their_sigma(tmp_path, name):
+@pytest.mark.parametrize("name", [pytest.param(name, marks=FULL if name.startswith("hex") else SLOW) for name in SETS])
+def test_labels_are_right_and_faces_within_their_sigma(tmp_path, no_page, name):
     make, most_um = SETS[name]
     scene, data, out = make(), tmp_path / "data", tmp_path / "run"
     write_dataset(data, scene, RenderOptions(seed=1), image_format="png")

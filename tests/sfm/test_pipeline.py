@@ -9,42 +9,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.sfm import run
 from stcal.sfm.adjust.refine import adjust, find_scale
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.pairs import PairOptions, rank_pairs
-from stcal.sfm.report.compare import compare
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.shared import own_copy
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
-    """The reference design in clutter, at a third of the paper's width."""
-    folder = tmp_path_factory.mktemp("pipeline")
-    scene = make_scene(SceneOptions(seed=11, width=1620, height=1080, images_per_group=4))
-    write_dataset(folder / "data", scene, RenderOptions(clutter=True, seed=11))
-    data = folder / "data"
-    result = run(data / "images", data / "cameras.txt", folder / "run", data / "target.toml", data / "board.toml")
-    return data, result
-
-
-@pytest.mark.slow
-def test_cluttered_photographs_are_labelled_without_a_mistake_and_errors_are_as_sigma_predicts(calibrated):
-    data, result = calibrated
-    found = compare(result.out, data / "truth.json").content()
-    labels, faces = found["labels"], found["faces"]
-    assert labels["wrong"] == 0
-    assert labels["found"] / labels["visible"] >= 0.97
-    assert set(faces) == {"1", "2", "3", "4", "5"}
-    for face_id in ("2", "3", "4", "5"):
-        # χ²₆/6 of a true covariance exceeds 4 once in 2000 draws.
-        assert 0.1 < faces[face_id]["normalised_error"] < 2.0
-        assert faces[face_id]["translation_um"] < 25
-    assert result.calibration.joint.sigma0 == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_result_shows_itself_in_a_line_and_in_a_notebook(small_result):

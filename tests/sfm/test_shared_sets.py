@@ -87,7 +87,7 @@ def test_the_native_program_agrees(rendered):
 
 
 @pytest.mark.slow
-def test_the_uncorrected_control_shows_the_bias_that_residuals_hide(shared_data, tmp_path):
+def test_the_uncorrected_control_shows_the_bias_that_residuals_hide(shared_data, no_page, tmp_path):
     """The bias r²cosθ/D is 40–64 µm for the big circles at 0–50° and 1 m; a face is one circle against another's."""
     folder = shared_data("stereo_target/clean")
     result = run(folder / "images", folder / "cameras.txt", tmp_path / "run", options=RunOptions(eccentricity=False))
@@ -104,15 +104,16 @@ DOTGRID = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner=(9, 0), corner_rad
 
 
 def dotgrid_images(shared_data):
+    """Every third of fifteen."""
     folder = shared_data("dotgrid_handeye/images")
-    return [(path.stem, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))]
+    return [(path.stem, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))[::3]]
 
 
 @pytest.mark.slow
 def test_all_photographed_boards_are_found_and_oriented(shared_data):
     camera = Camera(640, 480, [542.324, 543.515], [320.474, 226.039], np.zeros(8))
     images = dotgrid_images(shared_data)
-    assert len(images) == 15
+    assert len(images) == 5
     for name, image in images:
         found = detect_image(image, camera, reference_target(), DOTGRID, EllipseOptions())
         assert found.board is not None

@@ -22,7 +22,7 @@ BY_DEFAULT = "by default"
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownName:
     """``name`` of a transform, of :data:`EVERY_FRAME`, or of a unit, of :data:`stcal.io.table.LENGTHS`; ``by`` : how it
     is known, in words; ``stated`` : whether the file itself states it, so that an option cannot contradict it."""
 
@@ -52,8 +52,8 @@ class PoseSide:
     poses: Poses
     places: tuple[str, ...]
     turned: str
-    unit: Known | None = None
-    frames: Known | None = None
+    unit: KnownName | None = None
+    frames: KnownName | None = None
     names: tuple[str, ...] = ()
     trajectory: bool = False
     covariance: np.ndarray | None = None
@@ -144,7 +144,7 @@ class Said:
         for unit in (self.length_unit, *(own.get("length_unit") for own in self.own.values())):
             if unit and unit not in LENGTHS:
                 raise InputError("E-OPTION-VALUE", f"--length-unit {unit}: unknown; {', '.join(LENGTHS)} needed")
-        if len({Known(name, "").role for name in self.frames}) < len(self.frames):
+        if len({KnownName(name, "").role for name in self.frames}) < len(self.frames):
             raise InputError("E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each side at most")
 
     def frames_of(self, role: Role) -> str | None:
@@ -201,21 +201,21 @@ ROLES_BY_NAME: dict[Role, re.Pattern] = {
 """Names that tell whether poses are the robot's or the camera's, but not in which direction."""
 
 
-def frames_of(key: object) -> Known | None:
+def frames_of(key: object) -> KnownName | None:
     """Returns the transform that a name means, or, not stated, the one by default of the side that it names; None where
     it means none."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
-        return Known(name, f"by its name {key}")
+        return KnownName(name, f"by its name {key}")
     for form, order, only in _FORMS:
         if match := form.fullmatch(_PART.sub("", name, count=1)):
             sides = {part[0]: part[2:] for part, text in match.groupdict().items() if text is not None}
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
-                return Known(frames, f"by its name {key}", only)
+                return KnownName(frames, f"by its name {key}", only)
     for role in ROLES:
         if ROLES_BY_NAME[role].fullmatch(name):
-            return Known(FRAMES[role][0], BY_DEFAULT, False)
+            return KnownName(FRAMES[role][0], BY_DEFAULT, False)
     return None
 
 
@@ -240,7 +240,7 @@ LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timesta
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
 SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
 """Setups by easy_handeye's names of them."""
-ROS = Known("m", "as in ROS", False)
+ROS = KnownName("m", "as in ROS", False)
 
 
 def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
@@ -307,7 +307,7 @@ def _name_in(value: Mapping) -> str:
     return next((str(v).strip() for v in given if isinstance(v, str | int | float) and not isinstance(v, bool)), "")
 
 
-def _side_of(value: Any, where: str, frames: Known | None = None) -> PoseSide | None:
+def _side_of(value: Any, where: str, frames: KnownName | None = None) -> PoseSide | None:
     """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping) and _matrix(value) is not None:
@@ -360,12 +360,12 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
     fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
     by = "as easy_handeye writes it"
-    frames = Known(FRAMES["robot"][fixed], f"{by} of {of_setup}", False), Known("camera_from_board", by, False)
+    frames = KnownName(FRAMES["robot"][fixed], f"{by} of {of_setup}", False), KnownName("camera_from_board", by, False)
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
     return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
 
 
-def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
+def _of_messages(values: Any, where: str, frames: KnownName) -> PoseSide:
     """Returns the poses of a list of ROS's transforms, metres."""
     if not isinstance(values, list) or not values:
         raise InputError("E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; save them anew")
@@ -388,7 +388,7 @@ def _of_messages(values: Any, where: str, frames: Known) -> PoseSide:
 def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
     """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
-    named: dict[str, Known] = {}
+    named: dict[str, KnownName] = {}
     others, names = [], ()
     for key, item in value.items():
         if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
@@ -423,7 +423,7 @@ def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
     return PoseContent("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
-def _of_rotations(parts: dict[str, Any], where: str, frames: Known) -> PoseSide:
+def _of_rotations(parts: dict[str, Any], where: str, frames: KnownName) -> PoseSide:
     """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
     arrays: dict[str, np.ndarray] = {}
     for key, item in parts.items():

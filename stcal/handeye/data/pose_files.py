@@ -20,7 +20,7 @@ from stcal.geometry.rigid import Order, Poses
 from stcal.handeye.data.pose_content import (
     EVERY_FRAME,
     FRAMES,
-    Known,
+    KnownName,
     PoseContent,
     PoseSide,
     Role,
@@ -66,7 +66,7 @@ def todays(table: Table) -> bool:
 def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
     """Returns the poses in the columns of a table; None where it has none."""
     names, sides = _row_names(table, key), []
-    prefixes = {f"{frame}_": Known(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
+    prefixes = {f"{frame}_": KnownName(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
     for prefix, frames in (*prefixes.items(), ("", None)):
         if (sides and not prefix) or (place := _place(table, prefix)) is None:
             continue
@@ -97,14 +97,14 @@ def _row_names(table: Table, key: str) -> tuple[str, ...]:
     return values if len(set(values)) == len(table) else ()
 
 
-def _place(table: Table, prefix: str) -> tuple[np.ndarray, Known | None] | None:
+def _place(table: Table, prefix: str) -> tuple[np.ndarray, KnownName | None] | None:
     for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
         for unit in (*LENGTHS, ""):
             names = (form.format(axis) + f"_{unit}" * bool(unit) for axis in "xyz")
             present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
             if len(present) == len("xyz"):
                 values = np.column_stack([table.numbers(column) for column in present])
-                return values, Known(unit, "by the columns") if unit else None
+                return values, KnownName(unit, "by the columns") if unit else None
             if present and unit and form == "{}":
                 alone = f"{table.where}: {', '.join(present)} alone"
                 raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
@@ -258,7 +258,7 @@ def _of_tum(file: File) -> PoseContent:
             order = list(said_convention(file.said.rotation, what, file.where, len("wxyz")).order)
     require_each_once(names, places, file.where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
-    turned, unit = f"quaternions {', '.join(order)}", Known("m", "as in TUM", False)
+    turned, unit = f"quaternions {', '.join(order)}", KnownName("m", "as in TUM", False)
     poses = Poses(of_quaternions(wxyz, places, file.where), values[:, 1:4])
     side = PoseSide(poses, places, turned, unit, names=names, trajectory=True)
     return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
@@ -540,7 +540,7 @@ def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> P
     return replace(side, poses=poses, covariance=covariance, common=common, **read)
 
 
-def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Known:
+def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> KnownName:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option, frames = statements.frames_of(role), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
@@ -551,19 +551,19 @@ def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Know
         )
         raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
     if option is not None:
-        return Known(option, "as you say")
+        return KnownName(option, "as you say")
     if frames is None and side.trajectory and role == "camera":
-        return Known("board_from_camera", "by default, the camera's trajectory")
-    return frames or Known(FRAMES[role][0], "by default")
+        return KnownName("board_from_camera", "by default, the camera's trajectory")
+    return frames or KnownName(FRAMES[role][0], "by default")
 
 
-def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Known, str]:
+def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[KnownName, str]:
     """Returns the unit, and its name again if it was guessed from the size of lengths."""
     option = statements.length_unit
     if side.unit is not None and (option is None or side.unit.stated):
         return side.unit, ""
     if option is not None:
-        return Known(option, "as you say", False), ""
+        return KnownName(option, "as you say", False), ""
     distances = np.linalg.norm(side.poses.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
@@ -577,4 +577,4 @@ def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Know
             f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
         )
     guess = "m" if farthest <= METRES_UP_TO else "mm"
-    return Known(guess, f"by their size, up to {farthest:.4g}", False), guess
+    return KnownName(guess, f"by their size, up to {farthest:.4g}", False), guess

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote, named
-from stcal.geometry.arrays import ByValue, Rows, require_covariance, require_fields
+from stcal.geometry.arrays import ByValue, CovarianceRows, require_covariance, require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
@@ -175,7 +175,7 @@ def stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
                 needed = f"a positive number up to {MAX_SIDE_PX}, and 1 needed"
                 raise InputError("E-CAMERA-COVARIANCE", f"{measured}; {needed}")
         covariance = correlation * np.outer(sigma, sigma)
-        require_covariance(covariance, count, Rows(tuple(names)), definite=True)
+        require_covariance(covariance, count, CovarianceRows(tuple(names)), definite=True)
     except (InputError, ValueError) as error:
         none = f"SIGMA and CORRELATION state no covariance of its parameters: {error}"
         raise InputError("E-CAMERA-COVARIANCE", f"{none}; write it again, or remove these comments") from error

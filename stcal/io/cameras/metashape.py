@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Rows, require_covariance
+from stcal.geometry.arrays import CovarianceRows, require_covariance
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv
 from stcal.io.cameras.foreign_lenses import ForeignLens, one_of, refused, require_finite
@@ -114,7 +114,7 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> Camera
         if not names or set(names) - set(NAMES) or len(set(names)) < len(names) or len(matrix) != len(names) ** 2:
             raise InputError("E-CAMERA-COVARIANCE", f"{len(names)} parameters, {len(matrix)} numbers")
         matrix = matrix.reshape(len(names), -1)
-        require_covariance(matrix, len(names), Rows(tuple(names)))
+        require_covariance(matrix, len(names), CovarianceRows(tuple(names)))
     except (InputError, ValueError) as error:
         raise InputError("E-CAMERA-COVARIANCE", f"<covariance>: {error}; export the cameras again") from error
     if "b2" in names:

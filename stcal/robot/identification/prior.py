@@ -279,7 +279,7 @@ def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedFrame:
     """The pose of the base in the instrument's frame, a tool in the flange's, a station in the first one's, or the
     start of a branch. ``sigma`` : (6,) of its rotation (rad, about the outer frame's axes) and translation (mm); nan
     where it was not fitted."""
@@ -289,7 +289,9 @@ class Placed:
     sigma: np.ndarray
 
 
-def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
+def placed(
+    state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot
+) -> tuple[PlacedFrame, ...]:
     """Returns base, tools, stations and starts of branches with σ; nan where the observations do not tell them."""
 
     def poses(at: State) -> Poses:
@@ -318,4 +320,4 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
             f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
             for i, (after, _) in nominal.tree.mounts.items()
         ]
-    return tuple(Placed(*station) for station in zip(names, current, sigma, strict=True))
+    return tuple(PlacedFrame(*station) for station in zip(names, current, sigma, strict=True))

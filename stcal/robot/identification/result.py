@@ -26,9 +26,9 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tip_jacobian,
 )
-from stcal.robot.identification.prior import Adjusted, Placed, dh_values
+from stcal.robot.identification.prior import Adjusted, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS, ArmSolution
-from stcal.robot.identification.unexplained import Finding
+from stcal.robot.identification.unexplained import Effect
 from stcal.robot.kinematics.robot_file import WRITTEN_MM, RobotText, load_robot
 from stcal.robot.kinematics.robot_model import USUAL, Conditions, Elasticity, Robot
 
@@ -176,7 +176,7 @@ class Predicted:
     left_mm: float = 0.0
 
     @classmethod
-    def of(cls, state: State, robot: Robot, seen: Observed, covariance: np.ndarray, left: Sequence[Finding]):
+    def of(cls, state: State, robot: Robot, seen: Observed, covariance: np.ndarray, left: Sequence[Effect]):
         """Returns σ for the target of most rows; None for distances, which do not place the arm."""
         if seen.kind == "distance":
             return None
@@ -263,8 +263,8 @@ class Identified(Brief):
     nominal_mm: np.ndarray
     held_out: HeldOutRows | None
     predicted: Predicted | None
-    placed: tuple[Placed, ...]
-    left: tuple[Finding, ...] | None
+    placed: tuple[PlacedFrame, ...]
+    left: tuple[Effect, ...] | None
     dh_sigma: np.ndarray
     observability: ObservabilityIndices
     deviations: dict[str, float | None]
@@ -381,7 +381,7 @@ class IdentifiedFile(ResultFile):
     )
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
     dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
-    placed: list[Annotated[Placed, Named()]] = Field(
+    placed: list[Annotated[PlacedFrame, Named()]] = Field(
         description="base in the instrument's frame, tools in the flange's: `name`, `pose` (mm), `sigma` of rotation "
         "(rad, about the outer frame's axes) and translation (mm); null where not determined"
     )
@@ -392,7 +392,7 @@ class IdentifiedFile(ResultFile):
     lines: list[int] = Field(validation_alias=AliasPath("seen", "lines"), description="of the observations in the file")
     fitted_mm: Vector = Field(description="their errors")
     weights: Vector = Field(description="their weights; below a half: outliers")
-    left: list[Finding] | None = Field(
+    left: list[Effect] | None = Field(
         description="what the residuals go with: `what` in words, `joint` and `turns` (0: none), `effect_mm`, "
         "`effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the number of tests, "
         "`line` of the first row after a jump, `advice`; null where rows are too few to tell"

@@ -38,7 +38,7 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Effect:
     """An effect found in the residuals; the result file of ``identify`` describes the fields (``left``)."""
 
     what: str
@@ -67,7 +67,7 @@ def left(
     weighting: Weighting,
     explained: np.ndarray | None = None,
     weights: np.ndarray | None = None,
-) -> tuple[Finding, ...] | None:
+) -> tuple[Effect, ...] | None:
     """Returns the effects found in the residuals of ``state``, at most three, the strongest first; None for too few
     rows.
 
@@ -85,7 +85,7 @@ def left(
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
     weights = np.ones(len(rows.errors)) if weights is None else weights
     rest = _Rest.of(rows, explained, candidates, np.sqrt(weights) * (weights >= GROSS))
-    findings: list[Finding] = []
+    findings: list[Effect] = []
     while len(findings) < MOST:
         tried = rest.strongest(len(order)), _moved_meanwhile(rows, order, explained, len(candidates) + len(order))
         found = min((each for each in tried if each is not None), key=lambda each: each.log_p, default=None)
@@ -128,7 +128,7 @@ class _Found:
     """A finding with the logarithm of its probability by chance and its ``motions`` (r, w, c). ``root`` : (r,) 1 for
     rows that are no errors beside it, else 0; ``rest`` : the residuals without it where all of these rows stay."""
 
-    finding: Finding
+    finding: Effect
     log_p: float
     motions: np.ndarray
     root: np.ndarray
@@ -193,7 +193,7 @@ class _Rest:
         freedom = self.freedom - new.shape[1]
         rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
         p = float(np.exp(min(log_p, 0.0)))
-        finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
+        finding = Effect(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
         return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
 
     def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
@@ -276,12 +276,12 @@ def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarra
         what = f"the order of the rows, {moved.what} from line {line}{likely} on"
     log_p = change.log_p + float(np.log(tests))
     p = float(np.exp(min(log_p, 0.0)))
-    finding = Finding(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
+    finding = Effect(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
     taken = change.moves[:, None, None] * moved.motions
     return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
 
 
-def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
+def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Effect | None:
     """Returns the jump or drift along the rows, of equal σ; None without one of more than ``share`` of the squares."""
     order, rows = _order(state, measured), _Weighted(residuals(state, measured), Weighting(1.0, 1.0), measured)
     found = _moved_meanwhile(rows, order, jacobian(state, measured), len(order))

@@ -35,10 +35,10 @@ from stcal.robot.identification.adjustment import (
     tips_of,
     tool_motions,
 )
-from stcal.robot.identification.prior import Placed
+from stcal.robot.identification.prior import PlacedFrame
 from stcal.robot.identification.result import Figures
 from stcal.robot.identification.start import Fit, start
-from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
+from stcal.robot.identification.unexplained import LEAST_FREEDOM, Effect, left
 from stcal.robot.kinematics.measurements import Measurements, unread
 from stcal.robot.kinematics.robot_model import Robot
 
@@ -339,9 +339,9 @@ class Evaluated:
     residuals: np.ndarray
     good: np.ndarray
     rotation_rad: np.ndarray
-    placed: tuple[Placed, ...]
-    left: tuple[Finding, ...] | None
-    beyond: tuple[Finding, ...] | None
+    placed: tuple[PlacedFrame, ...]
+    left: tuple[Effect, ...] | None
+    beyond: tuple[Effect, ...] | None
 
     @property
     def name(self) -> str:
@@ -518,7 +518,7 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
 
 def _placed(
     state: State, base: Rigid, found: np.ndarray, fitted: np.ndarray, fit: Fit, with_base: bool
-) -> tuple[Placed, ...]:
+) -> tuple[PlacedFrame, ...]:
     """Returns the placements with σ from the residuals ``found`` (r, w) and the derivatives ``fitted`` (r, w, k)."""
     flat, k = fitted.reshape(found.size, -1), fitted.shape[2]
     size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
@@ -528,13 +528,13 @@ def _placed(
     at, placed = 0, []
     if with_base:
         at = 6 * ("base" in fit)
-        placed.append(Placed("base", base, np.sqrt(np.diag(covariance)[:6]) if at else np.full(6, np.nan)))
+        placed.append(PlacedFrame("base", base, np.sqrt(np.diag(covariance)[:6]) if at else np.full(6, np.nan)))
     for name, tool in state.tools.items():
         sigma = np.full(6, np.nan)
         if "tool" in fit:
             own = tool.rotation @ covariance[at : at + 3, at : at + 3] @ tool.rotation.T
             sigma[3:], at = np.sqrt(np.diag(own)), at + 3
-        placed.append(Placed(f"tool {name}".rstrip(), tool, sigma))
+        placed.append(PlacedFrame(f"tool {name}".rstrip(), tool, sigma))
     return tuple(placed)
 
 

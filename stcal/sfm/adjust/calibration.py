@@ -22,7 +22,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceInGroup, FrameKind
 from stcal.sfm.adjust.equations import CIRCLES, UNKNOWN_SHAPES
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.refine import Scale, adjust, eccentricity_px, find_scale, free_network
-from stcal.sfm.adjust.uncertainty import calibrated_target, centre_sigma_px, result_of, with_scatter
+from stcal.sfm.adjust.uncertainty import calibrated_target, centre_sigma_px, widened_result, with_scatter
 from stcal.sfm.data.group_model import GroupModel, M, MetricModel, WorldModel
 
 FLATNESS_MM = 0.02  # σ of the circles off the plane of their face where none is stated
@@ -156,7 +156,7 @@ def calibrate(
     if joint_rounds:
         state, factors = _adjust_all(metric, factors, camera, target, board, options, prior, joint_rounds, step)
         state = with_scatter(state, calibrated, target, options.frame)
-        joint = result_of(state)
+        joint = widened_result(state)
         calibrated = calibrated_target(joint, calibrated, target, options.frame, state)
         circle_sigma_px = joint.sigma_scale * centre_sigma_px(state, CIRCLES)
         step(None)

@@ -82,7 +82,7 @@ class RowsOfView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Group:
+class GroupPart:
     """One group of the joint adjustment, with e dots."""
 
     model: MetricModel  # at the start
@@ -142,7 +142,7 @@ AS_STATED, UNKNOWN_SHAPES = ShapeFactors(), ShapeFactors(amplitude=1.0)
 class Setting:
     """Constants of one minimisation."""
 
-    groups: tuple[Group, ...]
+    groups: tuple[GroupPart, ...]
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
     common: float
@@ -197,7 +197,7 @@ class Setting:
             parts.append(a)
         return Joined(parts, SHARED if self.common else SHARED[:2], free_directions)
 
-    def _add(self, a: Adjustment, group: Group, values: Mapping[str, Any], circles: Block, camera: Block) -> None:
+    def _add(self, a: Adjustment, group: GroupPart, values: Mapping[str, Any], circles: Block, camera: Block) -> None:
         model, few = group.model, is_dots_first_cheaper(group)
         poses = a.block(group.name(POSES), values[group.name(POSES)], eliminate=not few)
         points = [(CIRCLES, self.labels, circles)]
@@ -231,13 +231,13 @@ class Setting:
         a.factor(residuals, ends, self.own_sigma_mm(), derivatives, kind=BOARD)
 
 
-def is_dots_first_cheaper(group: Group) -> bool:
+def is_dots_first_cheaper(group: GroupPart) -> bool:
     """True if the cameras of a group are fewer unknowns than its dots."""
     return 6 * len(group.model.images) < 3 * len(group.dots)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shape:
+class KnownShape:
     """The n points of a face of known shape against its design, which is laid over them with their weights."""
 
     members: np.ndarray  # (n,) indices among the circles
@@ -259,7 +259,7 @@ class Shape:
         weight: np.ndarray,
         size_sigma: float,
         amplitude: float = AMPLITUDES[0],
-    ) -> "Shape":
+    ) -> "KnownShape":
         """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size; ``amplitude`` : of the
         smooth deviations of its print."""
         modes = PrintModes.of(design[:, :2])
@@ -398,7 +398,7 @@ def planes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
         yield members, slope, across @ (own @ normal), setting.flatness_mm
 
 
-def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
+def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownShape]:
     """Yields the faces of known shape, with their stated σ; none for a state that a step has sent to infinity."""
     if not np.isfinite(xyz).all():
         return
@@ -411,7 +411,7 @@ def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
         weight = np.tile([within**-2, within**-2, 0.0 if np.isinf(off) else off**-2], (len(members), 1))
         try:
             size_sigma = alone * face.size_sigma
-            yield Shape.of(members, design, xyz[members], weight, size_sigma, setting.factors.amplitude)
+            yield KnownShape.of(members, design, xyz[members], weight, size_sigma, setting.factors.amplitude)
         except DegenerateError:  # corners on a line
             continue
 

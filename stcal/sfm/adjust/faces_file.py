@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from stcal.boards.target_file import load_target
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, Rows, freeze, frozen, require_arguments, require_covariance
+from stcal.geometry.arrays import Brief, CovarianceRows, freeze, frozen, require_arguments, require_covariance
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.json import (
@@ -68,7 +68,7 @@ class JointCovariance(Part):
             count = len(self.upper_triangle)
             raise mistake(f"upper_triangle of {count} numbers, {needed} needed for {size}×{size}")
         try:
-            require_covariance(self.matrix(), size, Rows.of(self.labels, "xyz"))
+            require_covariance(self.matrix(), size, CovarianceRows.of(self.labels, "xyz"))
         except InputError as error:
             raise mistake(error) from error
         return self
@@ -201,7 +201,7 @@ class TargetCircles(Brief):
         freeze(self, "radius", (c,), "radii")
         freeze(self, "covariance", (3 * c, 3 * c), "circles' covariance")
         try:
-            require_covariance(self.covariance, 3 * c, Rows.of(self.labels, "xyz"))
+            require_covariance(self.covariance, 3 * c, CovarianceRows.of(self.labels, "xyz"))
         except InputError as error:
             raise InputError(error.code, f"circles' covariance: {error}; make the run again") from error
         object.__setattr__(self, "place", {label: i for i, label in enumerate(self.labels)})

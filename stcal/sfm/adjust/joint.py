@@ -22,7 +22,7 @@ from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust import equations
-from stcal.sfm.adjust.equations import CIRCLES, Group, Setting, ShapeFactors
+from stcal.sfm.adjust.equations import CIRCLES, GroupPart, Setting, ShapeFactors
 from stcal.sfm.adjust.refine import EXACTLY, MIN_DOTS
 from stcal.sfm.data.group_model import MetricModel
 
@@ -105,8 +105,8 @@ class Adjusted:
         return self.setting.camera(self.solution.values)
 
     def result(self, sigma0: float | None = None) -> JointResult:
-        """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``. ``sigma0``: of
-        the residuals if None."""
+        """Returns the result with the covariances of independent errors; see :func:`.uncertainty.widened_result`.
+        ``sigma0``: of the residuals if None."""
         setting, solution, values = self.setting, self.solution, self.solution.values
         groups, xyz = setting.groups, values[CIRCLES].array
         flat = sum(len(members) - 3 for members, *_ in equations.planes(xyz, setting)) + sum(
@@ -317,7 +317,7 @@ def _descent(setting: Setting, values: Values, settled: float) -> Minimum[Values
     )
 
 
-def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Group:
+def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> GroupPart:
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
@@ -331,7 +331,7 @@ def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
         return _group(model.without(np.isin(model.point_index, dots)), board, labels)
     design = board.places_mm(model.labels[i] for i in dots)
     cells = dot_cells(model.labels[i] for i in dots)
-    return Group(
+    return GroupPart(
         model,
         align_rigid(model.xyz_model[dots], design) if len(dots) else Rigid(),
         design,

@@ -188,7 +188,7 @@ class Contributions:
     centre_sigma_px: dict[str, float]  # of circles and of dots, RMS per axis, scaled by σ₀
 
 
-def result_of(state: Adjusted, covariance: dict[str, np.ndarray] | None = None) -> JointResult:
+def widened_result(state: Adjusted, covariance: dict[str, np.ndarray] | None = None) -> JointResult:
     """Returns the result of an adjustment, with covariances by how much its photographs differ."""
     joint, variance = state.result(), state.differ**2
     if variance > 1:
@@ -206,7 +206,7 @@ def result_of(state: Adjusted, covariance: dict[str, np.ndarray] | None = None) 
 def contributions_of(state: Adjusted) -> Contributions:
     """Splits the covariance at the minimum of an adjustment into the contributions of the observations."""
     covariance, by_scale, by_intrinsics = _parts_of(state)
-    joint = result_of(state, covariance)
+    joint = widened_result(state, covariance)
     variance = joint.sigma_scale**2
     return Contributions(
         joint,

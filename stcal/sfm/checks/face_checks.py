@@ -18,7 +18,7 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.refine import Network
-from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
+from stcal.sfm.adjust.uncertainty import calibrated_target, widened_result
 from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
@@ -39,7 +39,7 @@ def _adjusted(evidence: Evidence, whole: JointResult, models: Iterable[MetricMod
     models = [model for model in models if model.images]  # a part of a group may hold no two images of a point
     try:
         part = adjust_part(models, evidence.board, evidence.options.flatness_mm, whole) if models else None
-        return result_of(part) if part else _unfixed(models)
+        return widened_result(part) if part else _unfixed(models)
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:

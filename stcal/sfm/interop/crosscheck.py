@@ -33,7 +33,7 @@ from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seed
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import with_judgement
 from stcal.sfm.runs.comparisons import (
-    CameraDifference,
+    CameraRow,
     Crosscheck,
     FaceDifference,
     FacesCompared,
@@ -467,7 +467,7 @@ def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float
     return float(np.sqrt(off @ np.linalg.solve(covariance + np.diag(floor**2), off) / len(off)))
 
 
-def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDifference]:
+def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
     """Returns the differences of camera positions and attitudes relative to the target; those in σ are relative to the
     circles of their group, the covariances' datum."""
     factors = run.sigma_factors()
@@ -489,7 +489,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
                 continue
             um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
             sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
-            rows.append(CameraDifference(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
+            rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
     return sorted(rows, key=lambda row: row.image)
 
 

@@ -56,7 +56,7 @@ FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Corners:
+class BodyCorners:
     """n corners of known faces in the images."""
 
     images: tuple[str, ...]
@@ -69,7 +69,7 @@ class Corners:
     root: np.ndarray  # (n, 2, 2) whitens residuals in px
 
     @classmethod
-    def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "Corners":
+    def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "BodyCorners":
         """Returns the corners of views with at least four corners of a face."""
         place: dict[Label, tuple[int, int]] = {
             label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
@@ -87,7 +87,7 @@ class Corners:
         root, xy_px = np.linalg.inv(np.linalg.cholesky(covariance)), np.concatenate([each.centre_px for each in seen])
         return cls(tuple(each.name for each in observations), tuple(faces), image, face, corner, xy, xy_px, root)
 
-    def select(self, keep: np.ndarray) -> "Corners":
+    def select(self, keep: np.ndarray) -> "BodyCorners":
         """Returns the corners of a mask."""
         arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "corner", "xy_face", "xy_px", "root")}
         return replace(self, **arrays)
@@ -108,21 +108,21 @@ class Body:
     placed_images: np.ndarray
     cost: float = np.inf  # of all corners of placed faces in placed images, in σ²
 
-    def xyz_camera(self, corners: Corners) -> np.ndarray:
+    def xyz_camera(self, corners: BodyCorners) -> np.ndarray:
         """Returns the corners in the frames of the cameras, (n, 3)."""
         xyz_body = self.body_from_face[corners.face] @ corners.xyz_face()
         return self.camera_from_body[corners.image] @ xyz_body
 
-    def lengths(self, corners: Corners) -> np.ndarray:
+    def lengths(self, corners: BodyCorners) -> np.ndarray:
         """Returns the lengths of the residuals in σ, (n,); infinite behind a camera."""
         return _lengths(self.xyz_camera(corners), corners, self.camera)
 
-    def used(self, corners: Corners) -> np.ndarray:
+    def used(self, corners: BodyCorners) -> np.ndarray:
         """Returns the mask of the corners of placed faces in placed images, (n,)."""
         return self.placed_faces[corners.face] & self.placed_images[corners.image]
 
 
-def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.ndarray:
+def _lengths(xyz_camera: np.ndarray, corners: BodyCorners, camera: Camera) -> np.ndarray:
     ahead = xyz_camera[:, 2] > 0
     safe = np.where(ahead[:, None], xyz_camera, [0.0, 0.0, 1.0])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -131,9 +131,9 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
     return np.where(ahead & np.isfinite(length), length, np.inf)
 
 
-def place_body(corners: Corners, camera: Camera) -> Body:
+def place_body(corners: BodyCorners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera, linked by what most images agree on."""
-    views, count = _Views.of(corners, camera), len(corners.faces)
+    views, count = _FaceViews.of(corners, camera), len(corners.faces)
     edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
@@ -157,7 +157,7 @@ def place_body(corners: Corners, camera: Camera) -> Body:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Views:
+class _FaceViews:
     """v views of a face in an image."""
 
     image: np.ndarray
@@ -170,7 +170,7 @@ class _Views:
         return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
 
     @classmethod
-    def of(cls, corners: Corners, camera: Camera) -> "_Views":
+    def of(cls, corners: BodyCorners, camera: Camera) -> "_FaceViews":
         normalised = camera.normalised_from_pixel(corners.xy_px)
         key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
         members = [np.flatnonzero(view_of == v) for v in range(len(key))]
@@ -208,7 +208,7 @@ class _Views:
         return cls(key[kept, 0], key[kept, 1], minima.poses, minima.cost.reshape(-1, 2))
 
 
-def _pairs(views: _Views) -> dict[tuple[int, int], list[tuple[int, int]]]:
+def _pairs(views: _FaceViews) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """Returns the two views of each image that shows two faces, by these faces, in order."""
     by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for image in np.unique(views.image):
@@ -232,7 +232,7 @@ class _Relative:
     turned_alike: np.ndarray  # (4p, 4p) whether two have the same rotation
 
     @classmethod
-    def of(cls, pairs: list[tuple[int, int]], views: _Views) -> "_Relative":
+    def of(cls, pairs: list[tuple[int, int]], views: _FaceViews) -> "_Relative":
         """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
         pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
         a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
@@ -253,7 +253,7 @@ class _Relative:
         return best, int(votes[best])
 
 
-def _edge(pairs: list[tuple[int, int]], views: _Views) -> tuple[Rigid, int]:
+def _edge(pairs: list[tuple[int, int]], views: _FaceViews) -> tuple[Rigid, int]:
     """Returns a_from_b of two faces as the images see it, and the number of images that agree on it."""
     poses = _Relative.of(pairs, views)
     translation = poses.b_place - poses.a_place
@@ -265,11 +265,11 @@ def _edge(pairs: list[tuple[int, int]], views: _Views) -> tuple[Rigid, int]:
     return Rigid(mean, np.median(translation[near], axis=0)), votes
 
 
-def wrong_sizes(corners: Corners, camera: Camera) -> tuple[dict[int, float], int]:
+def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float], int]:
     """Returns true over stated size of faces whose size contradicts those of most others, by index of the face, and the
     number of the others that were compared. Too large by q, a face seems farther by q: face b is at the same place d in
     the frame of a in all images, q R_aᵀ t_b − R_aᵀ t_a = d."""
-    views = _Views.of(corners, camera)
+    views = _FaceViews.of(corners, camera)
     ratios: list[tuple[int, int, float, float]] = []
     for (a, b), pairs in _pairs(views).items():
         if len(pairs) < LEAST_PAIRS:
@@ -320,7 +320,7 @@ def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, f
 
 
 def _images(
-    views: _Views, corners: Corners, body_from_face: Poses, placed_faces: np.ndarray, camera: Camera
+    views: _FaceViews, corners: BodyCorners, body_from_face: Poses, placed_faces: np.ndarray, camera: Camera
 ) -> tuple[Poses, np.ndarray]:
     """Returns camera_from_body of each image: of what its views say, that which fits most of its corners best."""
     poses, placed = [Rigid(np.eye(3), [0.0, 0.0, 1.0]) for _ in corners.images], np.zeros(len(corners.images), bool)
@@ -337,7 +337,7 @@ def _images(
     return Poses.of(poses), placed
 
 
-def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
+def _faces_again(views: _FaceViews, corners: BodyCorners, body: Body) -> Poses:
     """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
     poses, camera_from_body = list(body.body_from_face), body.camera_from_body
     for face in np.flatnonzero(body.placed_faces)[1:]:
@@ -351,7 +351,7 @@ def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
     return Poses.of(poses)
 
 
-def adjust_body(start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
+def adjust_body(start: Body, corners: BodyCorners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
     """Returns the body of least robust cost over all poses, and over the camera's parameters of ``basis`` (16, q),
     which have the weight matrix ``prior`` (q, q) about those of ``given``."""
     body = start
@@ -364,7 +364,7 @@ def adjust_body(start: Body, corners: Corners, basis: np.ndarray, prior: np.ndar
     return replace(body, cost=float(huber_cost(length, HUBER * max(robust_sigma(length, 2), 1e-3)).sum()))
 
 
-def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, huber: float) -> Body:
+def _minimum(body: Body, used: BodyCorners, basis: np.ndarray, prior: np.ndarray, given: Camera, huber: float) -> Body:
     a, q = Adjustment(), basis.shape[1]
     held = ~body.placed_faces
     held[body.placed_faces.argmax()] = True
@@ -402,11 +402,11 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
     return at(*a.minimum(start, settled=1e-7, max_steps=MAX_STEPS).state.values())
 
 
-def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
+def settled_body(body: Body, corners: BodyCorners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
     """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
     for _ in range(PASSES - 1):
-        views = _Views.of(corners, body.camera)
+        views = _FaceViews.of(corners, body.camera)
         faces = _faces_again(views, corners, body)
         poses, placed = _images(views, corners, faces, body.placed_faces, body.camera)
         start = replace(body, body_from_face=faces, camera_from_body=poses, placed_images=placed)
@@ -417,7 +417,7 @@ def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndar
     return body
 
 
-def contradictions(body: Body, corners: Corners) -> list[Outlier]:
+def contradictions(body: Body, corners: BodyCorners) -> list[Outlier]:
     """Returns the corners that lie elsewhere than the rigid body has them, with a limit by their number and their tail.
     Lengths are compared with those of the same corner in other images too: a print that is off is no gross error."""
     printed = np.array([face.sigma_mm is not None for face in corners.faces])
@@ -488,7 +488,7 @@ def place_with_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
-    corners = Corners.of(observations, faces)
+    corners = BodyCorners.of(observations, faces)
     _require_sizes(corners, camera)
     body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
     return _named(body, corners, camera)
@@ -498,7 +498,7 @@ def place_and_find_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
 ) -> PlacedBody:
     """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
-    corners = Corners.of(observations, faces)
+    corners = BodyCorners.of(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
     _require_sizes(corners, first)
@@ -518,7 +518,7 @@ def place_and_find_camera(
     return _named(best, corners, unknown_lens(best.camera))
 
 
-def _require_sizes(corners: Corners, camera: Camera) -> None:
+def _require_sizes(corners: BodyCorners, camera: Camera) -> None:
     """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
     wrong, alike = wrong_sizes(corners, camera)
     if not wrong:
@@ -539,7 +539,7 @@ def _require_sizes(corners: Corners, camera: Camera) -> None:
     raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
 
 
-def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
+def _with_focal_length(corners: BodyCorners, camera: Camera) -> Body | None:
     """Returns the body with an adjusted focal length, None if there is none from this start."""
     basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
     try:
@@ -552,7 +552,7 @@ def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
         return None
 
 
-def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
+def _named(body: Body, corners: BodyCorners, camera: Camera) -> PlacedBody:
     placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
         {corners.faces[f].id: body.body_from_face[f] for f in placed},

@@ -19,7 +19,7 @@ from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.report.text import join, number, text_table
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import result_of
+from stcal.sfm.adjust.uncertainty import widened_result
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import (
     FORECAST,
@@ -302,7 +302,7 @@ class KnownRun(Brief):
 def known_of(run: SavedRun) -> KnownRun:
     """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
     again = adjusted_run(run)
-    joint = result_of(again.state)
+    joint = widened_result(again.state)
     heights, rim_sigma_mm = run.rims_mm()
     rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(

@@ -60,7 +60,7 @@ class Comparison(Part):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class MethodResult:
     """Result of one method."""
 
     target: CalibratedTarget
@@ -68,7 +68,7 @@ class Answer:
     scales: dict[str, Scale]  # by group
 
 
-def compare_with_paper(result: "RunResult", published: Answer | StcalError) -> Comparison:
+def compare_with_paper(result: "RunResult", published: MethodResult | StcalError) -> Comparison:
     """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
     three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
     joint = result.calibration.joint
@@ -88,7 +88,7 @@ def compare_with_paper(result: "RunResult", published: Answer | StcalError) -> C
     return Comparison.model_validate({"with": "paper", "rows": filled, "sigma": sigma})
 
 
-def in_steps(result: "RunResult") -> dict[str, Answer | StcalError]:
+def in_steps(result: "RunResult") -> dict[str, MethodResult | StcalError]:
     """Answers, or errors, from the run's own circles by the step added last, with λ by rows, three-point frames and
     single transforms, without the joint adjustment."""
     camera, designs = result.camera, (result.target_design, result.board_design)
@@ -99,18 +99,18 @@ def in_steps(result: "RunResult") -> dict[str, Answer | StcalError]:
     # The models hold the corrections already; the calibration itself works without eccentricity.
     plain: dict[str, Any] = {"solve": "paper", "frame": "three-point", "eccentricity": False, "refine_camera": False}
     options = replace(result.options.adjustment(result.target_design), **plain)
-    answers: dict[str, Answer | StcalError] = {}
+    answers: dict[str, MethodResult | StcalError] = {}
     for step, models, eccentricity in zip(STEPS[:-1], (equal, equal, weighted), (False, True, True), strict=True):
         try:
             refined = tuple(refine(model, camera, *designs, eccentricity).model for model in models)
             calibration = calibrate(refined, camera, *designs, options)
-            answers[f"+ {step}"] = Answer(calibration.target, refined, calibration.scales)
+            answers[f"+ {step}"] = MethodResult(calibration.target, refined, calibration.scales)
         except StcalError as error:
             answers[f"+ {step}"] = error
     return answers
 
 
-def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera: Camera) -> ComparedRow:
+def _row(name: str, found: MethodResult | StcalError, whole: CalibratedTarget, camera: Camera) -> ComparedRow:
     """Returns how far an answer is from the whole one."""
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
@@ -224,7 +224,7 @@ class FaceDifference(FaceOff):
     sigmas: float | None = None
 
 
-class CameraDifference(Part):
+class CameraRow(Part):
     image: str
     position_um: float
     rotation_mdeg: float
@@ -243,7 +243,7 @@ class ResultCompared(FacesCompared):
 class MappingCompared(ResultCompared):
     """Differences of two results; the keys that were not given are not in the file."""
 
-    cameras: list[CameraDifference] = Field(default=[])
+    cameras: list[CameraRow] = Field(default=[])
 
 
 class Crosscheck(Part):

@@ -9,7 +9,7 @@ from stcal.design import BoardDesign
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel
 from stcal.sfm.adjust import equations
-from stcal.sfm.adjust.equations import Group, Setting
+from stcal.sfm.adjust.equations import GroupPart, Setting
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 
@@ -52,7 +52,7 @@ def test_dots_off_their_design_cost_their_squares_over_sigma(group):
     labels = tuple(model.labels[i] for i in circle_rows)
 
     def cost(off_mm: np.ndarray) -> float:
-        own = Group(
+        own = GroupPart(
             model=model,
             model_from_board=Rigid(),
             design=model.xyz_model[dot_rows] + off_mm,
