@@ -22,7 +22,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 KEPT = {".json", ".csv", ".toml", ".txt", ".out"}
 PASSED_OVER = {".stcal", "overlays", "points3D.txt", "images.txt", "frames.txt"}
 LAYOUT_TAGS = range(17)

@@ -18,7 +18,7 @@ from stcal.report.document import (
     subheading,
     tiles,
 )
-from stcal.report.text import join, number, significant
+from stcal.report.text import join, number, significant, wrapped
 from stcal.sfm.budget.budget_file import (
     BudgetFile,
     LengthTest,
@@ -77,11 +77,12 @@ def budget_in_brief(file: BudgetFile, page: bool) -> str:
         *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
-        _no_certificate(file) or ("--report FILE.html writes a certificate of calibration" if offered else ""),
+        _no_certificate(file, brief=True)
+        or ("--report FILE.html writes a certificate of calibration" if offered else ""),
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
         "" if page else f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
     ]
-    return "\n".join(filter(None, lines))
+    return "\n".join(part for line in filter(None, lines) for part in wrapped(line))
 
 
 def _answer(file: BudgetFile) -> Answer:
@@ -163,15 +164,15 @@ def _is_valid(file: BudgetFile) -> bool:
     return file.usable and file.size_known and all(test.agrees for test in file.length_tests)
 
 
-def _no_certificate(file: BudgetFile) -> str:
-    """Returns why a valid budget is no certificate; empty if it is one. Faces that need not be flat need no
-    statement."""
+def _no_certificate(file: BudgetFile, brief: bool = False) -> str:
+    """Returns why a valid budget is no certificate, ``brief`` without keys; empty if it is one. Faces that need not be
+    flat need no statement."""
     if not _is_valid(file):
         return ""
     if file.reserved:
         return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
     missing = [row for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
-    unstated = [f"{row.title} ({row.words})" for row in missing]
+    unstated = [row.title if brief else f"{row.title} ({row.words})" for row in missing]
     unstated += [name for name in REQUIRED if not file.fields.get(name, "").strip()]
     without = any(row.key == "intrinsics" for row in missing)
     camera = ", and σ of the intrinsics in the camera file" if without else ""

@@ -153,7 +153,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     for folder, own in summary.prints.items():
         board = "the board" if folder == "." else f"the board of {folder}"
         parameters += stretch_in_words(board, **own)
-    parameters.append(plot(lambda: field_figure(*moved_px(lens)), "What the lens moves"))
+    parameters.append(plots(plot(lambda: field_figure(*moved_px(lens)), "What the lens moves", css="")))
     uncertainty = [
         "How well it is known where the camera sees a known direction, up to a rotation of the camera, which poses "
         "absorb. Points: those of the boards",
