@@ -221,9 +221,8 @@ def called(monkeypatch, capsys):
 
 
 @pytest.fixture
-def typed(copied, called, monkeypatch):
-    """Runs each command of a case in a copy of its folder; without a run's page, which other tests look at."""
-    monkeypatch.setattr("stcal.sfm.runs.folder.report_html", lambda *_: "")
+def typed(copied, called):
+    """Runs each command of a case in a copy of its folder."""
 
     def run(case: str, more: str = "") -> list[Outcome]:
         text = (copied(case) / "cmd").read_text()

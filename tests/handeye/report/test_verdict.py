@@ -45,6 +45,8 @@ def test_few_poses_ask_for_care():
     found = judged(outcome_of(5, 5))
     assert found.word == "use with care"
     assert "Motions of the flange" in [each.title for each in found.reasons()]
+    few = [[each.title for each in judged(outcome_of(count, 5)).reasons()] for count in (4, 5)]
+    assert ["Number of poses" in titles for titles in few] == [True, False]
 
 
 @pytest.mark.slow

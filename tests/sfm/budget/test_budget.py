@@ -188,7 +188,11 @@ WARM_TARGET = StatedSize(expansion_ppm_per_k=23.0, temperature_c=22.4)
         (WARM_BOARD, WARM_TARGET, 22.95 - 55.2, 20.0),
         (WARM_BOARD, replace(WARM_TARGET, reference_temperature_c=22.0), 22.95 - 9.2, 22.0),
         (WARM_BOARD, StatedSize(), 22.95, None),
+        (WARM_BOARD, StatedSize(temperature_c=22.4), 22.95, 22.4),
+        (WARM_BOARD, StatedSize(temperature_c=20.0), 22.95, 20.0),
         (StatedSize(temperature_c=20.0), WARM_TARGET, -55.2, 20.0),
+        (StatedSize(expansion_ppm_per_k=0.0), WARM_TARGET, -55.2, 20.0),
+        (StatedSize(), WARM_TARGET, 0.0, 22.4),
         (StatedSize(), StatedSize(), 0.0, None),
     ],
 )
@@ -483,11 +487,12 @@ def certified(saved, plain):
 def test_a_certificate_has_all_inputs_stated_and_a_traceability(saved, plain, certified):
     full, file = certified, BudgetFile.of(plain, saved, verify(saved.folder))
     for one, lacks in (
-        (full.model_copy(update={"fields": full.fields | {REQUIRED[-1]: " "}}), REQUIRED[-1]),
+        *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
         (file.model_copy(update={"fields": full.fields}), "board&#39;s pitch"),
     ):
         page = budget_report(one).page()
         assert "Certificate" not in page
+        assert "certificate number" not in page
         assert re.search(f"not a certificate: nothing is stated of [^<]*{re.escape(lacks)}", page)
     care = full.model_copy(update={"reserved": True})
     assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()

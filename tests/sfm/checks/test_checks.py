@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,8 +21,11 @@ from stcal.sfm.checks.board_checks import board_checks, radius_checks
 from stcal.sfm.checks.image_checks import moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
 from stcal.sfm.checks.suite import run_checks
+from stcal.sfm.pipeline import run
 from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
 from stcal.sfm.report.run_page import checks_section
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
@@ -363,15 +367,32 @@ def test_what_larger_sigma_cover_enlarges_them(ratio, verdict, enlarges):
     assert judge("groups", "t", [trial], "faces", "do").verdict == ("failed" if ratio > 1 else "passed")
 
 
-def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma(lab):
-    """By 10 µm, face 5 in the last of three groups that close a loop."""
+@pytest.mark.slow
+def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
+    """With pixels: one image out of focus."""
+    own = small_set("12", "14")
+    picture = render(small_scene, "12", 1, RenderOptions(blur_px=2.5))
+    cv2.imwrite(str(own.image(1)), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    folder = own.folder
+    result = run(own.images, own.camera, own.out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1))
+    checks = {check.key: check for check in result.checks}
+    assert checks["sharpness"].verdict == "suspicious"
+    assert set(checks["sharpness"].names) == {"12/IMG_1001.jpg"}
+    text = (own.out / "report.html").read_text(encoding="utf-8")
+    assert "Sharpness of each image" in text.split('id="use"')[1].split("checks that passed")[0]
+
+
+@pytest.mark.parametrize(("moved_um", "verdict"), [(10, "suspicious"), (100, "failed")])
+def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(lab, moved_um, verdict):
+    """Face 5 in the last of three groups that close a loop."""
     scene = make_scene(SceneOptions(seed=3, images_per_group=4, groups=(("1", "2"), ("2", "5"), ("1", "5"))))
-    shift = np.array([0.01, 0, 0])
+    shift = np.array([1e-3 * moved_um, 0, 0])
     faces, circles = dict(scene.target_from_face), scene.circles_target
     faces["5"] = Rigid(faces["5"].rotation, faces["5"].translation + shift)
     other = {label: xyz + shift if label.face == "5" else xyz for label, xyz in circles.items()}
     moved = lab.observe(replace(scene, target_from_face=faces, circles_target=other))
     images = [b if b.group == "15" else a for a, b in zip(lab.observe(scene), moved, strict=True)]
     checks = lab.check(scene, images, solve="joint")
-    assert checks["groups"].verdict == "suspicious"
-    assert 1.2 < max(check.enlarges for check in checks.values()) <= MOST_ENLARGED
+    assert checks["groups"].verdict == verdict
+    larger = max(check.enlarges for check in checks.values())
+    assert (1.2 < larger <= MOST_ENLARGED) == (verdict == "suspicious")
