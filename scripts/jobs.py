@@ -22,8 +22,7 @@ PYTHON = shlex.quote(sys.executable)
 PROGRAMS = shlex.quote(str(Path(sys.executable).parent))
 COMMANDS = {
     "style": f"{PROGRAMS}/ruff check . && {PROGRAMS}/ruff format --check . && {PROGRAMS}/lint-imports",
-    # With more room for young objects, less time goes into clearing away.
-    "types": f'NODE_OPTIONS="${{NODE_OPTIONS:-}} --max-semi-space-size=128" {PROGRAMS}/basedpyright',
+    "types": f"{PROGRAMS}/pyrefly check --python-interpreter-path {PYTHON} --output-format min-text",
     "site": f"{PYTHON} scripts/build_site.py",
     "wheel": "scripts/try_wheel",
     "tests": f"{PYTHON} -m pytest -n {os.cpu_count() or 1} --dist worksteal",

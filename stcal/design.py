@@ -74,7 +74,7 @@ class FaceDesign(Brief):
     x: str
     y: str
     rough_target_from_face: Rigid | None = None
-    outline_mm: Array | None = None
+    outline_mm: np.ndarray | None = None
     rim_mm: Array | None = None
     printed: PrintedPattern | None = None
     sigma_mm: float | None = None
@@ -441,7 +441,7 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
         raise InputError("E-BOARD-TYPE", f"{fault}; a rectangular board of dots needed, or none")
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
-    return ScaleReference(**(known or none), faces=faces, distances=target.distances)
+    return ScaleReference(**(known or none), faces=faces, distances=target.distances)  # type: ignore[arg-type]
 
 
 DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit where no size is known

@@ -48,7 +48,7 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
     p, q = p[p != q], q[p != q]
     factor = (other_centres[q] - other_centres[p]) / (centres[j] - centres[i])
     fits = alike(abs(factor) * radius[i], other_radius[p]) & alike(abs(factor) * radius[j], other_radius[q])
-    tree, found = KDTree(np.column_stack([other_centres.real, other_centres.imag])), []
+    tree, found = KDTree(np.column_stack([other_centres.real, other_centres.imag])), list[Likeness]()
     for start, turn in zip(p[fits], factor[fits], strict=True):
         moved = other_centres[start] + turn * (centres - centres[i])
         nearest = np.asarray(tree.query(np.column_stack([moved.real, moved.imag]))[1])

@@ -160,7 +160,7 @@ KEYS: dict[str, Any] = {
 
 def _form(word: str, design: type, number: Any, **more: Any) -> type[Sized]:
     """Return the form of the file of a kind of board; ``number`` : of rows and columns; ``more`` : further keys."""
-    keys: dict[str, Any] = {"type": (Literal[word], ...)}
+    keys: dict[str, Any] = {"type": (Literal[word], ...)}  # type: ignore[valid-type]
     for f in fields(design):
         keys[f.name] = KEYS.get(f.name, number), ... if f.default is MISSING else f.default
     return create_model(f"_{design.__name__}", __base__=Sized, **keys | more)
@@ -189,7 +189,7 @@ def _grid(design: type[FlatBoard], data: Any, where: str) -> FlatBoard:
     return board
 
 
-SPACING = {
+SPACING: dict[type, str] = {
     AsymmetricCirclesDesign: "half of what neighbours in a row are apart",
     HexagonalCirclesDesign: "what neighbours are apart",
 }

@@ -9,6 +9,7 @@ measured in the original image. A ChArUco board is read by its tags (through ``c
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -424,7 +425,7 @@ def find_on_faces(
         view = find_chessboard(image, name, board, with_sigma=True)
         return view, "" if view else why_no_chessboard(image, board)
 
-    finders = {
+    finders: dict[type, Callable[[Any], tuple[BoardView | None, str]]] = {
         TagLayout: lambda board: (view_of_tags(name, tags, board), ""),
         CharucoDesign: charuco,
         ChessboardDesign: chessboard,

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -257,7 +257,7 @@ def register(
 
     if identified and not robot_file:
         raise InputError("E-OPTION-NEEDS", f"--identified {identified}: only with --robot FILE")
-    published = {"sample": sample, "share": share, "tries": tries, "orthogonal_within": orthogonality}
+    published: dict[str, Any] = {"sample": sample, "share": share, "tries": tries, "orthogonal_within": orthogonality}
     published = {name: value for name, value in published.items() if value is not None}
     if published and method != "liu2017":
         raise InputError("E-OPTION-NEEDS", "--sample, --share, --tries, --orthogonality: only with --method liu2017")

@@ -19,22 +19,19 @@ from stcal.errors import InputError
 Shape = tuple[int | None, ...]
 MOST_KEPT = 512  # number of results that a function keeps
 LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
-MYPY = False
-"""True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
 
-if TYPE_CHECKING and not MYPY:
+if TYPE_CHECKING:
 
     class Array:
         """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`. To
-        pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
-        ``np.ndarray``. At run time, and to mypy, it is ``np.ndarray``. Only for fields; an optional one is
-        ``np.ndarray | None``."""
+        checkers of types it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
+        ``np.ndarray``. At run time it is ``np.ndarray``. Only for fields; an optional one is ``np.ndarray | None``."""
 
         def __get__(self, instance: object, owner: Any) -> np.ndarray: ...
         def __set__(self, instance: object, value: ArrayLike) -> None: ...
 
 else:
-    Array = np.ndarray  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
+    Array = np.ndarray
 
 
 class ByValue:
@@ -204,8 +201,10 @@ def frozen(
         array = values if values.base is None and not values.flags.writeable else values.copy()
     else:
         array = _as_array(values, shape, what, dtype)
-    if shape not in (None, array.shape) and (
-        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    if (
+        shape is not None
+        and shape != array.shape
+        and (array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)))
     ):
         raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
     # three times as fast as all() on few numbers

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import MYPY, Array, Brief, ByValue, freeze, frozen
+from stcal.geometry.arrays import Array, Brief, ByValue, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components; in tables by the names of columns (``wxyz``), or by their order (``xyzw``)."""
@@ -60,7 +60,7 @@ def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
     return max(*(abs(square - 1) for square in own), *map(abs, across))
 
 
-if TYPE_CHECKING and not MYPY:
+if TYPE_CHECKING:
 
     class Turn(Array):
         """Type of a field of rotation matrices, which accepts SciPy's rotations too."""
@@ -68,7 +68,7 @@ if TYPE_CHECKING and not MYPY:
         def __set__(self, instance: object, value: ArrayLike | Rotation) -> None: ...
 
 else:
-    Turn = Array  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
+    Turn = Array
 
 
 class _Frames:

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -305,7 +306,8 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     jacobian[:, 3:, :3] = -skew(poses.translation - as_numbered.translation)
     errors = carried(jacobian, pairs.camera_from_board_covariance, pairs.camera_from_board_common)
     names = ("camera_from_board", "camera_from_board_covariance", "camera_from_board_common")
-    repaired = replace(pairs, **dict(zip(names, (poses, *errors), strict=True)))
+    changed: dict[str, Any] = dict(zip(names, (poses, *errors), strict=True))
+    repaired = replace(pairs, **changed)
     if views is not None:
         turned = (view.turned(every[k].inverse()) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))

@@ -283,7 +283,7 @@ def easy_handeye(result: HandEye, transforms: list[Static], name: str, second: b
     turn, place = dict(zip("xyzw", xyzw(first.pose), strict=True)), dict(zip("xyz", metres(first.pose), strict=True))
     if second:
         kind = "eye_in_hand" if in_hand else "eye_on_base"
-        content = {"parameters": {"name": name, "calibration_type": kind, **named, **MOVE_GROUP}}
+        content: dict[str, dict] = {"parameters": {"name": name, "calibration_type": kind, **named, **MOVE_GROUP}}
         content["transform"] = {"translation": place, "rotation": turn}
     else:
         content = {"parameters": {"eye_on_hand": in_hand, **MOVE_GROUP, "namespace": f"/{name}/", **named}}

@@ -369,7 +369,7 @@ class HandEyeProblem:
             covariance = covariance + error.covariance(inverse) - inverse
         stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
         sigma = {name: value for name, value in stated.items() if value} | solution.sigma
-        more = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
+        more: dict[str, Any] = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
         more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
         return self._solved("pose", x, z, solution.residuals, notes, **more)
 
@@ -408,7 +408,7 @@ class HandEyeProblem:
         if doubted:
             which = ", ".join(f"{FACTORS[name]} {factor:.1f} times" for name, factor in doubted.items())
             notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-        more = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
+        more: dict[str, Any] = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
         more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
         return self._solved("reprojection", x, z, residuals, notes, **more)
 

@@ -43,7 +43,7 @@ def packed(key: str, arrays: Mapping[str, Any], meta: dict[str, Any]) -> bytes:
     content = {name: np.asarray(values) for name, values in arrays.items()}
     content[META] = _bytes(json.dumps(meta | {MADE_FROM: key}).encode())
     stream = io.BytesIO()
-    np.savez(stream, **content | {CHECKSUM: _bytes(_digest(content))})  # pyright: ignore[reportArgumentType]
+    np.savez(stream, **content | {CHECKSUM: _bytes(_digest(content))})  # type: ignore[arg-type]
     return stream.getvalue()
 
 

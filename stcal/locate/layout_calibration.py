@@ -198,7 +198,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     for round_ in range(VARIANCE_ROUNDS):
         minimum = layout.problem(values, noise).minimum(max_steps=60)
         solution = minimum.required("layout", "check board file and camera file").linear
-        values = solution.values
+        values: dict[str, Any] = solution.values
         previous, noise = noise, layout.noise(solution, noise)
         change = max(abs(noise.corner_px - previous.corner_px), abs(noise.tag_px - previous.tag_px))
         settled = round_ > 0 and abs(noise.board / previous.board - 1) < 0.01 and change < NEAR_PX

@@ -305,7 +305,7 @@ class Located(Brief):
     def camera_from_obj(self) -> Rigid | None:
         """Pose of the target by the method that was asked for, mm; None if there is none."""
         found = self.patent or self.pose
-        return found and found.camera_from_obj
+        return None if found is None else found.camera_from_obj
 
 
 @require_arguments

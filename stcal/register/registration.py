@@ -210,9 +210,9 @@ def register(
     if problem.model == RIGID:
         doubts.check_units(problem, seed)
     second = None
-    published = replace(
-        liu2017_options or Liu2017Options(), **({} if threshold_mm is None else {"limit_mm": threshold_mm})
-    )
+    published = liu2017_options or Liu2017Options()
+    if threshold_mm is not None:
+        published = replace(published, limit_mm=threshold_mm)
     again: Callable[[Problem], Fitted] = {
         "robust": partial(consensus.robust_fit, threshold=threshold_mm, seed=seed),
         "least-squares": lambda part: replace(_as_assigned(part, np.ones(len(part), bool), None), threshold=np.inf),

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -282,7 +282,7 @@ def _lines(blocks: Iterable[Block]) -> Iterator[str]:
 
 
 def _macro(name: str, *values) -> str:
-    return environment().globals[name](*values)
+    return cast(Callable[..., str], environment().globals[name])(*values)
 
 
 def html(*blocks: Block):

@@ -430,7 +430,7 @@ def design_target(
     folder = _free(out)
     kept = folder / "board.toml" if folder and os.path.lexists(folder / "board.toml") else None
     board = load_dots(kept) if kept else None
-    made = make_target(options, progress and partial(progress, "patterns"))
+    made = make_target(options, progress and partial(progress, "patterns"))  # type: ignore[arg-type]
     noise, source = expected_noise()
     same = {name: getattr(options, name) for name in ("distance_mm", "width", "camera", "seed")}
     session = PlanOptions(images=images, noise=noise, **same)

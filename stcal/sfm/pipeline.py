@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -242,7 +243,8 @@ def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Cal
 
 def compared(task: Task, result: RunResult) -> RunResult:
     """Returns the result with its comparison with the published method on the same photographs, if it is asked for."""
-    model, published = task.camera, {"solve": "paper", "frame": "three-point", "eccentricity": False}
+    model = task.camera
+    published: dict[str, Any] = {"solve": "paper", "frame": "three-point", "eccentricity": False}
     if not task.options.compare or not result.target.target_from_face or model is None:
         return result
     options = replace(task.options, **published, refine_camera=False, compare=None).settled(task.target)

@@ -256,7 +256,7 @@ def _poses(
 
 def _shown_deg(scene: BodyScene, pose: Rigid) -> dict[str, tuple[float, ...]]:
     """Returns the angle between normal and line of sight, (1,) degrees, of each face that a photograph shows."""
-    tilts = {}
+    tilts: dict[str, tuple[float, ...]] = {}
     for face in scene.target.faces:
         camera_from_face = pose @ scene.target_from_face[face.id]
         middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)

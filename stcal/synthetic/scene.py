@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -223,7 +224,8 @@ def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
     """Returns options that place views for the camera of a file, which must state its image size."""
     focal_px = float(np.sqrt(file.focal.prod()))
     distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
-    return replace(options, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
+    size: dict[str, Any] = {"width": file.width, "height": file.height}
+    return replace(options, **size, focal_px=focal_px, distortion=distortion)
 
 
 def group_name(pair: tuple[str, str]) -> str:

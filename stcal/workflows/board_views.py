@@ -388,7 +388,7 @@ def calibrate_camera_by_corners(
     return calibrated(find, images, grid, colmap_model, workers, ROUNDS.get(type(board), 1))
 
 
-ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3, HexagonalCirclesDesign: 3}
+ROUNDS: dict[type, int] = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3, HexagonalCirclesDesign: 3}
 """Rounds of detection where the camera helps to find the points, and for circles also moves them: an error of their
 eccentricity shrinks to less than a tenth with each round. Corners of chessboards and ChArUco boards need one."""
 

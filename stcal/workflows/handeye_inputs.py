@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,7 +79,7 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         stream = Stream.of(known, robot.poses, Path(robot.where).name)
         return stream, dict(zip(images, stream.after_origin(list(images.values())).tolist(), strict=True))
 
-    read = {"own": False, "timed": False}
+    read: dict[str, Any] = {"own": False, "timed": False}
     if not timing.offset and all(time in known for time in images.values()):  # rows without an image are no mistake
         rows = [known.index(time) for time in images.values()]
         read |= {

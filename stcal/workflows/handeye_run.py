@@ -277,7 +277,7 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
     def reachable(flange: Poses) -> np.ndarray:
         """Returns True where a pose is within the limits and its joint values are determined."""
-        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
+        return np.array([status == REACHED for status in inverse(robot, flange, near).status])  # type: ignore[arg-type]
 
     planned = plan_poses(given.pairs, result, count, outline, camera, reachable, seed)
     q = inverse(robot, planned.base_from_flange, near).q

@@ -4,6 +4,7 @@ systems."""
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -125,8 +126,8 @@ def register_with_robot(
             f"{pairs.where}: {len(pairs)} point pairs, a registration of {len(found)}, {len(data)} joint vectors; as "
             "many of each needed",
         )
-    options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
-    options["liu2017_options"] = liu2017_options
+    options: dict[str, Any] = {"model": found.model, "method": found.method, "seed": found.seed}
+    options |= {"threshold_mm": threshold_mm, "liu2017_options": liu2017_options}
     settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
     good = found.inliers.copy()
     if registration.field is not None:

@@ -99,7 +99,8 @@ class HandEyePoses(Brief):
                         raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
                 matrices = Poses.of(rigid)
             sides.append(Poses(matrices.rotation, LENGTHS[unit] * matrices.translation))
-        return cls(*sides, names=tuple(names), where=where)
+        first, second = sides
+        return cls(first, second, names=tuple(names), where=where)
 
     def __len__(self) -> int:
         return len(self.base_from_flange)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import yaml
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
@@ -88,7 +88,7 @@ def camera_of_photograph(path: str | Path) -> LoadedLens:
             (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
         if is_heic(data) and heic_turns(data) % 2:
             width, height = height, width
-    except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = " ".join(str(error).split())[:100]
         fault = f"{where}: no photograph that can be read ({reason})"
         raise InputError("E-CAMERA-UNREADABLE", f"{fault}; give another") from error

@@ -406,7 +406,7 @@ def directions_named(directions: np.ndarray, names: tuple[str, ...] | list[str])
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
         free[lead] = 0
-        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
+        i, j = map(int, np.unravel_index(free[:, column:].argmax(), free[:, column:].shape))
         reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
         reduced[:, column] /= reduced[i, column]
         others = np.arange(reduced.shape[1]) != column

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations, product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -329,7 +329,7 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
         for held, said, right, times in (there, ("mm", words, "mm", 1 / LENGTHS[unit])):
-            scaled = {name: times * values for name, values in lengths.items() if values is not None}
+            scaled: dict[str, Any] = {name: times * values for name, values in lengths.items() if values is not None}
             cure = f"call the columns x_{right} … or distance_{right}"
             yield f"lengths are {held} in columns of {said}", cure, robot, replace(data, **scaled)
     for i in range(n):
@@ -337,7 +337,8 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
         reversed_ = replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
         yield f"joint {i + 1} had the opposite sign", cure, robot, reversed_
     if (robot.coupling != np.eye(n)).any():
-        yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
+        uncoupled = replace(robot, coupling=np.eye(n))
+        yield "the joints were not coupled", "take coupling out of the robot file", uncoupled, data
         other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
         cure = "change the signs of coupling off its diagonal"
         yield "the joints were coupled with the other sign", cure, other, data

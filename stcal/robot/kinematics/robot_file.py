@@ -139,7 +139,7 @@ def load_robot(path: str | Path) -> Robot:
             raise InputError("E-ROBOT-TARGET", f"{where}: target {t.name} occurs twice; names must differ")
         tools[t.name] = t.rigid(f"{where}: target {t.name}")
     base = data.base.rigid(f"{where}: base")
-    elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
+    elasticity = None if data.elasticity is None else data.elasticity.elasticity(n, f"{where}: elasticity")
     arm = tuple(rows), tuple(joints), np.eye(n) if data.coupling is None else np.array(data.coupling)
     return Robot(data.name, data.convention, *arm, base, tools, elasticity, _tree(data, where), data.unusual_size)
 

@@ -201,8 +201,8 @@ class Elasticity:
     gravity: np.ndarray
     payload_kg: float = 0.0
     payload_centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    hysteresis: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the joints
-    pivot: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # likewise
+    hysteresis: np.ndarray = None  # type: ignore  # made below: its size is that of the joints
+    pivot: np.ndarray = None  # type: ignore  # likewise
 
     def __post_init__(self):
         n = len(self.compliance)
@@ -281,7 +281,7 @@ class Robot(Brief):
     convention: Convention
     rows: tuple[DHRow, ...]
     joints: tuple[Joint, ...]
-    coupling: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the rows
+    coupling: np.ndarray = None  # type: ignore  # made below: its size is that of the rows
     world_from_base: Rigid = field(default_factory=lambda: Rigid())
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
     elasticity: Elasticity | None = None
@@ -347,7 +347,10 @@ class Robot(Brief):
                 "E-ARRAY-SHAPE",
                 f"robot {name}: limits of shape {ends.shape}, types of {len(kinds)} joints; ({n}, 2) and {n} needed",
             )
-        joints = tuple(Joint(kind, *pair) for kind, pair in zip(kinds, ends.tolist(), strict=True))
+        joints = tuple(
+            Joint(kind, *pair)  # type: ignore[arg-type]  # judged by Joint
+            for kind, pair in zip(kinds, ends.tolist(), strict=True)
+        )
         warn_of_degrees(
             np.where(np.isfinite(ends), ends, 0.0).T, np.array(kinds) == "revolute", f"robot {name}: limits"
         )

@@ -95,7 +95,7 @@ def calibration_file(calibration: CameraCalibration) -> CalibrationFile:
         rounds=calibration.rounds,
         projection_sigma_px=float(np.median(projection.sigma_px)),
         corners=_rows(calibrate.CORNERS, reached),
-        held_out_rms_px=held_out and held_out.rms_px(),
+        held_out_rms_px=None if held_out is None else held_out.rms_px(),
         models=calibration.candidates,
         images=list(_views(result)),
         outliers=list(_outliers(result)),

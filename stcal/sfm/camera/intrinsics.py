@@ -55,7 +55,7 @@ class Fit:
             keep = np.array([name in names for name in model.images])
             if keep.any():
                 seen = model.observed(np.flatnonzero(keep[model.image_index]))
-                images, poses = (tuple(compress(each, keep)) for each in (model.images, model.camera_from_model))
+                images, poses = tuple(compress(model.images, keep)), tuple(compress(model.camera_from_model, keep))
                 index = (np.cumsum(keep) - 1)[seen.image_index]
                 parts.append(replace(seen, images=images, camera_from_model=poses, image_index=index))
         return replace(self, models=tuple(parts))

@@ -322,6 +322,6 @@ def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: 
         shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
         corrected = replace(model, shift_px=shift)
         parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (of_faces, ~of_faces)]
-    except (StcalError, ValueError, np.linalg.LinAlgError):
+    except (StcalError, ValueError):
         return False
     return all(n.redundancy.sum() > MIN_REDUNDANCY and n.noise() < MOST_SIGMAS**2 for n in parts)

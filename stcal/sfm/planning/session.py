@@ -296,7 +296,10 @@ def _beside_board(
         width=options.width,
         height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
-        **dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0),
+        centre_sigma=0.0,
+        circle_sigma_mm=0.0,
+        face_shift_mm=0.0,
+        face_turn_deg=0.0,
     )
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
     run = options.run.adjustment(scene.target)

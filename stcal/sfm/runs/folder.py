@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -286,7 +287,7 @@ def require_report(saved: SavedRun) -> None:
 
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
-    rows = []
+    rows: list[list[Any]] = []
     for each in seen.labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
