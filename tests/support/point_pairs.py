@@ -45,7 +45,7 @@ def cube(rng: np.random.Generator, n: int, half_mm: float = HALF_MM) -> np.ndarr
 def random_rigid(rng: np.random.Generator) -> Rigid:
     """Any rotation, and a translation within 3 m along each axis."""
     seed = rng.integers(2**31)
-    turn = Rotation.random(random_state=seed)  # pyright: ignore[reportCallIssue]  the seeded stream of earlier figures
+    turn = Rotation.random(random_state=seed)  # the seeded stream of earlier figures
     return Rigid(turn.as_matrix(), rng.uniform(-3000, 3000, 3))
 
 
