@@ -110,6 +110,7 @@ def test_a_type_checker_knows_what_the_scripts_use(tmp_path):
     for number, code in SCRIPTS.items():
         (tmp_path / f"task_{number}.py").write_text(code, encoding="utf-8")
     program = Path(sys.executable).parent / "pyrefly"
-    words = [program, "check", "--python-interpreter-path", sys.executable, "--search-path", ROOT, tmp_path]
+    words = [program, "check", "--preset", "default", "--python-interpreter-path", sys.executable]
+    words += ["--search-path", ROOT, tmp_path]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (0, "")
