@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from html import escape
 from itertools import compress, product
@@ -16,6 +17,7 @@ from stcal.boards.target_file import load_boards, load_target
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.parts import (
     LAYERS,
+    LETTERS,
     Disc,
     Piece,
     Shape,
@@ -36,7 +38,6 @@ from stcal.io.files import save
 APART = 6.0  # distance from a part to its first dimension, and between dimensions, mm
 ARROW = 1.5
 CUT_FROM, CUT_TO = 1.5, 5.0  # distances from the outline at which cut marks begin and end, mm
-LETTERS = 2.0
 BAR, SHORT_BAR = 100.0, 50.0  # lengths of scale bars, mm
 
 
@@ -83,7 +84,6 @@ def scale_bars(width: float, height: float) -> list[Shape]:
 def _dimension(axis: int, low: float, high: float, words: str, edge: float, away: float) -> list[Shape]:
     """Return the dimension of a length along X below ``edge``, or along Y to the left of it."""
     level = edge - away
-
     lines = [[(low, level), (high, level)]]
     for end, sign in ((low, 1), (high, -1)):
         lines.append([(end, edge - 1.0), (end, level - 1.0)])
@@ -191,13 +191,12 @@ class _Way:
 
 def _ways(part: Piece, paper: str) -> list[_Way]:
     """Return the layouts of a part: portrait and landscape, with dimensions, or bare on one sheet."""
-    ways, boxes, (width, height) = [], np.array([shape.box() for shape in part.pattern()]), PAPERS[paper]
+    ways, (width, height) = [], PAPERS[paper]
+    boxes = np.array([shape.box() for shape in part.shapes if shape.layer == "PATTERN"])
     for bare, size in product((False, True), ((width, height), (height, width))):
         shapes = framed(part, bare)
         box, room = extent(shapes), np.array(size) - FURNITURE
-        across, down = (
-            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k]) for k in (0, 1)
-        )
+        across, down = (seams_between(*box[:, k].tolist(), float(room[k]), boxes[:, :, k]) for k in (0, 1))
         low, high = np.moveaxis(boxes, 1, 0)
         cuts = any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in (across, down)[k])
         way = _Way(shapes, box, size, (across, down), cuts, bare)
@@ -406,11 +405,7 @@ Design = TargetDesign | BoardDesign | FlatBoard | BoardSet
 
 @require_arguments
 def draw(
-    design: Design | str | Path,
-    out: str | Path,
-    paper: str = "",
-    margin_mm: float = 10.0,
-    net: bool = False,
+    design: Design | str | Path, out: str | Path, paper: str = "", margin_mm: float = 10.0, net: bool = False
 ) -> Drawn:
     """Draw a target or a board 1:1 to a file, whose suffix gives the form: ``.pdf`` or ``.svg``.
 
@@ -447,7 +442,8 @@ def draw(
         fitting = paper_for(parts) or OWN
         paper = paper if given or paper == OWN else fitting
         if paper != OWN and len(paper_sheets(parts, paper, "")) > 1:
-            fault = f"--net: {_size(parts[0])}, and a sheet of {paper} has room for {_room(paper)}"
+            size, room = (_size(sides) for sides in (np.ptp(parts[0].outline, axis=0), PAPERS[paper] - FURNITURE))
+            fault = f"--net: {size}, and a sheet of {paper} has room for {room}"
             remedy = f"take --paper {fitting}, or draw the plates one by one without --net"
             raise InputError("E-DRAW-SHEETS", f"{fault}; {remedy}")
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
@@ -472,16 +468,13 @@ def net_text(target: TargetDesign) -> str:
     """Return how large the net of a body is, and which paper takes it."""
     part = net_part(target)
     paper = paper_for([part])
-    return f"net to fold, {_size(part)}: {f'one sheet of {paper}' if paper else 'larger than A0'}"
+    return (
+        f"net to fold, {_size(np.ptp(part.outline, axis=0))}: {f'one sheet of {paper}' if paper else 'larger than A0'}"
+    )
 
 
-def _size(part: Piece) -> str:
-    return f"{' × '.join(said_mm(side) for side in np.ptp(part.outline, axis=0))} mm"
-
-
-def _room(paper: str) -> str:
-    """Return the room that a sheet has for parts and their dimensions."""
-    return f"{' × '.join(said_mm(side) for side in PAPERS[paper] - FURNITURE)} mm"
+def _size(sides: np.ndarray) -> str:
+    return f"{' × '.join(map(said_mm, sides))} mm"
 
 
 def load_design(path: str | Path) -> Design:
@@ -496,11 +489,9 @@ def load_design(path: str | Path) -> Design:
 def paper_for(parts: Sequence[Piece]) -> str | None:
     """Return the smallest paper from A4 to A0 that takes each part on one sheet, or None."""
     for paper in ("A4", "A3", "A2", "A1", "A0"):
-        try:
+        with suppress(InputError):  # more sheets than are drawn
             if len(paper_sheets(parts, paper, "")) == len(parts):
                 return paper
-        except InputError:  # more sheets than are drawn
-            continue
     return None
 
 
@@ -518,7 +509,7 @@ def _paper(path: Path, paper: str) -> str:
 
 def drawn_text(drawn: Drawn) -> str:
     """Return the parts and sheets of a drawing, and how to use them, as text."""
-    lines = [f"{part.name}: {_size(part)}" for part in drawn.parts]
+    lines = [f"{part.name}: {_size(np.ptp(part.outline, axis=0))}" for part in drawn.parts]
     sheets = len(drawn.sheets)
     kind = "of its own size" if drawn.paper == OWN else drawn.paper
     lines.append(f"{drawn.path}: {sheets} sheet{'s' if sheets > 1 else ''} {kind}")
@@ -528,8 +519,9 @@ def drawn_text(drawn: Drawn) -> str:
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
+        room = _size(PAPERS[drawn.paper] - FURNITURE)
         lines.append(
-            f"a sheet of {drawn.paper} has room for {_room(drawn.paper)}, either way round, dimensions included; "
-            f"parts that are glued of several sheets are off at the seams: state it in sigma_mm, or {larger}"
+            f"a sheet of {drawn.paper} has room for {room}, either way round, dimensions included; parts that are "
+            f"glued of several sheets are off at the seams: state it in sigma_mm, or {larger}"
         )
     return "\n".join(lines)

@@ -139,10 +139,6 @@ class Piece:
     spans: Spans = ()  # lengths that are dimensioned
     lines: tuple[Outline, ...] = ()  # to cut and fold, if they replace the outline, which then only encloses the part
 
-    def pattern(self) -> list[Shape]:
-        """Return the shapes of the pattern, without the ground."""
-        return [shape for shape in self.shapes if shape.layer == "PATTERN"]
-
 
 def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Piece:
     """Return the plate of a face, in the face's frame as seen from outside, Y upwards."""

@@ -1,6 +1,5 @@
 """Photographs of a body held before a camera in changing poses, with its truth: printed faces, and faces of circles."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,14 +10,12 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.board_designs import black_areas, clear_mm
-from stcal.boards.target_file import save_target
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.cameras.read import save_camera
-from stcal.synthetic.dataset import TruthFile, image_name, new_dataset, write_images
+from stcal.synthetic.dataset import TruthFile, image_name, new_dataset, write_scene
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
 DRAWING_PX = 2000  # longer side of the drawing of a face, px
@@ -444,14 +441,7 @@ def write_body(
 
     Raises InputError: the folder is not empty or cannot be written.
     """
-    folder, count = Path(folder), len(scene.camera_from_target)
-    with new_dataset(folder):
-        (folder / "images").mkdir(parents=True, exist_ok=True)
-        save_camera(folder / "cameras.txt", scene.camera)
-        save_target(folder / "target.toml", scene.target)
-        truth = json.dumps(body_truth(scene, image_format).content())
-        (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        drawings, paths = scene.drawings(), [folder / "images" / image_name("", i, image_format) for i in range(count)]
-        arguments = [(scene, i, drawings) for i in range(count)]
-        write_images(render_body, paths, arguments, jpeg_quality, workers, progress)
-    return paths
+    with new_dataset(Path(folder)):
+        truth, drawings = body_truth(scene, image_format), scene.drawings()
+        jobs = {name: (scene, i, drawings) for i, name in enumerate(truth.camera_from_target or ())}
+        return write_scene(Path(folder), scene, truth, render_body, jobs, jpeg_quality, workers, progress)

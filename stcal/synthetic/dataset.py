@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +16,7 @@ from stcal.boards.target_file import save_target
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.read import save_camera
-from stcal.io.files import unwritable
+from stcal.io.files import save, unwritable
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
@@ -87,8 +87,9 @@ class TruthFile(ResultFile):
     def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
         """Returns the truth of a scene, with images named by :func:`image_name`."""
         options = options or RenderOptions()
-        lens = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
-        optics: dict[str, Any] = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
+        optics: dict[str, Any] = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
+        optics |= {"rim_mm": options.rim_mm} if options.rim_mm else {}
+        given = {"optics": TrueOptics(**optics)} if optics else {}
         groups = {}
         for name, group in scene.groups.items():
             shown = [_circles(scene, name, i) for i in range(len(group.camera_from_target))]
@@ -97,14 +98,14 @@ class TruthFile(ResultFile):
                 for i, pose in enumerate(group.camera_from_target)
             }
             groups[name] = TrueGroup(board_circles_target=group.board_circles_target, images=images)
-        truth = cls(
+        return cls(
             unit="mm",
             reference_face=scene.reference_face,
             target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
             circles={str(label): xyz for label, xyz in scene.circles_target.items()},
             groups=groups,
+            **given,
         )
-        return truth.model_copy(update={"optics": TrueOptics(**optics)}) if optics else truth
 
 
 def image_name(group: str, image: int, image_format: str = "jpg") -> str:
@@ -115,12 +116,12 @@ def image_name(group: str, image: int, image_format: str = "jpg") -> str:
 def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
     shown = image_circles(scene, group, image)
     number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
-    made = {}
-    for i, label in enumerate(shown.labels):
-        centre, tilt_deg = np.round(shown.centre_px[i], 5), round(float(np.degrees(shown.tilt_rad[i])), 2)
-        circle = TrueCircle(centre_px=centre, tilt_deg=tilt_deg, must_find=bool(shown.must_find[i]))
-        made[number.get(label, label)] = circle
-    return made
+    tilts_deg = np.degrees(shown.tilt_rad).tolist()
+    rows = zip(shown.labels, shown.centre_px.round(5), tilts_deg, shown.must_find, strict=True)
+    return {
+        number.get(label, label): TrueCircle(centre_px=centre, tilt_deg=round(tilt_deg, 2), must_find=bool(must_find))
+        for label, centre, tilt_deg, must_find in rows
+    }
 
 
 @require_arguments
@@ -142,7 +143,7 @@ def render_all(
     """
     options = options or RenderOptions()
     check_lens(scene, options.lens)
-    views = [(name, i) for name, group in scene.groups.items() for i in range(len(group.camera_from_target))]
+    views = scene.views()
     rendered = dict(run_parallel(render, [(scene, *view, options) for view in views], workers))
     return {name: [rendered[k] for k, (group, _) in enumerate(views) if group == name] for name in scene.groups}
 
@@ -157,6 +158,7 @@ def new_dataset(folder: Path) -> Iterator[None]:
         raise InputError("E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give another")
     existed = folder.exists()
     try:
+        (folder / "images").mkdir(parents=True, exist_ok=True)
         yield
     except BaseException as error:
         for child in list(folder.iterdir()) if folder.is_dir() else ():
@@ -206,37 +208,33 @@ def write_dataset(
         raise InputError("E-OPTION-RANGE", f"data set: JPEG quality {jpeg_quality}, 1 to 100 needed")
     with new_dataset(folder):
         check_lens(scene, options.lens)
-        truth = json.dumps(TruthFile.of(scene, image_format, options).content())
-        for group in scene.groups:
-            (folder / "images" / group).mkdir(parents=True, exist_ok=True)
-        save_camera(folder / "cameras.txt", scene.camera)
-        save_target(folder / "target.toml", scene.target)
         save_board(folder / "board.toml", scene.board)
-        (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        views = [(group, i) for group, g in scene.groups.items() for i in range(len(g.camera_from_target))]
-        paths = [folder / "images" / image_name(*view, image_format) for view in views]
-        write_images(render, paths, [(scene, *view, options) for view in views], jpeg_quality, workers, progress)
-    return paths
+        jobs = {image_name(*view, image_format): (scene, *view, options) for view in scene.views()}
+        truth = TruthFile.of(scene, image_format, options)
+        return write_scene(folder, scene, truth, render, jobs, jpeg_quality, workers, progress)
 
 
-def write_images(
+def write_scene(
+    folder: Path,
+    scene: Any,  # with a target and a camera
+    truth: TruthFile,
     make: Callable[..., np.ndarray],
-    paths: Sequence[Path],
-    arguments: Sequence[tuple],  # of ``make``, by image
+    jobs: Mapping[str, tuple],  # arguments of ``make`` by name of the image
     jpeg_quality: int,
     workers: int | None,
     progress: Callable[[int, int], None] | None,
-) -> None:
-    """Writes images as they are made, in processes side by side."""
-    jobs = [(make, path, own, jpeg_quality) for path, own in zip(paths, arguments, strict=True)]
-    for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
+) -> list[Path]:
+    """Writes camera, target, truth, and the images as they are made, in processes side by side; returns their paths."""
+    save_camera(folder / "cameras.txt", scene.camera)
+    save_target(folder / "target.toml", scene.target)
+    save(folder / "truth.json", json.dumps(truth.content()) + "\n")
+    paths = [folder / "images" / name for name in jobs]
+    calls = [(make, path, own, jpeg_quality) for path, own in zip(paths, jobs.values(), strict=True)]
+    for done, _ in enumerate(run_parallel(_write_image, calls, workers), 1):
         if progress:
-            progress(done, len(jobs))
+            progress(done, len(calls))
+    return paths
 
 
 def _write_image(make: Callable[..., np.ndarray], path: Path, arguments: tuple, jpeg_quality: int) -> None:
-    data = encode(make(*arguments), path.suffix, jpeg_quality)
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise unwritable(path, error) from error
+    save(path, encode(make(*arguments), path.suffix, jpeg_quality))

@@ -79,16 +79,14 @@ def tag_cube(edge_mm: float, dictionary: str = FAMILY, first_id: int = 0, size_s
     return _body("cube of tags", normals, edge_mm / 2, tag_mm, dictionary, first_id, size_sigma_mm)
 
 
-def tag_dodecahedron(
-    edge_mm: float, dictionary: str = FAMILY, first_id: int = 0, size_sigma_mm: float = 0.0
-) -> TargetDesign:
+def tag_dodecahedron(edge_mm: float, dictionary: str = FAMILY, first_id: int = 0) -> TargetDesign:
     """Return a dodecahedron of this edge with twelve tags; ids count up from ``first_id``."""
     signs = [(a, b) for a in (1, -1) for b in (1, -1)]
     corners = [np.roll([0.0, a, b * GOLDEN], k) for k in range(3) for a, b in signs]
     normals = np.array(corners) / np.sqrt(1 + GOLDEN**2)
     order = np.argsort(-normals @ normals[0], kind="stable")
     distance, tag_mm = edge_mm * DODECAHEDRON_WIDTH / 2, PENTAGON_SHARE * edge_mm
-    return _body("dodecahedron of tags", normals[order], distance, tag_mm, dictionary, first_id, size_sigma_mm)
+    return _body("dodecahedron of tags", normals[order], distance, tag_mm, dictionary, first_id)
 
 
 MOST_WIDTH_MM = 10_000.0
@@ -99,12 +97,11 @@ Body = Literal["cube", "dodecahedron"]
 def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, faces: str = "") -> TargetDesign:
     """Return a body of tags by its width between opposite faces, mm, which may be a text. ``faces`` : ids of the
     faces that it is to have, such as ``1,2,3,4,5``; all of them if empty."""
-    width, count = width_of(size), 6 if kind == "cube" else 12
+    width = width_of(size)
+    dodecahedron = tag_dodecahedron, width / DODECAHEDRON_WIDTH, 12
+    make, edge_mm, count = (tag_cube, width, 6) if kind == "cube" else dodecahedron
     family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
-    if kind == "cube":
-        whole = tag_cube(width, family, first_id)
-    else:
-        whole = tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
+    whole = make(edge_mm, family, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
     if unknown := [name for name in kept if name not in ids]:
         raise InputError("E-OPTION-VALUE", f"--faces {faces}: no face {unknown[0]}; use some of {', '.join(ids)}")
@@ -140,7 +137,7 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
     return text + tilted * (nearest < distance_mm)
 
 
-def _body(name, normals: np.ndarray, distance_mm, tag_mm, dictionary, first_id: int, size_sigma_mm) -> TargetDesign:
+def _body(name, normals: np.ndarray, distance_mm, tag_mm, dictionary, first_id: int, size_sigma_mm=0.0) -> TargetDesign:
     """Return a body of faces with these outward normals (n, 3), all at one distance from its middle."""
     tag_mm = float(np.round(tag_mm, 3))
     corners = tag_mm / 2 * np.array([[[-1, -1], [1, -1], [1, 1], [-1, 1]]], float)

@@ -80,7 +80,7 @@ def place_group(
     """Returns target_from_board and ``count`` camera_from_target. In every view both faces are tilted by up to 67°
     and the board by up to 50°, all of target and board is inside the image, and neither covers the other. Among the
     views that satisfy this, those farthest apart are chosen."""
-    best, shown = None, 0
+    places, shown = [], 0
     for _ in range(PLACES):
         target_from_board = _board_place(shape, rng)
         tried = max(CANDIDATES, CANDIDATES_PER_VIEW * count)
@@ -88,12 +88,10 @@ def place_group(
         faces_seen = np.flatnonzero((views.tilt_rad(shape.circles, shape.normals) <= MAX_FACE_TILT_RAD).all(1))
         valid = faces_seen[_board_seen(shape, target_from_board, views.rows(faces_seen), camera)]
         shown = max(shown, len(faces_seen))
-        if best is None or len(valid) > len(best[2]):
-            best = target_from_board, views, valid
+        places.append((target_from_board, views, valid))
         if len(valid) >= max(count, GOOD_SHARE * len(faces_seen)):
             break
-    assert best is not None  # PLACES is more than none
-    target_from_board, views, valid = best
+    target_from_board, views, valid = max(places, key=lambda place: len(place[2]))
     if len(valid) < count:
         width, height = np.ptp(shape.outline_board[:, :2], axis=0)
         raise DegenerateError(

@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
-from stcal.synthetic.scene import Group, ImageCircles, Scene, image_circles, rim_points
+from stcal.synthetic.scene import Group, ImageCircles, Pattern, Scene, image_circles, rim_points
 
 WALL_BEHIND_MM = 350.0
 WALL_CELL_MM = 35.0
@@ -39,47 +39,37 @@ class Look:
     lamps: tuple[float, float]
 
 
-BRIGHT = Look(circle=180, face=5, body=3, plate=5, wall=2, checker=(14, 27), lamps=(25, 225))
-DARK = Look(circle=24, face=205, body=140, plate=214, wall=85, checker=(75, 108), lamps=(8, 250))
+LOOKS: dict[Polarity, Look] = {
+    "bright": Look(circle=180, face=5, body=3, plate=5, wall=2, checker=(14, 27), lamps=(25, 225)),
+    "dark": Look(circle=24, face=205, body=140, plate=214, wall=85, checker=(75, 108), lamps=(8, 250)),
+}
+"""By the polarity of a target's or a board's circles."""
 
 
-def look_of(polarity: Polarity) -> Look:
-    """Returns the grey levels for a target or a board with circles of this polarity."""
-    return BRIGHT if polarity == "bright" else DARK
-
-
-def draw_background(
-    scene: Scene,
-    group: str,
-    image: int,
-    clutter: bool,
-    scenery_seed: int,
-    lens: ThinLens | None = None,
-    reflectance: float | None = None,
-) -> np.ndarray:
+def draw_background(scene: Scene, group: str, image: int, options: "RenderOptions") -> np.ndarray:
     """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery. A
     thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs."""
-    g, look = scene.groups[group], look_of(scene.target.polarity)
+    g, look = scene.groups[group], LOOKS[scene.target.polarity]
     canvas = np.full((scene.camera.height, scene.camera.width), round(look.wall), np.uint8)
     painter = _Painter(scene.camera, g.camera_from_target[image], canvas)
-    if clutter:
-        rng = np.random.default_rng([scene.seed, scenery_seed, list(scene.groups).index(group)])
+    if options.clutter:
+        rng = np.random.default_rng([scene.seed, options.seed, list(scene.groups).index(group)])
         wall = _wall(scene, g, rng)
         _draw_checker(painter, wall, look)
         _draw_lamps(painter, wall, look, rng)
-    if clutter or reflectance is not None:
-        _draw_reflections(painter, scene, g, reflectance)
+    if options.clutter or options.reflectance is not None:
+        _draw_reflections(painter, scene, g, options.reflectance)
     outlines = [*(scene.face_outline(face) for face in g.faces), scene.board_outline(group)]
     near_px = 0.0
-    if lens is not None:
+    if (lens := options.lens) is not None:
         middle_mm = (painter.camera_from_target @ np.vstack(outlines))[:, 2].mean()
         near_px = float(lens.confusion_px(scene.camera, middle_mm))
-        if clutter:
+        if options.clutter:
             far_px = float(lens.confusion_px(scene.camera, (painter.camera_from_target @ wall.translation)[2]))
             # Once more blurred with the target, the wall has the variance of its own circle of confusion.
             painter.canvas[:] = blur_evenly(painter.canvas, float(np.sqrt(max(far_px**2 - near_px**2, 0))))
     _draw_body(painter, scene, look)
-    painter.polygons(_edges(scene.board_outline(group)), look_of(scene.board.polarity).plate)
+    painter.polygons(_edges(scene.board_outline(group)), LOOKS[scene.board.polarity].plate)
     return blur_evenly(painter.canvas, near_px)
 
 
@@ -123,11 +113,12 @@ class _Painter:
         for outline, level in zip(pixel[near], np.broadcast_to(levels, len(near))[near], strict=True):
             self.fill(outline, level)
 
-    def circles(self, xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, level: float) -> None:
-        """Fills the circles (n, 3) of a plane that face the eye."""
-        shown = (self.centre - xyz) @ normal > 0
+    def circles(self, pattern: Pattern, level: float) -> None:
+        """Fills the circles that face the eye."""
+        shown = (self.centre - pattern.xyz_target) @ pattern.normal > 0
         if shown.any():
-            self.polygons(rim_points(xyz[shown], np.tile(normal, (shown.sum(), 1)), radius[shown], 48), level)
+            normals = np.tile(pattern.normal, (shown.sum(), 1))
+            self.polygons(rim_points(pattern.xyz_target[shown], normals, pattern.radius_mm[shown], 48), level)
 
     def fill(self, outline: np.ndarray, level: float) -> None:
         """Fills a polygon (k, 2) px."""
@@ -164,8 +155,7 @@ def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
 
 
 def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
-    n_discs, n_ellipses = 120, 60
-    n = n_discs + n_ellipses
+    n_discs, n = 120, 180  # the others are ellipses
     centre = np.column_stack([rng.uniform(-LAMP_REACH_MM, LAMP_REACH_MM, (n, 2)), np.full(n, 1.0)])
     radius = np.exp(rng.uniform(np.log(2.0), np.log(45.0), n))
     ratio = np.where(np.arange(n) < n_discs, 1.0, rng.uniform(0.2, 0.9, n))
@@ -186,18 +176,17 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: fl
     at = (outlines @ up).min() - TABLE_BELOW_MM
     if painter.centre @ up <= at:
         return
-    look, board, plate = look_of(scene.target.polarity), scene.board, look_of(scene.board.polarity)
+    look, plate = LOOKS[scene.target.polarity], LOOKS[scene.board.polarity]
     own = look.checker[1]
     mirror = replace(painter, mirror=(up, at), tone=lambda level: own + share * (level - own))
     if whole:
         _draw_body(mirror, scene, look)
-    for face in scene.target.faces:
-        normal = scene.target_from_face[face.id].rotation[:, 2]
-        mirror.circles(scene.face_circles(face.id), normal, face.radius_mm, look.circle)
+    *faces, board = scene.patterns(g.name)
+    for pattern in faces:
+        mirror.circles(pattern, look.circle)
     if whole:
         mirror.polygons(_edges(scene.board_outline(g.name)), plate.plate)
-    normal = -g.target_from_board.rotation[:, 2]
-    mirror.circles(g.board_circles_target, normal, board.radii_mm(), plate.circle)
+    mirror.circles(board, plate.circle)
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
@@ -295,18 +284,14 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
     if scene.camera.fisheye:
         fault = "rendering: thin lens of an equidistant camera"
         raise InputError("E-SIMULATE-OPTIONS", f"{fault}; a perspective camera needed, or leave the f-number out")
-    widest, at_mm = 0.0, lens.focus_mm
-    for name, group in scene.groups.items():
-        for image in range(len(group.camera_from_target)):
-            depth = image_circles(scene, name, image).xyz_camera[:, 2]
-            confusion = lens.confusion_px(scene.camera, depth)
-            if len(depth) and confusion.max() > widest:
-                widest, at_mm = float(confusion.max()), float(depth[confusion.argmax()])
-    if widest > WIDEST_PX:
+    depth = np.concatenate([image_circles(scene, *view).xyz_camera[:, 2] for view in scene.views()])
+    confusion = lens.confusion_px(scene.camera, depth)
+    if len(depth) and confusion.max() > WIDEST_PX:
         raise InputError(
             "E-SIMULATE-OPTIONS",
-            f"rendering: focused at {lens.focus_mm:g} mm, a circle at {at_mm:.0f} mm is blurred to a radius of "
-            f"{widest:.0f} px, at most {WIDEST_PX:g} possible; focus nearer to it, or take a larger f-number",
+            f"rendering: focused at {lens.focus_mm:g} mm, a circle at {depth[confusion.argmax()]:.0f} mm is blurred "
+            f"to a radius of {confusion.max():.0f} px, at most {WIDEST_PX:g} possible; focus nearer to it, or take a "
+            "larger f-number",
         )
 
 
@@ -316,19 +301,17 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)
-    picture = draw_background(scene, group, image, options.clutter, options.seed, options.lens, options.reflectance)
-    picture = picture.astype(np.float32)
-    board, face = look_of(scene.board.polarity).circle, look_of(scene.target.polarity).circle
+    picture = draw_background(scene, group, image, options).astype(np.float32)
+    board, face = LOOKS[scene.board.polarity].circle, LOOKS[scene.target.polarity].circle
     dot = np.array([isinstance(label, DotLabel) for label in circles.labels], bool)
-    base = np.where(dot, board, face)
-    levels = base * (1 + options.spread * rng.standard_normal(len(base)))
+    levels = np.where(dot, board, face) * (1 + options.spread * rng.standard_normal(len(dot)))
     rim_mm = np.where(dot, scene.board.rim_mm, options.rim_mm)
     rings = {DotLabel(*cell) for cell in scene.board.rings}
     holes = np.array([label in rings for label in circles.labels], bool)
     if holes.any():
         # The light of a hole is that of the plate in place of its dot's; circles are added to the plate's.
-        plate = look_of(scene.board.polarity).plate
-        every = circles.rows(np.append(np.arange(len(base)), np.flatnonzero(holes)))
+        plate = LOOKS[scene.board.polarity].plate
+        every = circles.rows(np.append(np.arange(len(dot)), np.flatnonzero(holes)))
         radius_mm = np.append(circles.radius_mm, HOLE_SHARE * circles.radius_mm[holes])
         circles = replace(every, radius_mm=radius_mm)
         levels = np.append(levels, 2 * plate - levels[holes])
@@ -380,7 +363,7 @@ def _add_circles(
         if lens is not None and confusion[i] > SHARP_PX:
             share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px, own)
         else:
-            share = shares[0] if len(shares) == 1 else np.minimum(*shares)
+            share = np.minimum.reduce(shares)
             share = share if own is None else share * own
         if blur_px > 0:
             share = cv2.GaussianBlur(share, (0, 0), blur_px * FINE, borderType=cv2.BORDER_REPLICATE)

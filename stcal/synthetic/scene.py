@@ -1,9 +1,10 @@
 """Scenes of a target and a board before a camera, perspective or wide, and observations without rendered pixels."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from itertools import combinations
-from typing import Any
+from itertools import chain, combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -148,6 +149,10 @@ class Scene(Brief):
         """Id of the face whose frame is the target frame."""
         return self.target.faces[0].id
 
+    def views(self) -> list[tuple[str, int]]:
+        """Returns group and number of all photographs."""
+        return [(name, i) for name, group in self.groups.items() for i in range(len(group.camera_from_target))]
+
     def face_circles(self, face_id: str) -> np.ndarray:
         """Returns the circle centres of a face, (n, 3), target frame, in the design's order."""
         return np.array([self.circles_target[label] for label in self.target.face(face_id).labels()])
@@ -156,9 +161,27 @@ class Scene(Brief):
         """Returns the corners of the visible side of a face, (k, 3), target frame."""
         return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id), self.margin_mm)
 
+    def patterns(self, group: str) -> "Iterator[Pattern]":
+        """Yields the circles of each face, and those of the board of a group."""
+        for face in self.target.faces:
+            normal = self.target_from_face[face.id].rotation[:, 2]
+            yield Pattern(face.labels(), self.face_circles(face.id), normal, face.radius_mm)
+        g = self.groups[group]
+        normal = -g.target_from_board.rotation[:, 2]
+        yield Pattern(self.board.labels(), g.board_circles_target, normal, self.board.radii_mm())
+
     def board_outline(self, group: str) -> np.ndarray:
         """Returns the corners of the board's plate, (4, 3), target frame."""
         return self.groups[group].target_from_board @ _board_rectangle(self.board)
+
+
+class Pattern(NamedTuple):
+    """Circles of one plane: labels, centres (n, 3) and outward normal (3,) in the target frame, and radii, mm."""
+
+    labels: Sequence[Label]
+    xyz_target: np.ndarray
+    normal: np.ndarray
+    radius_mm: np.ndarray
 
 
 @require_arguments
@@ -191,7 +214,9 @@ def make_scene(
         model = camera_model(camera)
         if not (model.width and model.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file")
-        scene = make_scene(seen_by(options, model), target, board, nominal)
+        distortion = () if FISHEYE in model.colmap_model else tuple(model.distortion[:8])
+        like_it = {"focal_px": float(np.sqrt(model.focal.prod())), "distortion": distortion}
+        scene = make_scene(replace(options, width=model.width, height=model.height, **like_it), target, board, nominal)
         return replace(scene, camera=model.calibrated(0, 0))
     if options.fisheye_deg is not None:
         perspective = replace(options, focal_px=PLACED_FOCAL * options.width, fisheye_deg=None)
@@ -218,14 +243,6 @@ def make_scene(
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
     return Scene(target, board, camera, target_from_face, circles, groups, options.seed, options.margin_mm)
-
-
-def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
-    """Returns options that place views for the camera of a file, which must state its image size."""
-    focal_px = float(np.sqrt(file.focal.prod()))
-    distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
-    size: dict[str, Any] = {"width": file.width, "height": file.height}
-    return replace(options, **size, focal_px=focal_px, distortion=distortion)
 
 
 def group_name(pair: tuple[str, str]) -> str:
@@ -384,21 +401,11 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     """Returns the circles that face the camera and whose centres lie in the image."""
     g = scene.groups[group]
     camera_from_target = g.camera_from_target[image]
-    labels, xyz, normal, radius, wanted = [], [], [], [], []
-    for face in scene.target.faces:
-        labels += face.labels()
-        xyz.append(scene.face_circles(face.id))
-        normal.append(np.tile(scene.target_from_face[face.id].rotation[:, 2], (len(face.ids), 1)))
-        radius.append(face.radius_mm)
-        wanted += [face.id in g.faces] * len(face.ids)
-    labels += scene.board.labels()
-    xyz.append(g.board_circles_target)
-    normal.append(np.tile(-g.target_from_board.rotation[:, 2], (len(g.board_circles_target), 1)))
-    radius.append(scene.board.radii_mm())
-    wanted += [True] * len(g.board_circles_target)
-
+    labels, xyz, normal, radius = zip(*scene.patterns(group), strict=True)
+    count = [len(own) for own in labels]
+    wanted = np.repeat([*(face.id in g.faces for face in scene.target.faces), True], count)
     xyz = camera_from_target @ np.vstack(xyz)
-    normal = np.vstack(normal) @ camera_from_target.rotation.T
+    normal = np.repeat(normal, count, axis=0) @ camera_from_target.rotation.T
     radius = np.concatenate(radius)
     cosine = -(xyz * normal).sum(1) / np.linalg.norm(xyz, axis=1)
     tilt = np.arccos(np.clip(cosine, -1, 1))
@@ -410,8 +417,8 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     near = np.flatnonzero(~whole)  # the rims near the border alone are computed
     rim = scene.camera.project(rim_points(xyz[near], normal[near], radius[near]))
     whole[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
-    findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
-    return ImageCircles(tuple(labels), xyz, normal, radius, tilt, centre, findable).rows(shown)
+    findable = wanted & (tilt <= MAX_FOUND_TILT_RAD) & whole
+    return ImageCircles(tuple(chain(*labels)), xyz, normal, radius, tilt, centre, findable).rows(shown)
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:

@@ -202,7 +202,7 @@ def test_squares_and_tags_are_read_back(board):
 def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
     board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark", rings=((0, 1), (3, 2)))
     (part,) = parts_of(board, 10.0)
-    discs = [(s.x, -s.y, s.radius, s.ink) for s in part.pattern() if isinstance(s, Disc)]
+    discs = [(s.x, -s.y, s.radius, s.ink) for s in part.shapes if s.layer == "PATTERN" and isinstance(s, Disc)]
     holes = [(x, y, 1.5, "white") for x, y in board.xy_mm()[[1, 14]]]
     wanted = [*((x, y, 3.0, "black") for x, y in board.xy_mm()), *holes]
     assert [ink for *_, ink in discs] == [ink for *_, ink in wanted]
