@@ -5,17 +5,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import BeforeValidator
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
-from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, checked, read_result
+from stcal.io.json import Matrix, Part, Pose, PoseCovariance, TransformMatrix, checked, read_result
 from stcal.io.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
 from stcal.locate.scenes import Located
@@ -39,7 +38,7 @@ class RegistrationRead(Part):
     format: Literal["stcal registration 1"] = "stcal registration 1"
     model: str
     method: str
-    b_from_a: Annotated[Matrix4, BeforeValidator(lambda given: given.matrix() if hasattr(given, "matrix") else given)]
+    b_from_a: TransformMatrix
     covariance: Matrix
 
 
@@ -85,11 +84,10 @@ class GoalChain(Brief):
             )
 
 
-def _mounted(hand_eye: object, robot_poses: object) -> tuple[str, UncertainRigid]:
-    """Returns name and pose of the camera; robot poses decide which name an unnamed transform has."""
+def _mounted(hand_eye: object, robot_poses: object) -> tuple[bool, UncertainRigid]:
+    """Returns whether the camera is on the flange, and its pose; robot poses decide what an unnamed transform is."""
     if isinstance(hand_eye, Rigid):
-        return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
-    where = _named("hand-eye", hand_eye)
+        return robot_poses is not None, UncertainRigid.exact(hand_eye)
     if isinstance(hand_eye, str | Path):
         read = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     else:
@@ -98,9 +96,10 @@ def _mounted(hand_eye: object, robot_poses: object) -> tuple[str, UncertainRigid
     either = {MOVING: read.flange_from_camera, FIXED: read.base_from_camera}
     given = {name: Rigid.from_matrix(matrix) for name, matrix in either.items() if matrix is not None}
     if len(given) != 1:
-        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed")
+        found = f"{_named('hand-eye', hand_eye)}: {' and '.join(given) or 'neither'}"
+        raise InputError("E-HANDEYE-FILE", f"{found}; {MOVING} or {FIXED} needed")
     [(name, pose)] = given.items()
-    return name, UncertainRigid(pose, np.zeros((6, 6)) if read.covariance is None else read.covariance)
+    return name == MOVING, UncertainRigid(pose, np.zeros((6, 6)) if read.covariance is None else read.covariance)
 
 
 def _registered(registration: object) -> UncertainRigid:
@@ -281,10 +280,9 @@ def goal_chain(
             "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
         )
     if hand_eye is None:
-        name, mount, source = FIXED, _registered(registration), _named("registration", registration)
+        moving, mount, source = False, _registered(registration), _named("registration", registration)
     else:
-        (name, mount), source = _mounted(hand_eye, robot_poses), _named("hand-eye", hand_eye)
-    moving = name == MOVING
+        (moving, mount), source = _mounted(hand_eye, robot_poses), _named("hand-eye", hand_eye)
     if moving and robot_poses is None:
         raise InputError(
             "E-OPTION-MISSING",

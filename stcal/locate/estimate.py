@@ -150,10 +150,6 @@ class SeenTags(Brief):
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, keep) -> "SeenTags":
-        """Returns the selected tags."""
-        return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep], self.edge_sigma_px[keep])
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ObjPose(ImageFit, Brief):
@@ -278,21 +274,16 @@ def problem_of(
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:
     """Returns the pose that fits most corners, among those from all corners together and from each tag alone."""
-    tags = [slice(4 * k, 4 * k + 4) for k in range(len(problem.xy) // 4)]
-    for sets in ([slice(None)], tags):
-        poses = []
-        for corners in sets:
-            with suppress(DegenerateError):
-                poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
-        if not poses:
-            continue
+    poses = []
+    for corners in (slice(None), *(slice(k, k + 4) for k in range(0, len(problem.xy), 4))):
+        with suppress(DegenerateError):
+            poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
+    if poses:
         view = project(problem, Poses.of(poses))
         distance = np.linalg.norm(problem.in_px(view.residual), axis=2)
         score = np.where(view.before, np.log1p((distance / START_PX) ** 2).sum(1), np.inf)
-        best = int(score.argmin())
-        # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
-        if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
-            return poses[best]
+        if np.isfinite(score.min()):
+            return poses[int(score.argmin())]
     raise DegenerateError(
         "E-LOCATE-NO-POSE", f"{where}: no pose explains the tags' corners; check layout, camera file and tags"
     )
@@ -355,7 +346,6 @@ class Merged:
     """Corners of all exposures by :func:`merge`."""
 
     seen: SeenTags  # of the layout's tags
-    counts: tuple[int, ...]  # of these tags in each exposure
     share: float  # of the corners' variance that differs between exposures
     shifts: tuple[Shift, ...]  # of each exposure against the one with the most tags in common
     repeated: tuple[tuple[str, int], ...]  # tags that an exposure shows more than once
@@ -394,7 +384,6 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(8)
     return Merged(
         SeenTags(used, mean, merged, (weight_share.mean(2) * edge).sum(0)),
-        tuple(int(n) for n in visible.sum(1)),
         share,
         _shifts(corners, covariance, visible, names or [str(k + 1) for k in range(len(exposures))]),
         tuple(sorted({tag for tags in exposures for tag in tags.repeated if tag in rows})),

@@ -160,10 +160,9 @@ def require_layout_written(path: str | Path, layout: TargetLayout) -> None:
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square to its corners."""
-    nominal = UNIT_SQUARE
     middle = corners.mean(0)
-    along = np.sum((corners - middle) * nominal)
-    across = np.sum((corners - middle) @ np.array([[0, -1], [1, 0]]) * nominal)
+    along = np.sum((corners - middle) * UNIT_SQUARE)
+    across = np.sum((corners - middle) @ np.array([[0, -1], [1, 0]]) * UNIT_SQUARE)
     cosine, sine = np.array([along, across]) / np.hypot(along, across)
     turn = np.array([[cosine, sine], [-sine, cosine]])
     return turn, -turn @ middle

@@ -11,7 +11,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
-from stcal.io.json import Finite, Named, Part, Pose, ResultFile, Shape
+from stcal.io.json import Finite, Named, Part, Pose, ResultFile, Rows, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
 from stcal.locate.base_chain import GoalChain, Goals, accepted, uncertain
 from stcal.locate.estimate import Merged, ObjPose
@@ -170,8 +170,6 @@ def _picture(
     }
 
 
-Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
-"""Rows of the layout's tags."""
 Corners = Annotated[np.ndarray, Shape((None, 4, 2))]
 OF_FIT = Named("covariance second delta_chi2 rms_px chi2 redundancy p_value rows outliers residuals_px weights")
 OF_PATENT = Named("exposure second errors_px det_j same exposures")

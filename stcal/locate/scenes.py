@@ -368,18 +368,17 @@ def locate_image(
     if size != wanted:
         raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
     exposure = detect(grey_8bit(grey), name, target.dictionaries())
-    return locate_scene(SceneTags(name, (exposure,)), target, model, options, lambda _: grey)
+    return locate_scene(SceneTags(name, (exposure,)), target, model, options or LocateOptions(), lambda _: grey)
 
 
 def locate_scene(
     scene: SceneTags,
     layout: TargetLayout,
     camera: CameraModel,
-    options: LocateOptions | None = None,
-    image_of: Callable[[str], np.ndarray] | None = None,
+    options: LocateOptions,
+    image_of: Callable[[str], np.ndarray],
 ) -> Located:
     """Locates the target in one scene and judges the pose; in an image without its tags, others are looked for."""
-    options = options or LocateOptions()
     used, notes = scene.exposures, [f"left out: {trouble}" for trouble in scene.unreadable]
     merged = None
 
@@ -408,7 +407,7 @@ def locate_scene(
         for each in used
         if each.tags.smear_px
     ]
-    if not sum(merged.counts) and image_of:
+    if not len(merged.seen):
         if unknown:
             return rejected(
                 f"no tag of the layout, but others of its dictionaries ({unknown}); is it the layout of this target?"
@@ -419,8 +418,6 @@ def locate_scene(
     if merged.repeated:
         names = ", ".join(str(tag) for _, tag in merged.repeated)
         return rejected(f"tags seen twice: {names}; every id once in view needed; cover the copy")
-    if not len(merged.seen):
-        return rejected("no tag of the layout; 1 needed")
     moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
     if moved:
         shift = max(moved, key=lambda shift: shift.shift_px)
@@ -451,10 +448,8 @@ def locate_scene(
     if pose.outliers:
         ids = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
         notes.append(f"tags that contradict the others, left out: {ids}")
-    explained = mistakes(merged.seen, pose) if pose.outliers else []
     pose, verdict = judge(pose, options.verdict)
-    if verdict.decision == "reject":
-        explained = explained or mistakes(merged.seen, pose)
-    if explained:
+    doubtful = pose.outliers or verdict.decision == "reject"
+    if doubtful and (explained := mistakes(merged.seen, pose)):
         verdict = replace(verdict, decision="reject", reasons=(*verdict.reasons, *explained))
     return Located(scene, merged, pose, verdict, tuple(notes))

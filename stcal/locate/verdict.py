@@ -1,12 +1,13 @@
 """Verdict on a pose, and the mistake in a layout that explains a bad fit; for comparison, the method of the CN patent
 "monocular visual target positioning" (Anhui Yuanguji), steps S5 to S9."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 from scipy.special import chdtri
 
 from stcal.boards.tags import Tags
@@ -14,11 +15,12 @@ from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import PlanePoses, apply_homography, covariance_of_both, deciding_delta, poses_of_plane
+from stcal.geometry.plane import covariance_of_both, deciding_delta, poses_of_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import ObjPose, SeenTags, locate, reprojection_rms
 from stcal.locate.layout import TargetLayout
+from stcal.locate.layout_calibration import plane_points
 
 Decision = Literal["accept", "ambiguous", "reject"]
 
@@ -175,10 +177,8 @@ def _other_size(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: 
     """Yields the layout with tags of the size, about their middles, at which the image has them."""
     if pose is None:
         return
-    from_obj, stated = pose.camera_from_obj, layout.corners_mm[detected.rows]
-    plane = np.linalg.inv(np.column_stack([from_obj.rotation[:, :2], from_obj.translation]))
-    rays = camera.normalised_from_pixel(detected.corners_px.reshape(-1, 2))
-    seen = apply_homography(plane, rays).reshape(stated.shape)
+    stated, rays = layout.corners_mm[detected.rows], camera.normalised_from_pixel(detected.corners_px.reshape(-1, 2))
+    seen = plane_points(pose.camera_from_obj, rays).reshape(stated.shape)
     middle_seen, middle = (corners.mean(axis=1, keepdims=True) for corners in (seen, stated))
     apart = [float(np.linalg.norm(places - places.mean(axis=0))) for places in (middle_seen, middle)]
     size = float(np.median(np.linalg.norm(seen - middle_seen, axis=2) / np.linalg.norm(stated - middle, axis=2)))
@@ -275,31 +275,17 @@ def largest_area(corners: Sequence[np.ndarray], share: float) -> tuple[dict[int,
     """Returns the areas, px², that the exposures with the most tags span, and those of these exposures that span more
     than ``share`` of the largest (S5); ``corners`` : (k, 4, 2) px of each exposure."""
     most = max(map(len, corners))
-    area = {i: triangulated_area(each.reshape(-1, 2)) for i, each in enumerate(corners) if len(each) == most}
+    area = {i: 0.0 for i, each in enumerate(corners) if len(each) == most}
+    for i in area:  # Delaunay's triangles fill the convex hull
+        with suppress(QhullError):  # collinear points span nothing
+            area[i] = float(ConvexHull(corners[i].reshape(-1, 2)).volume)
     return area, [i for i in area if area[i] > share * max(area.values())]
 
 
-def triangulated_area(points: np.ndarray) -> float:
-    """Returns the sum of the Delaunay triangles' areas by Heron's formula, px²; 0 for collinear points."""
-    try:
-        triangles = points[Delaunay(points).simplices]
-    except QhullError:
-        return 0.0
-    a, b, c = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).T
-    s = (a + b + c) / 2
-    return float(np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0)).sum())
-
-
 def locate_as_patent(
-    exposures: Sequence[Tags],
-    layout: TargetLayout,
-    camera: Camera,
-    options: PatentOptions | None = None,
-    where: str = "scene",
-    solve: Callable[[np.ndarray, np.ndarray], PlanePoses] = poses_of_plane,
+    exposures: Sequence[Tags], layout: TargetLayout, camera: Camera, options: PatentOptions, where: str = "scene"
 ) -> PatentPose:
     """Applies the gate (S5 to S9) to the exposure of least IPPE error; raises DegenerateError: no tag, or no pose."""
-    options = options or PatentOptions()
     rows = layout.rows()
     listed = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
     corners = [tags.corners_px[of_layout] for tags, of_layout in zip(exposures, listed, strict=True)]
@@ -312,7 +298,7 @@ def locate_as_patent(
         xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in listed[i]]].reshape(-1, 2)
         pixels = corners[i].reshape(-1, 2)
         try:
-            found = solve(xy, camera.normalised_from_pixel(pixels))
+            found = poses_of_plane(xy, camera.normalised_from_pixel(pixels))
         except DegenerateError:
             continue
         (low, first), (high, second) = sorted(
@@ -324,8 +310,8 @@ def locate_as_patent(
             same = (first @ second.inverse()).angle_rad() < SAME_RAD  # T_a and T_b are equivalent (S8)
             same = bool(same and shift < SAME_SHARE * np.linalg.norm(first.translation))
             verdict = gate(found.determinant, low, high / max(low, 1e-9), same, options)
-            pair, count = (first, second, (low, high)), len(listed[i])
-            best = PatentPose(i, tuple(chosen), *pair, found.determinant, count, verdict, same=same)
+            figures = (low, high), found.determinant, len(listed[i])
+            best = PatentPose(i, tuple(chosen), first, second, *figures, verdict, same=same)
     if best is None:
         raise DegenerateError(
             "E-LOCATE-NO-POSE",
