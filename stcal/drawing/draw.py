@@ -119,21 +119,15 @@ MOST_MM = 5000.0  # largest side of a page in a PDF, mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlacedShapes:
-    """Shapes in the sheet's frame, clipped to the box ``clip`` (2, 2) if it is given."""
-
-    shapes: tuple[Shape, ...]
-    clip: np.ndarray | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
     """A page with its origin at the bottom left."""
 
     title: str
     width: float
     height: float
-    placed: tuple[PlacedShapes, ...]
+    shapes: tuple[Shape, ...]  # of the parts
+    furniture: tuple[Shape, ...]
+    clip: np.ndarray | None = None  # box (2, 2) of what is drawn of the parts; all of them if None
     bare: bool = False  # whether the part is without dimensions, with which it would take more sheets
 
 
@@ -196,7 +190,7 @@ def _ways(part: Piece, paper: str) -> list[_Way]:
     for bare, size in product((False, True), ((width, height), (height, width))):
         shapes = framed(part, bare)
         box, room = extent(shapes), np.array(size) - FURNITURE
-        across, down = (seams_between(*box[:, k].tolist(), float(room[k]), boxes[:, :, k]) for k in (0, 1))
+        across, down = (seams_between(box[:, k].tolist(), float(room[k]), boxes[:, :, k]) for k in (0, 1))
         low, high = np.moveaxis(boxes, 1, 0)
         cuts = any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in (across, down)[k])
         way = _Way(shapes, box, size, (across, down), cuts, bare)
@@ -205,10 +199,10 @@ def _ways(part: Piece, paper: str) -> list[_Way]:
     return ways
 
 
-def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
+def seams_between(ends: Sequence[float], room: float, taken: np.ndarray) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
     Seams avoid the intervals ``taken`` (n, 2) if they can."""
-    seams, start = [], low
+    seams, (start, high) = [], ends
     while high - start > room:
         place = last = start + room - OVERLAP / 2
         while len(hit := taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]):
@@ -259,8 +253,7 @@ def _sheet(title: str, width: float, height: float, shapes: Iterable[Shape], shi
     if clip is not None:
         instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
     words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
-    placed = PlacedShapes(tuple(moved(shape, shift) for shape in shapes), clip)
-    return Sheet(title, width, height, (placed, PlacedShapes((*bars, *words))))
+    return Sheet(title, width, height, tuple(moved(shape, shift) for shape in shapes), (*bars, *words), clip)
 
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
@@ -277,14 +270,15 @@ def svg(sheet: Sheet) -> str:
         f'viewBox="0 0 {width} {height}">',
         f"<title>{escape(sheet.title)}</title>",
     ]
-    for number, placed in enumerate(sheet.placed):
-        clip = ""
-        if placed.clip is not None:
-            path, clip = _path([corners_of(placed.clip)], sheet.height), f' clip-path="url(#clip{number})"'
-            lines.append(f'<clipPath id="clip{number}"><path d="{path}"/></clipPath>')
+    clip = ""
+    if sheet.clip is not None:
+        clip = ' clip-path="url(#clip0)"'
+        lines.append(f'<clipPath id="clip0"><path d="{_path([corners_of(sheet.clip)], sheet.height)}"/></clipPath>')
+    for every, attribute in ((sheet.shapes, clip), (sheet.furniture, "")):
         for layer in LAYERS:
-            if shapes := [shape for shape in placed.shapes if shape.layer == layer]:
-                lines += [f'<g class="{layer}"{clip}>', *(_element(shape, sheet.height) for shape in shapes), "</g>"]
+            if shapes := [shape for shape in every if shape.layer == layer]:
+                elements = (_element(shape, sheet.height) for shape in shapes)
+                lines += [f'<g class="{layer}"{attribute}>', *elements, "</g>"]
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -330,13 +324,12 @@ def pdf(sheets: Sequence[Sheet]) -> bytes:
     for sheet in sheets:
         canvas.setPageSize((sheet.width / POINT_MM, sheet.height / POINT_MM))
         canvas.scale(1 / POINT_MM, 1 / POINT_MM)  # from here on lengths are in mm, upwards from the lower left corner
-        for placed in sheet.placed:
+        for shapes, clip in ((sheet.shapes, sheet.clip), (sheet.furniture, None)):
             canvas.saveState()
-            if placed.clip is not None:
-                canvas.clipPath(_outline(canvas, [corners_of(placed.clip)]), stroke=0)
-            for layer in LAYERS:
-                for shape in (layer_shape for layer_shape in placed.shapes if layer_shape.layer == layer):
-                    _add(canvas, shape)
+            if clip is not None:
+                canvas.clipPath(_outline(canvas, [corners_of(clip)]), stroke=0)
+            for shape in sorted(shapes, key=lambda shape: LAYERS.index(shape.layer)):
+                _add(canvas, shape)
             canvas.restoreState()
         canvas.showPage()
     canvas.save()

@@ -59,7 +59,7 @@ OBLIQUE_RAD = np.radians(50)
 
 def shapes_of(sheet) -> list:
     """All shapes of a page."""
-    return [shape for item in sheet.placed for shape in item.shapes]
+    return [*sheet.shapes, *sheet.furniture]
 
 
 def page_image(sheet) -> np.ndarray:
@@ -277,13 +277,11 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
     place = {s.name: np.array([s.x, s.y]) for s in part.shapes if isinstance(s, Disc)}
     whole, covered = set(), 0.0
     for sheet in sheets:
-        (tile, furniture) = sheet.placed
-        assert tile.clip is not None
-        assert furniture.clip is None
-        low, high = tile.clip
+        assert sheet.clip is not None
+        low, high = sheet.clip
         assert (low >= [EDGE + SIDE - 1e-9, EDGE + FOOT - 1e-9]).all()
         assert (high <= np.array([sheet.width, sheet.height]) - EDGE + 1e-9).all()
-        discs = [s for s in tile.shapes if isinstance(s, Disc)]
+        discs = [s for s in sheet.shapes if isinstance(s, Disc)]
         shifts = np.array([[s.x, s.y] - place[s.name] for s in discs])
         np.testing.assert_allclose(shifts - shifts[0], 0, atol=1e-9)
         inner = [low + OVERLAP / 2 - 1e-9, high - OVERLAP / 2 + 1e-9]  # what is left when cut along the seams
@@ -293,7 +291,7 @@ def test_sheets_cover_the_board_and_seams_run_between_dots():
                 whole.add(disc.name)
             cut = ((box[0] < inner[0]) & (box[1] > inner[0])) | ((box[0] < inner[1]) & (box[1] > inner[1]))
             assert not cut.any(), disc.name
-        marks = [s for s in tile.shapes if isinstance(s, Outline) and s.ink == "white"]
+        marks = [s for s in sheet.shapes if isinstance(s, Outline) and s.ink == "white"]
         assert len(marks) >= 6  # both strokes of at least three crosses
         covered += np.prod(high - low)
     assert whole == set(place)
