@@ -441,7 +441,8 @@ def write_body(
 
     Raises InputError: the folder is not empty or cannot be written.
     """
-    with new_dataset(Path(folder)):
+    out = Path(folder)
+    with new_dataset(out):
         truth, drawings = body_truth(scene, image_format), scene.drawings()
         jobs = {name: (scene, i, drawings) for i, name in enumerate(truth.camera_from_target or ())}
-        return write_scene(Path(folder), scene, truth, render_body, jobs, jpeg_quality, workers, progress)
+        return write_scene(out, scene.target, scene.camera, truth, render_body, jobs, jpeg_quality, workers, progress)

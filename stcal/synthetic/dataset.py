@@ -13,8 +13,10 @@ from pydantic import Field
 
 from stcal.boards.board_file import save_board
 from stcal.boards.target_file import save_target
+from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import Camera
 from stcal.io.cameras.read import save_camera
 from stcal.io.files import save, unwritable
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
@@ -89,7 +91,7 @@ class TruthFile(ResultFile):
         options = options or RenderOptions()
         optics: dict[str, Any] = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
         optics |= {"rim_mm": options.rim_mm} if options.rim_mm else {}
-        given = {"optics": TrueOptics(**optics)} if optics else {}
+        given: dict[str, Any] = {"optics": TrueOptics(**optics)} if optics else {}
         groups = {}
         for name, group in scene.groups.items():
             shown = [_circles(scene, name, i) for i in range(len(group.camera_from_target))]
@@ -211,12 +213,13 @@ def write_dataset(
         save_board(folder / "board.toml", scene.board)
         jobs = {image_name(*view, image_format): (scene, *view, options) for view in scene.views()}
         truth = TruthFile.of(scene, image_format, options)
-        return write_scene(folder, scene, truth, render, jobs, jpeg_quality, workers, progress)
+        return write_scene(folder, scene.target, scene.camera, truth, render, jobs, jpeg_quality, workers, progress)
 
 
 def write_scene(
     folder: Path,
-    scene: Any,  # with a target and a camera
+    target: TargetDesign,
+    camera: Camera,
     truth: TruthFile,
     make: Callable[..., np.ndarray],
     jobs: Mapping[str, tuple],  # arguments of ``make`` by name of the image
@@ -225,8 +228,8 @@ def write_scene(
     progress: Callable[[int, int], None] | None,
 ) -> list[Path]:
     """Writes camera, target, truth, and the images as they are made, in processes side by side; returns their paths."""
-    save_camera(folder / "cameras.txt", scene.camera)
-    save_target(folder / "target.toml", scene.target)
+    save_camera(folder / "cameras.txt", camera)
+    save_target(folder / "target.toml", target)
     save(folder / "truth.json", json.dumps(truth.content()) + "\n")
     paths = [folder / "images" / name for name in jobs]
     calls = [(make, path, own, jpeg_quality) for path, own in zip(paths, jobs.values(), strict=True)]

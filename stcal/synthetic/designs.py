@@ -98,8 +98,10 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
     """Return a body of tags by its width between opposite faces, mm, which may be a text. ``faces`` : ids of the
     faces that it is to have, such as ``1,2,3,4,5``; all of them if empty."""
     width = width_of(size)
-    dodecahedron = tag_dodecahedron, width / DODECAHEDRON_WIDTH, 12
-    make, edge_mm, count = (tag_cube, width, 6) if kind == "cube" else dodecahedron
+    make, edge_mm, count = {
+        "cube": (tag_cube, width, 6),
+        "dodecahedron": (tag_dodecahedron, width / DODECAHEDRON_WIDTH, 12),
+    }[kind]
     family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
     whole = make(edge_mm, family, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
