@@ -274,16 +274,21 @@ def problem_of(
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:
     """Returns the pose that fits most corners, among those from all corners together and from each tag alone."""
-    poses = []
-    for corners in (slice(None), *(slice(k, k + 4) for k in range(0, len(problem.xy), 4))):
-        with suppress(DegenerateError):
-            poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
-    if poses:
+    tags = [slice(4 * k, 4 * k + 4) for k in range(len(problem.xy) // 4)]
+    for sets in ([slice(None)], tags):
+        poses = []
+        for corners in sets:
+            with suppress(DegenerateError):
+                poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
+        if not poses:
+            continue
         view = project(problem, Poses.of(poses))
         distance = np.linalg.norm(problem.in_px(view.residual), axis=2)
         score = np.where(view.before, np.log1p((distance / START_PX) ** 2).sum(1), np.inf)
-        if np.isfinite(score.min()):
-            return poses[int(score.argmin())]
+        best = int(score.argmin())
+        # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
+        if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
+            return poses[best]
     raise DegenerateError(
         "E-LOCATE-NO-POSE", f"{where}: no pose explains the tags' corners; check layout, camera file and tags"
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import block_diag, null_space
@@ -84,7 +84,8 @@ class _Rows:
     slopes: Callable[[np.ndarray], np.ndarray]  # (r, 2c, k) by these values, from those (r, c, 2, 3) by the points
 
     @classmethod
-    def of(cls, images: Sequence[ImageCorners], seen: Sequence[np.ndarray], noise: Sequence, *places) -> "_Rows":
+    def of(cls, images: Sequence[ImageCorners], kind: Literal["board_", ""], *places) -> "_Rows":
+        seen, noise = ([getattr(image, kind + name) for image in images] for name in ("seen", "noise"))
         image = np.repeat(np.arange(len(images)), [len(each) for each in noise])
         focal = np.array([each.focal_px for each in images])[image]
         return cls(image, np.concatenate(seen).reshape(len(image), -1, 2), np.concatenate(noise), focal, *places)
@@ -130,15 +131,13 @@ class _Layout:
         modes = prints.modes.reshape(len(drawn), 3, -1)[place.ravel()]  # (r, 3, m) at the board's points
         board = _Rows.of(
             images,
-            [image.board_seen for image in images],
-            [image.board_noise for image in images],
+            "board_",
             lambda along: (xyz + modes @ along.array[0])[:, None],
             lambda by_place: by_place[:, 0] @ modes,
         )
         tags = _Rows.of(
             images,
-            [image.seen for image in images],
-            [image.noise for image in images],
+            "",
             lambda corners: np.pad(corners.array[tag].reshape(-1, 4, 2), ((0, 0), (0, 0), (0, 1))),
             lambda by_place: block_diagonal(by_place[..., :2]),
         )
