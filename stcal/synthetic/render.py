@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
-from stcal.synthetic.scene import Group, ImageCircles, Pattern, Scene, image_circles, rim_points
+from stcal.synthetic.scene import Group, ImageCircles, PlacedCircles, Scene, image_circles, rim_points
 
 WALL_BEHIND_MM = 350.0
 WALL_CELL_MM = 35.0
@@ -113,7 +113,7 @@ class _Painter:
         for outline, level in zip(pixel[near], np.broadcast_to(levels, len(near))[near], strict=True):
             self.fill(outline, level)
 
-    def circles(self, pattern: Pattern, level: float) -> None:
+    def circles(self, pattern: PlacedCircles, level: float) -> None:
         """Fills the circles that face the eye."""
         shown = (self.centre - pattern.xyz_target) @ pattern.normal > 0
         if shown.any():

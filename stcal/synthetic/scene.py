@@ -161,21 +161,21 @@ class Scene(Brief):
         """Returns the corners of the visible side of a face, (k, 3), target frame."""
         return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id), self.margin_mm)
 
-    def patterns(self, group: str) -> "Iterator[Pattern]":
+    def patterns(self, group: str) -> "Iterator[PlacedCircles]":
         """Yields the circles of each face, and those of the board of a group."""
         for face in self.target.faces:
             normal = self.target_from_face[face.id].rotation[:, 2]
-            yield Pattern(face.labels(), self.face_circles(face.id), normal, face.radius_mm)
+            yield PlacedCircles(face.labels(), self.face_circles(face.id), normal, face.radius_mm)
         g = self.groups[group]
         normal = -g.target_from_board.rotation[:, 2]
-        yield Pattern(self.board.labels(), g.board_circles_target, normal, self.board.radii_mm())
+        yield PlacedCircles(self.board.labels(), g.board_circles_target, normal, self.board.radii_mm())
 
     def board_outline(self, group: str) -> np.ndarray:
         """Returns the corners of the board's plate, (4, 3), target frame."""
         return self.groups[group].target_from_board @ _board_rectangle(self.board)
 
 
-class Pattern(NamedTuple):
+class PlacedCircles(NamedTuple):
     """Circles of one plane: labels, centres (n, 3) and outward normal (3,) in the target frame, and radii, mm."""
 
     labels: Sequence[Label]
