@@ -358,9 +358,8 @@ def detect_images(
         with scratch_folder("detect") as scratch:
             return detect_images(images, camera, scratch, target, board, options, progress)
     if (Path(out) / "faces.json").exists():
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
-        )
+        fault = f"output folder {out}: holds a finished calibration"
+        raise InputError("E-OUTPUT-EXISTS", f"{fault}; give another folder with --out")
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
         notes, model = [], task.camera
         if model is None:

@@ -106,16 +106,11 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
     for line, (a, b), value, sigma_mm in zip(table.lines, ends, length, sigma, strict=True):
         where = f"{table.where}: line {line}"
         if unknown := {a, b} - places.keys():
-            raise InputError(
-                "E-BUDGET-LENGTHS",
-                f"{where}: no circle {min(unknown)} in the run; give one such as {budget.joint.labels[0]}",
-            )
+            fault = f"{where}: no circle {min(unknown)} in the run"
+            raise InputError("E-BUDGET-LENGTHS", f"{fault}; give one such as {budget.joint.labels[0]}")
         if a == b or value <= 0 or sigma_mm < 0:
-            raise InputError(
-                "E-BUDGET-LENGTHS",
-                f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, and a σ of 0 "
-                "or more",
-            )
+            fault = f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm"
+            raise InputError("E-BUDGET-LENGTHS", f"{fault}; a length between two circles needed, and a σ of 0 or more")
         own = _corrected(budget, (places[a], places[b]))
         tested.append(_tested((a, b), own, (float(value), float(sigma_mm) ** 2, 0.0)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
@@ -135,10 +130,8 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     rows, other_rows = ([each.joint.labels.index(label) for label in common] for each in (budget, other))
     pairs = longest_of(common, budget.joint.xyz_model[rows])
     if not pairs:
-        raise InputError(
-            "E-BUDGET-LENGTHS",
-            f"run {folder}: {len(common)} circles in common, 2 needed; give a run of the same target",
-        )
+        fault = f"run {folder}: {len(common)} circles in common, 2 needed"
+        raise InputError("E-BUDGET-LENGTHS", f"{fault}; give a run of the same target")
     # The two runs may have used one board.
     same = len({(board.rows, board.columns, board.pitch_mm, board.corner) for board in boards}) == 1
     shared = SHARED if same else ("target_expansion",)

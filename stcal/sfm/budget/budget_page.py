@@ -236,10 +236,8 @@ def uncertainty_budget(
         one that it belongs to.
     """
     if lengths_statement is not None and lengths is None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"--lengths-statement {lengths_statement}: it is for a second calibration; give it with --lengths",
-        )
+        fault = f"--lengths-statement {lengths_statement}: it is for a second calibration"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; give it with --lengths")
     saved = saved_run(run)
     stated = statement_of(saved.board_design.stated, statement, fields)
     budget, tests, others = budget_of_run(saved, stated), [], []

@@ -104,11 +104,8 @@ def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping
         origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
     for name, value in (given or {}).items():
         if not name or len(name) > 60 or len(value) > LONGEST_TEXT:
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST_TEXT} for a "
-                "value",
-            )
+            fault = f"--field {name[:20]}: {len(f'{name}={value}')} characters"
+            raise InputError("E-OPTION-VALUE", f"{fault}; up to 60 for a name, {LONGEST_TEXT} for a value")
     named = file.fields | dict(given or {})
     named |= {name: "" for name in FIELDS if name not in named}
     return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
@@ -430,10 +427,8 @@ class Budget:
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     """Returns the budget of a run that was solved jointly; without a statement, with what ``board.toml`` states."""
     if run.faces.solve != "joint" or not run.faces.eccentricity:
-        raise InputError(
-            "E-BUDGET-NO-COVARIANCE",
-            f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
-        )
+        fault = f"run {run.folder}: solved by {run.faces.solve}, which states no covariance"
+        raise InputError("E-BUDGET-NO-COVARIANCE", f"{fault}; run again with --solve joint")
     adjusted, board, options = adjusted_run(run), run.board_design, run.options
     found = contributions_of(adjusted.state)
     own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)

@@ -100,10 +100,8 @@ def map_natively(
     code, output = _run(command, timeout_s, TMPDIR=str(folder))  # COLMAP writes its logs there
     program = f"native COLMAP: `{native.program} mapper`"
     if code is None:
-        raise MappingError(
-            "E-COLMAP-TIMEOUT",
-            f"{program} is still running after {timeout_s:g} s; raise --timeout, or check the program",
-        )
+        fault = f"{program} is still running after {timeout_s:g} s"
+        raise MappingError("E-COLMAP-TIMEOUT", f"{fault}; raise --timeout, or check the program")
     if code != 0:
         raise MappingError("E-COLMAP-FAILED", f"{program} {_end(code, output)}; check the program")
 
@@ -297,9 +295,8 @@ def crosscheck(
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
-            raise InputError(
-                "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
-            )
+            fault = f"run {saved.folder}: its results were replaced meanwhile"
+            raise InputError("E-RUN-REPLACED", f"{fault}; cross-check it again")
         check = _compared(saved, colmap, tolerances, timeout_s, progress)
         write_report(
             stage, with_judgement(saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}), saved.folder

@@ -137,10 +137,8 @@ def content_of(run: SavedRun, root: str) -> Content:
     names = [root, *(each.child for each in content.statics())]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(
-            "E-FRAME-NAME",
-            f"frames: {twice[0]} would be the name of two frames; rename a face or a circle of the target",
-        )
+        fault = f"frames: {twice[0]} would be the name of two frames"
+        raise InputError("E-FRAME-NAME", f"{fault}; rename a face or a circle of the target")
     return content
 
 
@@ -509,10 +507,8 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     path = Path(out)
     suffixes = {known.suffix: each for each, known in FORMS.items()}
     if not form and path.suffix.lower() not in suffixes:
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
-        )
+        fault = f"{path}: suffix {path.suffix or 'missing'}"
+        raise InputError("E-OUTPUT-SUFFIX", f"{fault}; one of {', '.join(suffixes)} needed, or --form")
     form = form or suffixes[path.suffix.lower()]
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")

@@ -123,9 +123,8 @@ def schema_of_version(version: str) -> Schema:
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
     if release is None or release[1] not in SCHEMAS:
         versions = ", ".join(SCHEMAS)
-        raise InputError(
-            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {versions}"
-        )
+        fault = f"COLMAP {version}: its database schema is not known"
+        raise InputError("E-COLMAP-VERSION", f"{fault}; use a release of {versions}")
     return SCHEMAS[release[1]]
 
 
@@ -205,9 +204,8 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
                 columns = ", ".join(name for name in theirs if name in ours)
                 copy.execute(f"INSERT INTO {table} ({columns}) SELECT {columns} FROM own.{table} ORDER BY rowid")
     except sqlite3.Error as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"{path}: cannot be written ({error}); check the folder's space and rights"
-        ) from error
+        fault = f"{path}: cannot be written ({error})"
+        raise InputError("E-OUTPUT-UNWRITABLE", f"{fault}; check the folder's space and rights") from error
     return len(pairs)
 
 
@@ -276,11 +274,8 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     reconstruction, points = _labelled_points(saved)
     spaced = [image.name for image in saved.observations if " " in image.name]
     if spaced and form == "colmap-txt":
-        raise InputError(
-            "E-MODEL-NAMES",
-            f"format {form}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
-            "or rename the image and run again",
-        )
+        fault = f"format {form}: image {spaced[0]} has a space in its name, at which readers end it"
+        raise InputError("E-MODEL-NAMES", f"{fault}; use colmap-bin, or rename the image and run again")
     out.parent.mkdir(parents=True, exist_ok=True)
     with _complete(out) as folder:
         folder.mkdir()

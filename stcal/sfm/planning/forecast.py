@@ -45,10 +45,8 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
     missing = [face.id for face in target.faces if face.id not in poses]
     if missing:
-        raise InputError(
-            "E-TARGET-NO-FACE",
-            f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces",
-        )
+        fault = f"{faces}: no face {missing[0]} of target {target.name}"
+        raise InputError("E-TARGET-NO-FACE", f"{fault}; give a run that shows all of its faces")
     return {face.id: poses[face.id] for face in target.faces}
 
 

@@ -111,14 +111,12 @@ class PlanOptions(Brief):
     def __post_init__(self):
         require_fields(self, "plan", spread_deg=0, distance_mm=0, width=1, seed=0, margin_mm=0)
         if self.images < MIN_IMAGES:
-            raise InputError(
-                "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
-            )
+            fault = f"plan: {self.images} images in each group, {MIN_IMAGES} needed"
+            raise InputError("E-OPTION-RANGE", f"{fault}; plan for more")
         model = None if self.camera is None else camera_model(self.camera)
         if model is not None and not (model.width and model.height):
-            raise InputError(
-                "E-CAMERA-SIZE", f"plan: camera file {model.source} states no image size; add it to the file"
-            )
+            fault = f"plan: camera file {model.source} states no image size"
+            raise InputError("E-CAMERA-SIZE", f"{fault}; add it to the file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +199,8 @@ def plan(
     """
     printed = bool(target.with_faces(printed=True).faces)
     if printed and (unfit := [n for n, v in {"--groups": options.groups, "--board": board}.items() if v]):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
-        )
+        fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
+        raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
     poses = dict(nominal) if isinstance(nominal, Mapping) else nominal_poses(target, nominal)
     if printed:
         faces = (replace(face, rough_target_from_face=poses[face.id]) for face in target.faces)
@@ -333,10 +330,8 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
         linked |= {face for pair in pairs if linked & set(pair) for face in pair}
     if len(linked) < 2 or planned - linked:
         unlinked = ", ".join(sorted(planned - linked)) or "any other face"
-        raise InputError(
-            "E-PLAN-UNLINKED",
-            f"plan: no group links face {unlinked} to reference face {reference}; add a group that shows one of each",
-        )
+        fault = f"plan: no group links face {unlinked} to reference face {reference}"
+        raise InputError("E-PLAN-UNLINKED", f"{fault}; add a group that shows one of each")
     return linked
 
 
@@ -352,10 +347,8 @@ def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[Bod
     model = assemble(MetricModel, TOP_GROUP, images, list(scene.camera_from_target), xyz)
     faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
     if unseen := [face.id for face in target.faces if face.id not in faces]:
-        raise InputError(
-            "E-PLAN-UNLINKED",
-            f"plan: {options.images} images of which fewer than two show face {unseen[0]}; plan more images",
-        )
+        fault = f"plan: {options.images} images of which fewer than two show face {unseen[0]}"
+        raise InputError("E-PLAN-UNLINKED", f"{fault}; plan more images")
     start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {TOP_GROUP: Rigid()})
     prior = camera_prior(unknown_lens(camera)) if file is None else None
     if file is not None and run.refine_camera:

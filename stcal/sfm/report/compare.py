@@ -134,20 +134,14 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     for where, circles in ((run, answer.circles), (truth, known.circles)):
         for label, place in circles.items():
             if (far := max(map(abs, place))) > FARTHEST:  # its square would overflow
-                raise InputError(
-                    "E-VALUE-TOO-FAR",
-                    f"{where}: circles.{label}: a length of {far:.3g}, up to {FARTHEST:g} possible; correct it",
-                )
+                length = f"{where}: circles.{label}: a length of {far:.3g}"
+                raise InputError("E-VALUE-TOO-FAR", f"{length}, up to {FARTHEST:g} possible; correct it")
     if answer.reference_face != known.reference_face:
-        raise InputError(
-            "E-COMPARE-REFERENCE",
-            f"reference face {answer.reference_face} in the run, {known.reference_face} in the truth; "
-            f"run again with --reference-face {known.reference_face}",
-        )
+        fault = f"reference face {answer.reference_face} in the run, {known.reference_face} in the truth"
+        raise InputError("E-COMPARE-REFERENCE", f"{fault}; run again with --reference-face {known.reference_face}")
     if not known.target_from_face.keys() & answer.target_from_face.keys():
-        raise InputError(
-            "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
-        )
+        fault = f"run {run}, truth {truth}: no face in common"
+        raise InputError("E-COMPARE-NO-FACE", f"{fault}; give the truth of the same target")
     _require_one_unit(f"run {run}, truth {truth}", answer, known)
     faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None

@@ -187,9 +187,8 @@ class Tolerances:
     def __post_init__(self):
         for name, value in asdict(self).items():
             if isinstance(value, int | float) and not 0 <= value < np.inf:
-                raise InputError(
-                    "E-OPTION-RANGE", f"tolerance {name} {value:g}: a number of 0 or more needed; give another"
-                )
+                fault = f"tolerance {name} {value:g}: a number of 0 or more needed"
+                raise InputError("E-OPTION-RANGE", f"{fault}; give another")
         require_fields(self, "tolerances")
 
 

@@ -221,10 +221,8 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
     run, out = folder_of(run), None if out is None else Path(out)
     require_run(run)
     if out is not None and out.suffix.lower() == ".pdf":
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}",
-        )
+        fault = f"--out {out}: the page is HTML"
+        raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {out.with_suffix('.html')}, and --pdf for {out.name}")
     if pdf:
         require_pdf()
     complete_interrupted(run)
@@ -278,10 +276,8 @@ def require_report(saved: SavedRun) -> None:
             overlay_path(saved.folder, name).stat()
         _report_page(saved.folder, report)
     if not os.access(saved.folder, os.W_OK):
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE",
-            f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it",
-        )
+        fault = f"run {saved.folder}: cannot be written to, and the comparison goes into its report"
+        raise InputError("E-OUTPUT-UNWRITABLE", f"{fault}; copy it")
 
 
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:

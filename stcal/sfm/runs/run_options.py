@@ -126,10 +126,8 @@ class RunOptions:
             "--board-only": options.board_only,
         }
         for name in (name for name, is_given in of_circles.items() if printed and is_given):
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
-            )
+            fault = f"{name}: only for targets of circles, and faces of this one have boards or tags"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
         if camera is None and not (board.rows or printed):
             raise InputError(
                 "E-CAMERA-NEEDED",
@@ -173,6 +171,5 @@ def focal_sigma_px(camera: CameraModel) -> float:
 def require_dots(board: BoardDesign | None, option: str) -> None:
     """Refuses a board of corners for an option whose method finds dots."""
     if isinstance(board, CornerBoard):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
-        )
+        fault = f"{option}: finds boards of dots, and --board is one of squares or tags"
+        raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")

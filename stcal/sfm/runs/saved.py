@@ -369,9 +369,8 @@ class RunResult(SavedRun):
         try:
             from pandas import DataFrame
         except ImportError as error:
-            raise InputError(
-                "E-EXTRA-MISSING", "DataFrame: needs pandas; install stereo-target-calibration[pandas]"
-            ) from error
+            fault = "DataFrame: needs pandas"
+            raise InputError("E-EXTRA-MISSING", f"{fault}; install stereo-target-calibration[pandas]") from error
         target, table = self.target, []
         if rows == "faces":
             for face, pose in target.target_from_face.items():
@@ -464,9 +463,8 @@ def saved_run(run: AnyRun) -> SavedRun:
 def require_run(folder: Path) -> None:
     """Refuses a folder that is not of a run."""
     if not (folder / RUN_MARKER).is_file():
-        raise InputError(
-            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
-        )
+        fault = f"run {folder}: not a run's folder (no {RUN_MARKER})"
+        raise InputError("E-RUN-FOLDER", f"{fault}; give the --out of a finished run")
 
 
 @require_arguments
@@ -500,10 +498,8 @@ def load_run(folder: str | Path) -> SavedRun:
     if missing == ["faces.json"]:
         raise no_faces(folder)
     if missing:
-        raise InputError(
-            "E-RUN-UNFINISHED",
-            f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
-        )
+        fault = f"run {folder}: unfinished, or of another version: no {', '.join(missing)}"
+        raise InputError("E-RUN-UNFINISHED", f"{fault}; run it again")
     assert target is not None
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
@@ -611,11 +607,8 @@ def verify(run: AnyRun) -> Verified:
     with as_written(f"run {run / RUN_MARKER}"):
         marker = checked(content, MarkerFile)
     if marker.sha256 is None:
-        raise InputError(
-            "E-RUN-UNFINISHED",
-            f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of another version (stcal {marker.version}); "
-            "run it again",
-        )
+        fault = f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of another version (stcal {marker.version})"
+        raise InputError("E-RUN-UNFINISHED", f"{fault}; run it again")
     present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
     known = marker.sha256
     now = {

@@ -87,21 +87,15 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     out = Path(out)
     length = len(os.fsencode(Path(real_place(out)) / LONGEST_DATABASE))
     if length > MOST_DATABASE_BYTES:
-        raise InputError(
-            "E-OUTPUT-LENGTH",
-            f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most; give a "
-            "shorter --out",
-        )
+        fault = f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most"
+        raise InputError("E-OUTPUT-LENGTH", f"{fault}; give a shorter --out")
     require_ours(out)
     place, frames = real_place(out), real_place(frames_folder(out))  # the run itself has put frames there
     for word, given in inputs.items():
         read = real_place(given) if isinstance(given, str | Path) else frames
         if read != frames and place in (read, *read.parents):
-            raise InputError(
-                "E-OUTPUT-IS-INPUT",
-                f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
-                "or give another --out",
-            )
+            fault = f"{word} {given}: lies in the output folder {out}, whose files this run replaces"
+            raise InputError("E-OUTPUT-IS-INPUT", f"{fault}; copy it elsewhere, or give another --out")
     with _staged(out) as stage:
         if not (out / RUN_MARKER).exists():
             save(out / RUN_MARKER, json_text(content.content()))
@@ -145,10 +139,8 @@ def _staged(out: Path) -> Iterator[Path]:
         remove(out / STAGE)
         (out / STAGE).mkdir()
     except filelock.Timeout as error:
-        raise InputError(
-            "E-OUTPUT-IN-USE",
-            f"output folder {out}: another process is writing a run there; wait for its end, or give another --out",
-        ) from error
+        fault = f"output folder {out}: another process is writing a run there"
+        raise InputError("E-OUTPUT-IN-USE", f"{fault}; wait for its end, or give another --out") from error
     except OSError as error:
         lock.release()
         raise _unwritable(out, error) from error
@@ -165,9 +157,8 @@ def as_written(file: Path | str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(
-            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
-        ) from error
+        fault = f"{error.filename}: {error.strerror or error}"
+        raise InputError("E-RUN-DAMAGED", f"{fault}; the run needs it, run it again") from error
     except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
@@ -253,14 +244,12 @@ def require_ours(out: Path) -> None:
         raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
     _require_no_link(out)
     if out.is_dir() and not (out / RUN_MARKER).exists() and any(path.name != INTERNAL for path in out.iterdir()):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: not empty and not of an earlier run; give a new folder with --out"
-        )
+        fault = f"output folder {out}: not empty and not of an earlier run"
+        raise InputError("E-OUTPUT-EXISTS", f"{fault}; give a new folder with --out")
 
 
 def _require_no_link(out: Path) -> None:
     for name in (INTERNAL, CACHE, STAGE, READY):
         if (out / name).is_symlink():
-            raise InputError(
-                "E-OUTPUT-LINK", f"output folder {out}: {name} in it is a link; remove it, a run writes through none"
-            )
+            fault = f"output folder {out}: {name} in it is a link"
+            raise InputError("E-OUTPUT-LINK", f"{fault}; remove it, a run writes through none")
