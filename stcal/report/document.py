@@ -75,8 +75,7 @@ def require_pdf() -> None:
     pdf_of("<p></p>")
 
 
-MOST_ROWS, MOST_PRINTED = 500, 60
-"""Largest number of rows of a table on a page, and on the terminal."""
+MOST_ROWS, MOST_PRINTED = 500, 60  # largest number of rows of a table on a page, and on the terminal
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,8 +36,7 @@ RED_BLUE = "#053061 #2166ac #4393c3 #92c5de #d1e5f0 #f7f7f7 #fddbc7 #f4a582 #d66
 VIRIDIS = "#440154 #472d7b #3b528b #2c728e #21918c #28ae80 #5ec962 #addc30 #fde725"
 """The ramp viridis (van der Walt & Smith 2015), dark to light."""
 DASH = "5 4"
-LETTER = 0.55
-"""Mean width of a letter as a share of the font's size."""
+LETTER = 0.55  # mean width of a letter as a share of the font's size
 MARKS = {
     "dot": "h0",
     "ring": "m-{1:.1f} 0a{1:.1f} {1:.1f} 0 1 0 {0:.1f} 0a{1:.1f} {1:.1f} 0 1 0 -{0:.1f} 0",
@@ -50,8 +49,7 @@ MARKS = {
 """Path of each mark from its middle; {0} is its size, {1} half of it, pt."""
 Ticks = tuple[Sequence[float], Sequence[str]]
 """Values of an axis, and their words."""
-UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
-"""Characters that no XML file may contain."""
+UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  # characters that no XML file may contain
 
 
 Box = tuple[float, float, float, float]

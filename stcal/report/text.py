@@ -12,10 +12,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.rotations import fixed
 
 NONE = "–"
-WIDTH = 100
-"""Largest number of characters of a line of sentences."""
-WIDEST = 10_000
-"""Largest number of characters of a line: no line is ever wrapped, whatever the terminal."""
+WIDTH = 100  # largest number of characters of a line of sentences
+WIDEST = 10_000  # largest number of characters of a line: no line is ever wrapped, whatever the terminal
 
 
 def number(value: float | None, digits: int) -> str:

@@ -48,8 +48,7 @@ class Side:
     box_from_plate: Rigid  # origin lower left as seen from outside, Y upwards, Z outwards
 
 
-NAMES = ("front", "right", "back", "left", "top")
-"""Names of the sides that may have circles."""
+NAMES = ("front", "right", "back", "left", "top")  # names of the sides that may have circles
 
 
 def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES) -> list[Side]:
@@ -98,12 +97,9 @@ LEAST_CIRCLES = MIN_NAMING + HIDDEN
 LARGE = 1.6
 """Radius of the larger circles as a multiple of the smaller radius. Detection takes radii up to a ratio of 1.3 for
 equal."""
-GAP = 0.8
-"""Least gap between the rims of two circles, in radii of the smaller circles."""
-PLACES, TRIES = 40, 30
-"""Numbers of candidate places for each circle, and of candidate patterns for each face."""
-GRID_MM = 0.5
-"""Grid of the coordinates of circles, so that they are round numbers that can be measured again."""
+GAP = 0.8  # least gap between the rims of two circles, in radii of the smaller circles
+PLACES, TRIES = 40, 30  # numbers of candidate places for each circle, and of candidate patterns for each face
+GRID_MM = 0.5  # grid of the coordinates of circles, so that they are round numbers that can be measured again
 CORNER_SHARE = 0.15
 """Size of the area at each corner in which a circle of the frame lies, as a share of the plate's sides."""
 
@@ -176,8 +172,7 @@ def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) 
     return replace(face, rough_target_from_face=side.box_from_plate @ plate_from_face, outline_mm=outline[:, :2])
 
 
-TILT_RAD = np.radians(40.0)
-"""Tilt of the face about an oblique axis in the simulated views."""
+TILT_RAD = np.radians(40.0)  # tilt of the face about an oblique axis in the simulated views
 CONTRAST = 100.0
 
 
@@ -211,21 +206,18 @@ def _seen(face: FaceDesign, target: TargetDesign, camera: Camera, distance_mm: f
     return Ellipses(centre, shape, np.full(len(centre), CONTRAST))
 
 
-FARTHER = 1.1
-"""Largest distance of a camera, as a multiple of the stated distance."""
+FARTHER = 1.1  # largest distance of a camera, as a multiple of the stated distance
 WELL_SEEN = 1.5
 """Least ratio of the smallest circle's diameter, where it is most tilted and farthest away, to the smallest diameter
 that detection looks for."""
-RADIUS_SHARE = 1 / 30
-"""Default radius of the smaller circles, as a share of the box's shortest side."""
+RADIUS_SHARE = 1 / 30  # default radius of the smaller circles, as a share of the box's shortest side
 RADIUS_STEP_MM = 0.25
 PITCH_SHARE = 0.23
 """Pitch of the board, as a share of the box's longest side. The board then reaches beyond the box on all sides."""
 FIELD_SHARE = 0.8
 """Share of the width that the camera sees at the stated distance, in which box and board stand side by side."""
 PITCH_STEP_MM = 5.0
-ATTEMPTS = 8
-"""Largest number of patterns drawn until one is identified in all cases."""
+ATTEMPTS = 8  # largest number of patterns drawn until one is identified in all cases
 ROWS, COLUMNS = 7, 9
 BOARD_SIGMA_MM = 0.02
 """Position error of dots that a good printer prints. A milled or photographic plate states its own."""

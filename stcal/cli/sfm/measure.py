@@ -34,8 +34,7 @@ def plan(
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
     run: Annotated[
-        Path | None,
-        "Take the σ of the centres, and target, board and camera if not given, from this finished run.",
+        Path | None, "Take the σ of the centres, and target, board and camera if not given, from this finished run."
     ] = None,
     target: shared.TargetFile = None,
     faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,

@@ -6,27 +6,9 @@ from pathlib import Path
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
-from stcal.report.document import (
-    Answer,
-    Block,
-    Document,
-    Notes,
-    Section,
-    Table,
-    bullets,
-    page_only,
-    subheading,
-    tiles,
-)
+from stcal.report.document import Answer, Block, Document, Notes, Section, Table, bullets, page_only, subheading, tiles
 from stcal.report.text import join, number, significant, wrapped
-from stcal.sfm.budget.budget_file import (
-    BudgetFile,
-    LengthTest,
-    against_run,
-    against_stated,
-    common_views,
-    refusals,
-)
+from stcal.sfm.budget.budget_file import BudgetFile, LengthTest, against_run, against_stated, common_views, refusals
 from stcal.sfm.budget.budget_tables import (
     as_exact,
     contributions,
@@ -42,8 +24,7 @@ from stcal.sfm.budget.certificate import REQUIRED, certificate
 from stcal.sfm.budget.combine import FIELDS, Budget, budget_of_run, statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
 
-LIMITS = 0.05
-"""Share of the variance above which a source is among those that limit a result."""
+LIMITS = 0.05  # share of the variance above which a source is among those that limit a result
 
 
 def budget_report(file: BudgetFile) -> Document:

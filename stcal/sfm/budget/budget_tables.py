@@ -28,12 +28,10 @@ DECISION_RULE = (
     "of both, E_n the error over it (ISO 13528). Decision rule: the lengths agree if the largest |E_n| is at most "
     "{test.limit:.2f}, which {count} exceed by chance in one of 22 tests"
 )
-MANY = 1e4
-"""Degrees of freedom that are as good as infinitely many."""
+MANY = 1e4  # degrees of freedom that are as good as infinitely many
 EXACT_UM = 1e-6
 """σ below which a value is exact by definition, as that of the frame's own origin is up to rounding, µm or mdeg."""
-NEGLIGIBLE = 1e-4
-"""Share of u below which a contribution has no sensitivity in the tables."""
+NEGLIGIBLE = 1e-4  # share of u below which a contribution has no sensitivity in the tables
 
 
 def method(file: BudgetFile) -> str:

@@ -32,12 +32,9 @@ STATED = {
     "reference_temperature_c": "reference temperature, °C",
 }
 """Words for what is stated of board and target."""
-DIRECTIONS = 200
-"""Number of directions among which that of the drawing is chosen."""
-MOST_NAMES = 40
-"""Number of points of a face up to which all are named in its drawing; of more, the outermost are."""
-SAME_PLANE_MM = 0.1
-"""Distance of a face from the middle of all within which the item is one plane."""
+DIRECTIONS = 200  # number of directions among which that of the drawing is chosen
+MOST_NAMES = 40  # number of points of a face up to which all are named in its drawing; of more, the outermost are
+SAME_PLANE_MM = 0.1  # distance of a face from the middle of all within which the item is one plane
 
 
 def certificate(file: BudgetFile) -> Document:

@@ -61,8 +61,7 @@ FIELDS = {
 }
 """Fields of the head of a budget with their words, in the order of a certificate; empty if they are not given."""
 LONGEST_TEXT = 500
-DEFAULT = "; the default, which `design` writes too: measure it and state it"
-"""Words for a σ that nobody has changed."""
+DEFAULT = "; the default, which `design` writes too: measure it and state it"  # words for a σ that nobody has changed
 
 
 Text = Annotated[
@@ -126,8 +125,7 @@ def fields_of(given: Sequence[str]) -> dict[str, str]:
 
 Origin = Literal["estimated", "stated", "assumed", "not stated", "not known"]
 PPM = 1e-6
-REFERENCE_C = 20.0
-"""Reference temperature of ISO 1:2022, used unless another one is stated."""
+REFERENCE_C = 20.0  # reference temperature of ISO 1:2022, used unless another one is stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,14 +323,11 @@ def _growth(stated: StatedSize) -> float | None:
     return stated.expansion_ppm_per_k * PPM * warmer
 
 
-COVERAGE_FACTOR = 2.0
-"""Coverage factor k for infinitely many degrees of freedom."""
+COVERAGE_FACTOR = 2.0  # coverage factor k for infinitely many degrees of freedom
 BY_CHANCE = 2 * float(ndtr(-COVERAGE_FACTOR))
 """Probability that an error is beyond U by chance, and that any length of a test is beyond the limit."""
-LONGEST_DISTANCES = 5
-"""Number of distances in a budget."""
-DRAWS = 100_000
-"""Number of random draws for the coverage (JCGM 101:2008)."""
+LONGEST_DISTANCES = 5  # number of distances in a budget
+DRAWS = 100_000  # number of random draws for the coverage (JCGM 101:2008)
 Kind = Literal["position", "rotation", "angle", "distance"]
 PARALLEL = 1e-3
 """Sine of an angle between two axes below which both directions across them count, as none of them leads its change."""

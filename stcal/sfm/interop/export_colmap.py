@@ -218,8 +218,7 @@ def database_text(written: Exported) -> str:
     )
 
 
-FORMATS = ("colmap-bin", "colmap-txt")
-"""Formats of a model, which is a folder."""
+FORMATS = ("colmap-bin", "colmap-txt")  # formats of a model, which is a folder
 LABELS = "labels.csv"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 

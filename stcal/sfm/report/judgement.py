@@ -19,10 +19,8 @@ TAIL = 2.0  # ratio of a face's σ to the median of the others above which this 
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0  # relative σ, in ppm, from which it is stated in %
-MORE = 4
-"""How many times the images the answer gives σ for."""
-FEW_IMAGES = 6
-"""Number of photographs below which more of them are the first thing to do."""
+MORE = 4  # how many times the images the answer gives σ for
+FEW_IMAGES = 6  # number of photographs below which more of them are the first thing to do
 QUESTIONS = {
     "use": "May I use it?",
     "quality": "How good is it?",
@@ -64,10 +62,8 @@ SOURCES = {
     "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
 }
 """Name and remedy of each source of σ beside the photographs."""
-MATTERS = 1.25
-"""Factor on σ from which a condition of the photographs is named."""
-HARMS = 3.0
-"""The same from which it is to be changed."""
+MATTERS = 1.25  # factor on σ from which a condition of the photographs is named
+HARMS = 3.0  # the same from which it is to be changed
 CONDITIONS = {
     "number": ("{:.0f} images in a group, 10 are usual", "take more photographs"),
     "distance": ("pictures are filled to {:.0f} %, 70 % is usual", "go nearer"),

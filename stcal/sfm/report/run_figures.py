@@ -19,10 +19,8 @@ from stcal.report.svg import (
     round_below,
 )
 
-CELLS = (12, 8)
-"""Number of cells of the image, in x and y, of which the mean residuals are drawn."""
-MOST, STEP = 4.0, 0.5
-"""Largest residual over its σ that the histogram shows, and the width of its bars."""
+CELLS = (12, 8)  # number of cells of the image, in x and y, of which the mean residuals are drawn
+MOST, STEP = 4.0, 0.5  # largest residual over its σ that the histogram shows, and the width of its bars
 
 
 def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:

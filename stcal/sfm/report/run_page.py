@@ -30,12 +30,7 @@ from stcal.report.document import (
     tone_of,
     verdict_word,
 )
-from stcal.report.svg import (
-    AXIS_COLOURS,
-    COLOURS,
-    INK,
-    round_below,
-)
+from stcal.report.svg import AXIS_COLOURS, COLOURS, INK, round_below
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
@@ -400,8 +395,7 @@ def crosscheck_section(check: dict) -> list[Block]:
     ]
 
 
-FIRST_NAMES = 6
-"""Number of names that a row has room for."""
+FIRST_NAMES = 6  # number of names that a row has room for
 
 
 def checks_section(checks_of_report: list[dict]) -> list[Block]:
@@ -469,8 +463,7 @@ def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
     return [*sides, at, at + 2.2 * depth * axes[2]]
 
 
-DIGITS = 2
-"""Number of decimals of coordinates in mm: far finer than a screen shows."""
+DIGITS = 2  # number of decimals of coordinates in mm: far finer than a screen shows
 AXIS = 0.2  # length of the faces' axes, as a share of the target's extent
 CAMERA = 0.07  # depth of a camera's pyramid, as a share of the scene's extent
 SHEET = "#7f93a8"

@@ -13,12 +13,9 @@ BLUR_PX = 0.76  # blur of an edge, standard deviation: a lens of 0.7 px and the 
 PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
-IMAGES = 10
-"""Number of images of a group that docs/howto/photograph.md asks for."""
-FILLED = 0.7
-"""Share of a picture's diagonal that faces and board cover where they fill the picture."""
-APART_RAD = math.radians(80)
-"""Angle between the outermost cameras of a group as their middle point sees it: ±40°."""
+IMAGES = 10  # number of images of a group that docs/howto/photograph.md asks for
+FILLED = 0.7  # share of a picture's diagonal that faces and board cover where they fill the picture
+APART_RAD = math.radians(80)  # angle between the outermost cameras of a group as their middle point sees it: ±40°
 
 
 def conditions(run: RunResult) -> dict[str, tuple[float, float]]:

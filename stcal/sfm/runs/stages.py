@@ -42,14 +42,7 @@ from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, 
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
-from stcal.sfm.mapping.body import (
-    LENS,
-    MIN_CORNERS,
-    map_body,
-    place_and_find_camera,
-    place_with_camera,
-    unknown_lens,
-)
+from stcal.sfm.mapping.body import LENS, MIN_CORNERS, map_body, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import Mapping, left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, pair_of_model, rank_pairs
