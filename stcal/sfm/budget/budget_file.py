@@ -379,12 +379,8 @@ class BudgetFile(ResultFile):
         cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
-        conditions, answer, refused, known = (
-            budget.conditions,
-            answer_of(run),
-            is_refused(run),
-            budget.conditions.size_known,
-        )
+        conditions, known = budget.conditions, budget.conditions.size_known
+        answer, refused = answer_of(run), is_refused(run)
         enlarged, poses, faces = 1 + conditions.correction, run.faces.poses(), {}
         for position, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
             pose = poses[position.measurand.name]
@@ -394,15 +390,12 @@ class BudgetFile(ResultFile):
                 position_um=Uncertainty.of(position, MICRO) if known else None,
                 rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
             )
-        angles = [
-            AngleUncertainty(
-                faces=list(row.measurand.faces),
-                angle_deg=_angle_deg(*(poses[face].rotation[:, 2] for face in row.measurand.faces)),
-                angle_mdeg=Uncertainty.of(row, MILLIDEGREES),
-            )
-            for row in budget.of_kind("angle")
-        ]
-        distances = []
+        angles, distances = [], []
+        for row in budget.of_kind("angle"):
+            a, b = (poses[face].rotation[:, 2] for face in row.measurand.faces)
+            angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+            own = {"angle_deg": angle_deg, "angle_mdeg": Uncertainty.of(row, MILLIDEGREES)}
+            angles.append(AngleUncertainty(faces=list(row.measurand.faces), **own))
         for row in budget.of_kind("distance"):
             length = row.measurand.length_mm or 0.0
             own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
@@ -414,6 +407,7 @@ class BudgetFile(ResultFile):
             circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, coverage_factor(freedom))
         if any(is_refused(each) for each in (run, *others)):
             tests = [test.without_u() for test in tests]
+        photographs = {name: Path(run.photographs) / name for name in sorted(each.name for each in run.observations)}
         return cls(
             format="stcal budget 1",
             version=stcal.__version__,
@@ -425,7 +419,7 @@ class BudgetFile(ResultFile):
                 sha256=run.sha256.get(RUN_MARKER, ""),
                 faces_sha256=run.sha256.get("faces.json", ""),
                 changed=[*verified.missing, *verified.changed, *verified.added],
-                photographs_sha256=dict(_digests(run)),
+                photographs_sha256={name: digest_of(path) for name, path in photographs.items() if path.is_file()},
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
@@ -451,17 +445,6 @@ class BudgetFile(ResultFile):
             length_tests=TypeAdapter(list[LengthTest]).validate_python([asdict(test) for test in tests]),
             notes=notes_of(budget, verified, run),
         )
-
-
-def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-
-
-def _digests(run: SavedRun) -> Iterator[tuple[str, str]]:
-    """Yields the name and the SHA-256 of each photograph that is in its folder."""
-    for name in sorted(image.name for image in run.observations):
-        if (path := Path(run.photographs) / name).is_file():
-            yield name, digest_of(path)
 
 
 def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
@@ -544,18 +527,13 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
     failed, unknown = run.failed_checks(), [source.title for source in budget.sources if source.origin == "not stated"]
-    notes = []
-    if failed:
-        invalid = join(invalidated(check["key"] for check in failed))
-        notes.append(
-            f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
-            f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given"
-        )
-    elif is_refused(run):
-        notes.append(f"may the run be used? {answer_of(run).use} No uncertainty of it is given")
+    first, invalid = [check["title"] for check in failed][:1], join(invalidated(check["key"] for check in failed))
     corrected = conditions.size_known and conditions.correction and not is_refused(run)
     both = statement.board.temperature_sigma_k and statement.target.temperature_sigma_k
     told = {
+        f"failed checks of the run: {len(failed)}, first {join(first)}; what they found is not among the inputs: "
+        f"{invalid} do not hold before it is put right, and no uncertainty of them is given": failed,
+        f"may the run be used? {answer_of(run).use} No uncertainty of it is given": is_refused(run) and not failed,
         f"{conditions.words}; lengths of the run are in the unit of the drawing": not conditions.size_known,
         f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
         "are": unknown,
@@ -567,7 +545,6 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
         "(one_thermometer of the statement), U is too large": has_board and both and not statement.one_thermometer,
     }
     return [
-        *notes,
         *(note for note, applies in told.items() if applies),
         *_unusual(statement),
         *verified.notes(),

@@ -1,6 +1,6 @@
 """Tables of an uncertainty budget, which its report and its certificate share."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stcal.io.files import RUN_MARKER
@@ -41,21 +41,15 @@ def method(file: BudgetFile) -> str:
 
 def what_u_is(file: BudgetFile) -> str:
     """Returns the sentence on U and k, which are of Student's distribution where few photographs count."""
-    factors = [each.coverage_factor for each in _uncertainties(file)]
-    factors += [each.coverage_factor for each in file.circles.values()]
+    of_faces = [u for face in file.faces.values() for u in (face.position_um, face.rotation_mdeg) if u is not None]
+    others = [*(each.angle_mdeg for each in file.angles), *(each.distance_um for each in file.distances)]
+    factors = [each.coverage_factor for each in (*of_faces, *others, *file.circles.values())]
     if not factors:
         return ""
     ends = [f"{end(factors):.2f}" for end in (min, max)]
     normal = ends[1] == f"{file.coverage_factor:.2f}"
     why = "for a normal distribution" if normal else "for Student's distribution with the effective degrees of freedom"
     return WHAT_U_IS.format(k=" to ".join(dict.fromkeys(ends)), why=why) + TOGETHER
-
-
-def _uncertainties(file: BudgetFile) -> Iterator[Uncertainty]:
-    for face in file.faces.values():
-        yield from filter(None, (face.position_um, face.rotation_mdeg))
-    yield from (each.angle_mdeg for each in file.angles)
-    yield from (each.distance_um for each in file.distances)
 
 
 def results(file: BudgetFile) -> list[Block]:

@@ -40,6 +40,8 @@ SAME_PLANE_MM = 0.1  # distance of a face from the middle of all within which th
 def certificate(file: BudgetFile) -> Document:
     """Returns the certificate of a budget for which all is stated that it needs."""
     images, groups = sum(each.images for each in file.views), len(file.views)
+    given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
+    head = [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
     how = (
         f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the points of all faces and the "
         f"poses of the camera were adjusted together (bundle adjustment by stcal {file.run.version}, uncertainties by "
@@ -57,14 +59,8 @@ def certificate(file: BudgetFile) -> Document:
             Section("Annex: uncertainty budget", [method(file), inputs(file), *contributions(file)], terminal=True),
             Section("Annex: data", [hashes(file), *photographs(file), "End of the certificate"]),
         ],
-        banner=[facts(_head(file)), RELATES],
+        banner=[facts(head), RELATES],
     )
-
-
-def _head(file: BudgetFile) -> list[list[str]]:
-    """Returns the fields that are given, in the order of :data:`FIELDS`, then others."""
-    given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
-    return [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
 
 
 def _conditions(file: BudgetFile) -> Table:

@@ -155,9 +155,11 @@ def sources_of(
     camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[BudgetSource, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
-    adjusted = _of_adjustment(contributions, board, flatness_mm)
-    intrinsics = _intrinsics(contributions, camera, refined, camera_given)
-    return (*adjusted, intrinsics, *(_of_statement(contributions, statement) if board.rows else ()))
+    return (
+        *_of_adjustment(contributions, board, flatness_mm),
+        _intrinsics(contributions, camera, refined, camera_given),
+        *(_of_statement(contributions, statement) if board.rows else ()),
+    )
 
 
 def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float | None) -> Iterator[BudgetSource]:
@@ -424,57 +426,48 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     if run.faces.solve != "joint" or not run.faces.eccentricity:
         fault = f"run {run.folder}: solved by {run.faces.solve}, which states no covariance"
         raise InputError("E-BUDGET-NO-COVARIANCE", f"{fault}; run again with --solve joint")
-    adjusted, board, options = adjusted_run(run), run.board_design, run.options
-    found = contributions_of(adjusted.state)
-    own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
-    stated = statement or statement_of(board.stated)
+    (state, start), board, options = adjusted_run(run), run.board_design, run.options
+    found = contributions_of(state)
+    own = derivatives(found.joint, start, run.target_design, run.faces.frame)
+    stated, camera_given = statement or statement_of(board.stated), run.report["summary"].get("camera_given", True)
+    sources = sources_of(found, run.camera, board, options.flatness_mm, options.refine_camera, stated, camera_given)
     heights, sigma_mm = run.rims_mm()
-    rims: tuple[BudgetSource, ...] = ()
     if heights:
         row = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
         covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
-        rims = (BudgetSource("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance),)
-    reference, camera_given = run.faces.reference_face, run.report["summary"].get("camera_given", True)
-    return budget(
-        found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
-    )
+        rims = BudgetSource("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance)
+        sources = (*sources, rims)
+    return budget(found.joint, own, sources, board, stated, run.faces.reference_face)
 
 
 def budget(
-    found: Contributions,
+    joint: JointResult,
     own: Derivatives,
-    camera: Camera,
-    board,
-    flatness_mm: float | None,
-    refined: bool,
+    sources: tuple[BudgetSource, ...],
+    board: BoardDesign,
     statement: Statement,
     reference_face: str,
-    more: tuple[BudgetSource, ...] = (),
-    camera_given: bool = True,
 ) -> Budget:
-    """Returns the budget of an adjustment, as :func:`sources_of`; ``more``: further rows."""
-    sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
+    """Returns the budget of an adjustment by its sources."""
     if own.circles_designed.shape[2]:
         words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
         size, sigma_um = own.circles.shape[-1], 1e3 * own.designed_sigma_mm
         none = np.zeros((size, size))  # it moves faces, not circles
         sources += (BudgetSource(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
-    rng, joint = np.random.default_rng(0), found.joint
+    rng = np.random.default_rng(0)
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
     rows = [
         _row(measurand, sources, own.designed_sigma_mm, freedom, rng)
-        for measurand in measurands(found.joint, own, reference_face)
+        for measurand in measurands(joint, own, reference_face)
     ]
-    views = tuple(_view(model) for model in found.joint.models)
+    views = tuple(_view(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
         for kinds in ("AB", "A")
     )
-    variances = [
-        (float(np.trace(whole)), float(np.trace(part))) for whole, part in zip(circles, estimated, strict=True)
-    ]
-    freedoms = np.array([effective_freedom(*each, freedom) for each in variances])
+    traces = (np.trace(covariances, axis1=1, axis2=2).tolist() for covariances in (circles, estimated))
+    freedoms = np.array([effective_freedom(*variances, freedom) for variances in zip(*traces, strict=True)])
     conditions = conditions_of(statement, board)
     return Budget(joint, reference_face, sources, tuple(rows), circles, freedoms, freedom, views, statement, conditions)
 

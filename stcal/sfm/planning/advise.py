@@ -13,6 +13,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.json import Named, ResultFile
 from stcal.labels import BOARD, CircleLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
@@ -301,18 +302,18 @@ class KnownRun(Brief):
 
 def known_of(run: SavedRun) -> KnownRun:
     """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
-    again = adjusted_run(run)
-    joint = widened_result(again.state)
+    state, start = adjusted_run(run)
+    joint = widened_result(state)
     heights, rim_sigma_mm = run.rims_mm()
-    rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
+    rims = rim_covariance_mm2(joint, start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(
         target=run.target_design,
         board=run.board_design,
         camera=joint.camera,
-        start=again.start,
+        start=start,
         frame=run.faces.frame,
         flatness_mm=run.options.flatness_mm,
-        prior=again.prior,
+        prior=camera_prior(run.camera) if run.options.refine_camera else None,
         common=joint.board_common,
         sigma0=joint.sigma_scale,
         rims_mm2=rims,

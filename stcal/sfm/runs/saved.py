@@ -16,7 +16,7 @@ from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, frozen, require_
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import CameraPrior, camera_prior
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import (
     BOARD,
@@ -555,17 +555,9 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
     return tuple(observations), tuple(corrected)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustedRun:
-    """The final adjustment of a run."""
-
-    state: Adjusted  # groups in mm in the target frame, at the minimum, with σ as in the run
-    start: CalibratedTarget  # result of the run
-    prior: CameraPrior | None  # of the intrinsics if they were adjusted
-
-
-def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame."""
+def adjusted_run(run: SavedRun) -> tuple[Adjusted, CalibratedTarget]:
+    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame; returns it
+    with σ as in the run, and the result of the run."""
     ids = image_ids(run.observations)
     read = read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
@@ -574,7 +566,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     state = with_scatter(state, start, run.target_design, run.faces.frame)
-    return AdjustedRun(replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start, prior)
+    return replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start
 
 
 @dataclass(frozen=True, slots=True)
