@@ -10,8 +10,9 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -150,10 +151,8 @@ Chained = Literal["chain", "paper"]
 
 
 def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
-    options = replace(run.options, solve=solve, refine_camera=False)
-    if solve == "paper":
-        options = replace(options, frame="three-point", eccentricity=False)
-    return options.adjustment(run.target_design)
+    published: dict[str, Any] = {"frame": "three-point", "eccentricity": False} if solve == "paper" else {}
+    return replace(run.options, solve=solve, refine_camera=False, **published).adjustment(run.target_design)
 
 
 def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
@@ -290,24 +289,23 @@ def crosscheck(
         The native program fails or hangs, or makes no model of a group, or one of another database.
     """
     saved = saved_run(run)
+    compared = partial(_compared, saved, colmap, tolerances, timeout_s, progress or (lambda *_: None))
     if not into_report:
-        return _compared(saved, colmap, tolerances, timeout_s, progress)
+        return compared()
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
             fault = f"run {saved.folder}: its results were replaced meanwhile"
             raise InputError("E-RUN-REPLACED", f"{fault}; cross-check it again")
-        check = _compared(saved, colmap, tolerances, timeout_s, progress)
-        write_report(
-            stage, with_judgement(saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}), saved.folder
-        )
+        check = compared()
+        report = saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}
+        write_report(stage, with_judgement(report), saved.folder)
     return check
 
 
 def _compared(
-    run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None
+    run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress
 ) -> Crosscheck:
-    progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
@@ -436,9 +434,7 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
         faces=face_differences(target, run, faces),
         circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
         circles_sigmas={
-            label: _sigmas(v, np.asarray(covariances[label]), FACE_FLOOR[3:])
-            for label, v in off.items()
-            if label in covariances
+            label: _sigmas(v, covariances[label], FACE_FLOOR[3:]) for label, v in off.items() if label in covariances
         },
     )
 
@@ -447,14 +443,13 @@ def face_differences(
     target: CalibratedTarget, run: SavedRun, faces: dict[str, Rigid] | None = None
 ) -> dict[str, FaceDifference | None]:
     """Returns the differences of a target's faces from ``faces``, or the run's; None of a face that only one has."""
-    a, b, covariance = target.target_from_face, faces, run.faces.target_from_face_covariance
-    b = run.faces.poses() if b is None else b
+    a, b = target.target_from_face, run.faces.poses() if faces is None else faces
+    covariance = run.faces.target_from_face_covariance
     rows: dict[str, FaceDifference | None] = dict.fromkeys(sorted(a.keys() | b.keys()))
     for face in a.keys() & b.keys():
         difference = a[face].difference(b[face])
-        (um, mdeg), sigmas = _off(difference), None
-        if face in covariance:
-            sigmas = _sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR)
+        um, mdeg = _off(difference)
+        sigmas = _sigmas(difference, covariance[face], FACE_FLOOR) if face in covariance else None
         rows[face] = FaceDifference(translation_um=um, rotation_mdeg=mdeg, sigmas=sigmas)
     return rows
 
@@ -471,8 +466,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
     model_of_group = {model.group: model for model in b.models}
     rows = []
     for theirs in a.models:
-        model = model_of_group.get(theirs.group)
-        if model is None:
+        if (model := model_of_group.get(theirs.group)) is None:
             continue
         common = sorted(set(theirs.labels) & set(model.labels), key=model.labels.index)
         own, other = (m.xyz_model[[m.labels.index(label) for label in common]] for m in (model, theirs))
@@ -482,11 +476,10 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
         aligned = theirs.in_world(alignment).camera_from_model
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
-            if name not in poses:
-                continue
-            um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
-            sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
-            rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
+            if name in poses:
+                um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
+                sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
+                rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
     return sorted(rows, key=lambda row: row.image)
 
 

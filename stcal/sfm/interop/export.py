@@ -82,11 +82,6 @@ class Content:
         sigma = np.sqrt(np.maximum(np.diag(self.target.face_covariance[face]), 0))  # the reference's is 0 but rounded
         return sigma[:3], sigma[3:]
 
-    def circle_sigma(self, label: CircleLabel) -> np.ndarray | None:
-        """Returns σ of x, y, z of a circle, mm, or None without a covariance."""
-        covariance = self.target.circle_covariance.get(label)
-        return None if covariance is None else np.sqrt(np.diag(covariance))
-
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
@@ -163,8 +158,8 @@ def table(content: Content) -> str:
         cells = [f"{v:.4g}" for v in (*(1e3 * shift), *(1e3 * np.degrees(turn)))]
         rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *(cells or [""] * 6)])
         for label in content.circles_of(face):
-            sigma = content.circle_sigma(label)
-            cells = [""] * 3 if sigma is None else [f"{1e3 * v:.4g}" for v in sigma]
+            covariance = content.target.circle_covariance.get(label)
+            cells = [""] * 3 if covariance is None else [f"{1e3 * v:.4g}" for v in np.sqrt(np.diag(covariance))]
             place = [*content.target.circles[label].tolist(), *turned, content.run.faces.radius_mm[label]]
             rows.append(["circle", face, label.circle, *place, *cells, "", "", ""])
     return csv_text(rows)
@@ -356,9 +351,9 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
         if face in target.face_covariance:
             extras["covariance_rad_mm"] = target.face_covariance[face].tolist()
-        below.append(scene.node(name=content.face_frame(face), **_placed(pose), children=circles, extras=extras))
-    if content.photographs:
-        below += _cameras(content, scene)
+        placed = {"translation": metres(pose), "rotation": xyzw(pose)}
+        below.append(scene.node(name=content.face_frame(face), **placed, children=circles, extras=extras))
+    below += _cameras(content, scene) if content.photographs else []
     extras = {"said": content.said(), "sigma_drawn_times": factor}
     up = scene.node(name="y_up", rotation=Y_UP, children=[scene.node(name=content.root, children=below, extras=extras)])
     materials = []
@@ -376,9 +371,8 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         "materials": materials,
         "accessors": scene.accessors,
         "bufferViews": scene.views,
+        **({"cameras": [_lens(content.camera)]} if content.photographs else {}),
     }
-    if content.photographs:
-        tree["cameras"] = [_lens(content.camera)]
     return tree, bytes(scene.data)
 
 
@@ -393,7 +387,8 @@ def _cameras(content: Content, scene: _Scene) -> list[int]:
     frustum = scene.mesh("image at depth", scene.shape(MM_M * shape @ GL_FROM_CV, lines), count + 1, LINES)
     nodes = []
     for (name, group), pose in content.photographs.items():
-        placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        turned = xyzw(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        placed = {"translation": metres(pose), "rotation": turned}
         extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
         nodes.append(scene.node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
     return nodes
@@ -433,10 +428,6 @@ def _exaggeration(content: Content) -> float:
         return 1.0
     sigma, radius = np.median(known, axis=0)
     return 10.0 ** np.floor(np.log10(radius / sigma))
-
-
-def _placed(pose: Rigid) -> dict:
-    return {"translation": metres(pose), "rotation": xyzw(pose)}
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
@@ -522,12 +513,10 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
 
 def export_text(written: ExportedRun) -> str:
     """Returns a text on the contents of the file, and on the results that it lacks."""
-    content = written.content
-    count, target = f"{len(content.target.circles)} circles", content.target
-    lines = [
-        f"{len(target.target_from_face)} faces and {count}, frame {content.root}, as {written.form}: {written.path}"
-    ]
-    if not content.target.face_covariance:
+    content, target = written.content, written.content.target
+    what = f"{len(target.target_from_face)} faces and {len(target.circles)} circles"
+    lines = [f"{what}, frame {content.root}, as {written.form}: {written.path}"]
+    if not target.face_covariance:
         lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
     if lost := FORMS[written.form].lost:
         lines.append(f"not in it: {lost}")

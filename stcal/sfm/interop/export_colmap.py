@@ -20,8 +20,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
-from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.labels import DotLabel
 from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
 from stcal.sfm.mapping.database import pycolmap, write_database
 from stcal.sfm.mapping.models import open_model, require_keypoints, write_reconstruction
@@ -233,14 +232,6 @@ class ExportedModel:
     points: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Point:
-    id: int
-    group: str  # empty if several groups share it
-    label: Label
-    xyz: list[float]  # (3,), target frame, mm
-
-
 @require_arguments
 def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     """Writes the final model of a run in COLMAP's binary or text format: mm, target frame, labels beside it.
@@ -270,7 +261,7 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
         raise InputError("E-OUTPUT-FOLDER", f"{out}: {existing} is a file; give another place")
     require_free(out, folder=True)
     saved = saved_run(run)
-    reconstruction, points = _labelled_points(saved)
+    reconstruction, rows = _labelled_points(saved)
     spaced = [image.name for image in saved.observations if " " in image.name]
     if spaced and form == "colmap-txt":
         fault = f"format {form}: image {spaced[0]} has a space in its name, at which readers end it"
@@ -278,13 +269,13 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     out.parent.mkdir(parents=True, exist_ok=True)
     with _complete(out) as folder:
         folder.mkdir()
-        (folder / LABELS).write_text(_labels_csv(points, saved.faces), encoding="utf-8")
+        (folder / LABELS).write_text(csv_text([LABEL_COLUMNS, *rows]), encoding="utf-8")
         write_reconstruction(reconstruction, folder, text=form == "colmap-txt")
-    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(points))
+    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(rows))
 
 
-def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
-    """Returns the run's model with coloured points, and the points by ascending id."""
+def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Sequence]]:
+    """Returns the run's model with coloured points, and the rows of ``labels.csv`` by the points' ascending ids."""
     path = run.folder / TARGET_MODEL
     if not path.is_dir():
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
@@ -299,8 +290,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
             raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
         image_of[image_id], corrected_px = observations[image.name]
         require_keypoints(path, image, image_of[image_id].labels, corrected_px)
-    rgb = colours(run)
-    points = []
+    rgb, covariance, rows = colours(run), run.faces.circle_covariance_mm2, []
     for point_id, point in sorted(reconstruction.points3D.items()):
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
@@ -311,21 +301,10 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
         point.color = np.array(colour, np.uint8)
-        group = groups.pop() if len(groups) == 1 else ""
-        points.append(_Point(point_id, group, label, point.xyz.tolist()))
-    return reconstruction, points
-
-
-def _labels_csv(points: Sequence[_Point], faces: FacesFile) -> str:
-    """Returns ``labels.csv``. Its first column is the point's id."""
-    covariance = faces.circle_covariance_mm2
-    rows: list[Sequence] = [LABEL_COLUMNS]
-    for point in points:
-        sigma = [""] * 3
-        if point.label in covariance:
-            sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
-        rows.append([point.id, point.group, point.label, *map(repr, point.xyz), *sigma])
-    return csv_text(rows)
+        sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[label]))] if label in covariance else [""] * 3
+        group = groups.pop() if len(groups) == 1 else ""  # empty if several groups share the point
+        rows.append([point_id, group, label, *map(repr, point.xyz.tolist()), *sigma])
+    return reconstruction, rows
 
 
 def model_text(written: ExportedModel) -> str:
