@@ -125,7 +125,6 @@ class Printed:
         return len(self.content) > 0
 
     def lines(self) -> list[str]:
-        """Return the lines."""
         return list(self.content)
 
     def __html__(self) -> str:
@@ -203,7 +202,6 @@ class Answer:
     said: str = ""
 
     def lines(self) -> list[str]:
-        """Return the answer as a line."""
         return [f"{self.question} {self._said()}"]
 
     def __html__(self) -> str:

@@ -176,7 +176,6 @@ class Drawing:
         )
 
     def uri(self) -> str:
-        """Returns the drawing as a data URI."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
 

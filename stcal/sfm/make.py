@@ -40,8 +40,6 @@ leaves room to cut, fold and glue."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """A side of the box."""
-
     name: str
     width: float  # of its plate, mm
     height: float
@@ -494,7 +492,6 @@ def _free(out: str | Path | None) -> Path | None:
 
 
 def _saved(folder: Path | None, target: TargetDesign, board: BoardDesign | None) -> tuple[Path, ...]:
-    """Writes the designs into a folder; returns the files."""
     if folder is None:
         return ()
     save_target(folder / "target.toml", target)

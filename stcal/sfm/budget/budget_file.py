@@ -38,7 +38,8 @@ from stcal.sfm.budget.combine import (
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, Use, judgement_of
-from stcal.sfm.runs.saved import SavedRun, Verified
+from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.transaction import Verified
 
 SHARED = ("board_pitch", "board_expansion", "target_expansion")
 """Sources whose errors two calibrations of one target with one board share: they scale all lengths by one factor."""
@@ -462,7 +463,6 @@ def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
 
 
 def _definitions(run: SavedRun) -> list[str]:
-    """Returns sentences that define the measurands."""
     plane = run.faces.frame == "plane"
     normal = "normal to the plane of all its circles, " if plane else ""
     foot = ", at its foot on the plane of all circles" if plane else ""

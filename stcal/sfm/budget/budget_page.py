@@ -22,7 +22,8 @@ from stcal.sfm.budget.budget_tables import (
 )
 from stcal.sfm.budget.certificate import REQUIRED, certificate
 from stcal.sfm.budget.combine import FIELDS, Budget, budget_of_run, statement_of
-from stcal.sfm.runs.saved import AnyRun, saved_run, verify
+from stcal.sfm.runs.saved import AnyRun, saved_run
+from stcal.sfm.runs.transaction import verify
 
 LIMITS = 0.05  # share of the variance above which a source is among those that limit a result
 
@@ -230,5 +231,5 @@ def uncertainty_budget(
         other = budget_of_run(second, statement_of(second.board_design.stated, lengths_statement or statement))
         test = against_run(budget, other, second.folder, (saved.board_design, second.board_design))
         tests.append(replace(test, notes=common_views(saved.observations, second.observations) + test.notes))
-    file = BudgetFile.of(budget, saved, verify(saved), tests, *others)
+    file = BudgetFile.of(budget, saved, verify(saved.folder), tests, *others)
     return UncertaintyBudget(budget, tuple(tests), file, tuple(refusals([saved, *others], file.length_tests)))

@@ -35,7 +35,6 @@ NEGLIGIBLE = 1e-4  # share of u below which a contribution has no sensitivity in
 
 
 def method(file: BudgetFile) -> str:
-    """Returns the sentences on how the budget was computed."""
     return METHOD.format(file=file)
 
 

@@ -76,7 +76,6 @@ def _conditions(file: BudgetFile) -> Table:
 
 
 def photographs(file: BudgetFile) -> list[Block]:
-    """Returns the photographs with their hashes."""
     found, every = file.run.photographs_sha256, sum(each.images for each in file.views)
     said = f"{len(found)} of {every} photographs, as they were in their folder when this certificate was made"
     return [said, Table(["<photograph", "<SHA-256"], list(found.items()), css="text")]

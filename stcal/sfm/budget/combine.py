@@ -38,6 +38,7 @@ from stcal.sfm.adjust.uncertainty import (
     derivatives,
 )
 from stcal.sfm.data.group_model import MetricModel
+from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
 FIELDS = {
@@ -83,8 +84,6 @@ class StatementFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What the user states."""
-
     board: StatedSize
     target: StatedSize
     origin: dict[tuple[str, str], str]  # the file that states a value, by ``board`` or ``target`` and key
@@ -403,8 +402,6 @@ class GroupViews:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
-    """The uncertainty budget of a run."""
-
     joint: JointResult
     reference_face: str
     sources: tuple[BudgetSource, ...]
@@ -417,7 +414,6 @@ class Budget:
     conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
 
     def of_kind(self, kind: Kind) -> list[Row]:
-        """Returns the rows of one kind."""
         return [row for row in self.rows if row.measurand.kind == kind]
 
 
@@ -547,6 +543,5 @@ def _row(
 
 
 def _view(model: MetricModel) -> GroupViews:
-    axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
-    spread = np.arccos(np.clip((axes @ axes.T).min(), -1, 1))
-    return GroupViews(model.group, len(model.images), float(np.degrees(spread)))
+    spread_rad = widest_angle_rad(np.array([pose.rotation[2] for pose in model.camera_from_model]))
+    return GroupViews(model.group, len(model.images), float(np.degrees(spread_rad)))

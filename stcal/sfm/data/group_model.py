@@ -95,7 +95,6 @@ class ImageObservations(Measured):
         return ImageObservations(self.name, self.group, self.labels + other.labels, *arrays)
 
     def select(self, keep) -> "ImageObservations":
-        """Returns the circles of the indices ``keep``."""
         arrays = {f.name: getattr(self, f.name)[keep] for f in fields(self)[3:]}
         return replace(self, labels=tuple(self.labels[i] for i in keep), **arrays)
 
@@ -109,13 +108,11 @@ def rows_by(keys: Iterable[K]) -> dict[K, np.ndarray]:
 
 
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
-    """Returns the observations by group, in order."""
     groups = rows_by(image.group for image in observations)
     return {group: [observations[i] for i in rows] for group, rows in groups.items()}
 
 
 def detections_csv(observations: list[ImageObservations]) -> str:
-    """Returns the text of ``detections.csv``."""
     rows: list[Sequence] = [["image", "label", "x_px", "y_px", "sigma_px"]]
     for image in observations:
         for label, (x, y), sigma in zip(image.labels, image.centre_px, image.sigma_px(), strict=True):
@@ -379,7 +376,6 @@ class Note(str):
 
     @property
     def note(self) -> str:
-        """The whole sentence."""
         return str(self)
 
     @classmethod

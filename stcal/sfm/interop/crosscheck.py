@@ -37,11 +37,9 @@ from stcal.sfm.runs.comparisons import (
     CameraRow,
     Crosscheck,
     FaceDifference,
-    FacesCompared,
     ImagesRegistered,
-    MappingCompared,
     ResidualRms,
-    ResultCompared,
+    ResultsCompared,
     Tolerances,
     allowed_text,
 )
@@ -59,8 +57,6 @@ MAX_OUTPUT = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class NativeColmap:
-    """A native COLMAP program."""
-
     program: Path
     version: str  # as the program states it, like ``3.8``
     mapper_options: frozenset[str]  # names
@@ -365,7 +361,7 @@ def _compared(
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
         mapping=mapping,
         result=result,
-        plain=FacesCompared(faces=face_differences(of_native.target, run)),
+        plain=ResultsCompared(faces=face_differences(of_native.target, run)),
         notes=list(of_native.notes),
         differences=_differences(images, mapping, result, tolerances),
     )
@@ -426,11 +422,11 @@ def _off(difference: np.ndarray) -> tuple[float, float]:
     return MICRO * shift, MICRO * turn
 
 
-def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> MappingCompared:
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultsCompared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    return MappingCompared(
+    return ResultsCompared(
         faces=face_differences(target, run, faces),
         circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
         circles_sigmas={
@@ -484,7 +480,6 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
 
 
 def comparison_text(check: Crosscheck) -> str:
-    """Returns the comparison as a text table."""
     residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
     rows = [["face", *("µm", "mdeg", "σ") * 3]]
     for face in check.mapping.faces:
@@ -514,7 +509,7 @@ def comparison_text(check: Crosscheck) -> str:
 
 
 def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
+    images: ImagesRegistered, mapping: ResultsCompared, result: ResultsCompared, limits: Tolerances
 ) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):

@@ -41,8 +41,6 @@ class _Report(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """Content of an export."""
-
     root: str  # name of the target frame
     run: SavedRun
     target: CalibratedTarget  # of faces.json
@@ -50,7 +48,6 @@ class Content:
     photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
 
     def circles_of(self, face: str) -> list[CircleLabel]:
-        """Returns the circles of a face, in the order of the design."""
         return [label for label in self.target.circles if label.face == face]
 
     def xyz_face(self, label: CircleLabel) -> np.ndarray:
@@ -58,7 +55,6 @@ class Content:
         return self.target.target_from_face[label.face].inverse() @ self.target.circles[label]
 
     def face_frame(self, face: str) -> str:
-        """Returns the name of the frame of a face."""
         return f"{self.root}_{face}"
 
     def circle_frame(self, label: CircleLabel) -> str:
@@ -138,7 +134,6 @@ def content_of(run: SavedRun, root: str) -> Content:
 
 
 def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
-    """Returns the colour of each face, by id."""
     return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target_design.faces)}
 
 
@@ -443,8 +438,6 @@ def _ball() -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A form of export."""
-
     suffix: str
     write: Callable[[Content], str | bytes]
     lost: str  # results among faces, circles, σ and cameras that the files do not hold

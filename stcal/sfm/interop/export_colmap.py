@@ -30,8 +30,6 @@ from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The database schema of a COLMAP version."""
-
     name: str
     user_version: int  # the stamp of the version's first release
     tables: dict[str, str]  # declaration by name
@@ -111,7 +109,6 @@ for _name, (_stamp, _new_tables, _new_indices) in _CHANGES.items():
 
 
 def find_schema(name: str) -> Schema:
-    """Returns the schema of that name."""
     if name not in SCHEMAS:
         raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
     return SCHEMAS[name]

@@ -146,10 +146,10 @@ class CentreNoise:
         sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
         if not any(len(model.point_index) for model in sampled):
             return replace(cls.expected(), corner_px=corner_px)
-        rims = [_RimImages.of(model, camera, radius_mm) for model in sampled]
-        both = [rim.information @ model.covariance_px2 for rim, model in zip(rims, sampled, strict=True)]
-        ratio = np.trace(np.concatenate(both), axis1=1, axis2=2) / 2
-        narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
+        rims = (_rim_images(model, camera, radius_mm) for model in sampled)
+        information, minor_px = (np.concatenate(each) for each in zip(*rims, strict=True))
+        covariance_px2 = np.concatenate([model.covariance_px2 for model in sampled])
+        ratio, narrow = np.trace(information @ covariance_px2, axis1=1, axis2=2) / 2, minor_px**-2
         usual = ratio <= 4 * np.median(ratio)
         slope, level = np.polyfit(narrow[usual], ratio[usual], 1)
         if slope <= 0 or level <= 0:
@@ -161,9 +161,9 @@ class CentreNoise:
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """Returns the metric model with the covariances that this noise gives its observations."""
-        rims = _RimImages.of(model, camera, radius_mm)
-        size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
-        covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
+        information, minor_px = _rim_images(model, camera, radius_mm)
+        size = self.edge**2 * (1 + (self.narrow_px / minor_px) ** 2)
+        covariance = size[:, None, None] * np.linalg.inv(information) + self.floor_px**2 * np.eye(2)
         covariance[_is_corner(model, radius_mm)] = self.corner_px**2 * np.eye(2)
         return replace(model, covariance_px2=covariance)
 
@@ -173,25 +173,18 @@ def _is_corner(model: MetricModel, radius_mm: dict[Label, float]) -> np.ndarray:
     return np.array([radius_mm[label] <= POINT_RADIUS_MM for label in model.labels])[model.point_index]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _RimImages:
-    """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
-
-    information: np.ndarray
-    minor_px: np.ndarray
-
-    @classmethod
-    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_RimImages":
-        """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
-        radius = np.array([radius_mm[label] for label in model.labels])
-        in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
-        by_point = projection_jacobians(model, camera)[1]
-        shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
-        angle = 2 * np.pi * np.arange(STEPS) / STEPS
-        along = shape @ np.array([-np.sin(angle), np.cos(angle)])  # of each step along the rim
-        normal = along[:, ::-1] * np.array([[1.0], [-1.0]])
-        by_length = normal / np.linalg.norm(along, axis=1)[:, None] * (2 * np.pi / STEPS)
-        return cls(by_length @ np.swapaxes(normal, 1, 2), singular_values(shape)[1])
+def _rim_images(model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns ∮ n nᵀ ds (n, 2, 2) and minor semi-axes (n,), px, of rims as ellipses, to first order in radius over
+    distance. The error is negligible for a σ."""
+    radius = np.array([radius_mm[label] for label in model.labels])
+    in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
+    by_point = projection_jacobians(model, camera)[1]
+    shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
+    angle = 2 * np.pi * np.arange(STEPS) / STEPS
+    along = shape @ np.array([-np.sin(angle), np.cos(angle)])  # of each step along the rim
+    normal = along[:, ::-1] * np.array([[1.0], [-1.0]])
+    by_length = normal / np.linalg.norm(along, axis=1)[:, None] * (2 * np.pi / STEPS)
+    return by_length @ np.swapaxes(normal, 1, 2), singular_values(shape)[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -59,8 +59,6 @@ the others, but groups that contradict one another make no fault within one of t
 
 @dataclass(frozen=True, slots=True)
 class TestedValue:
-    """One tested value."""
-
     name: str  # image, label, face, group, row …
     value: float
     limit: float | None  # in ``unit``; beyond it the value is suspicious
@@ -68,7 +66,6 @@ class TestedValue:
     probability: float | None  # of as much or more by chance, None if the value is not tested
 
     def words(self) -> str:
-        """Returns value and limit as text."""
         value, limit = self.texts()
         return value + (f", limit {limit}" if limit else "")
 

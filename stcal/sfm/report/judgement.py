@@ -144,7 +144,6 @@ def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
 
 
 def without_sigma(report: dict) -> dict:
-    """Returns the content of ``report.json`` without σ."""
     return report | {
         "faces": without_sigma_of(report["faces"]),
         "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],

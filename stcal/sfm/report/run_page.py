@@ -72,7 +72,6 @@ def report_html(
     residuals: Mapping[str, Residuals] | None = None,  # centres and their residuals by image name, px; None: not drawn
     gone: int = 0,  # number of overlays that are no longer in the run's folder
 ) -> str:
-    """Returns the page."""
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)

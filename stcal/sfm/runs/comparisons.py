@@ -61,8 +61,6 @@ class Comparison(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MethodResult:
-    """Result of one method."""
-
     target: CalibratedTarget
     models: tuple[WorldModel, ...]  # without unit, one per group
     scales: dict[str, Scale]  # by group
@@ -84,8 +82,7 @@ def compare_with_paper(result: "RunResult", published: MethodResult | StcalError
         for face, c in whole.face_covariance.items()
         if face != whole.reference_face
     }
-    filled = [row.model_dump() for row in rows]
-    return Comparison.model_validate({"with": "paper", "rows": filled, "sigma": sigma})
+    return Comparison(method="paper", rows=[ComparedRow(**row.model_dump()) for row in rows], sigma=sigma)
 
 
 def in_steps(result: "RunResult") -> dict[str, MethodResult | StcalError]:
@@ -115,15 +112,10 @@ def _row(name: str, found: MethodResult | StcalError, whole: CalibratedTarget, c
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
         return ComparedRow(method=name, missing=others, reason=str(found))
-    pairs = (
-        (face, pose, whole.target_from_face[face])
-        for face, pose in found.target.target_from_face.items()
-        if face in others
-    )
-    faces = {
-        face: _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
-        for face, pose, known in pairs
-    }
+    faces = {}
+    for face in (face for face in found.target.target_from_face if face in others):
+        pose, known = found.target.target_from_face[face], whole.target_from_face[face]
+        faces[face] = _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
     missing = [face for face in others if face not in faces]
     return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
 
@@ -195,12 +187,12 @@ class Tolerances:
 def allowed_text(tolerances: Tolerances) -> str:
     """Returns the limits in force as text."""
     parts = [f"faces and circles {tolerances.mapped_sigma:g} σ between the programs, {tolerances.sigma:g} σ adjusted"]
-    for kind, values in (
-        ("faces", ((tolerances.face_um, "µm"), (tolerances.face_mdeg, "mdeg"))),
-        ("circles", ((tolerances.circle_um, "µm"),)),
-        ("cameras", ((tolerances.camera_um, "µm"), (tolerances.camera_mdeg, "mdeg"))),
+    for kind, um, mdeg in (
+        ("faces", tolerances.face_um, tolerances.face_mdeg),
+        ("circles", tolerances.circle_um, None),
+        ("cameras", tolerances.camera_um, tolerances.camera_mdeg),
     ):
-        given = [f"{value:g} {unit}" for value, unit in values if value is not None]
+        given = [f"{value:g} {unit}" for value, unit in ((um, "µm"), (mdeg, "mdeg")) if value is not None]
         parts += [f"{kind} {' and '.join(given)}"] if given else []
     return ", ".join(parts)
 
@@ -230,18 +222,12 @@ class CameraRow(Part):
     sigmas: float
 
 
-class FacesCompared(Part):
-    faces: dict[ByFace, FaceDifference | None]
-
-
-class ResultCompared(FacesCompared):
-    circles_um: dict[ByLabel, float] = Field(default={})
-    circles_sigmas: dict[ByLabel, float] = Field(default={})
-
-
-class MappingCompared(ResultCompared):
+class ResultsCompared(Part):
     """Differences of two results; the keys that were not given are not in the file."""
 
+    faces: dict[ByFace, FaceDifference | None]
+    circles_um: dict[ByLabel, float] = Field(default={})
+    circles_sigmas: dict[ByLabel, float] = Field(default={})
     cameras: list[CameraRow] = Field(default=[])
 
 
@@ -262,18 +248,18 @@ class Crosscheck(Part):
     residual_rms_px: ResidualRms = Field(
         description="per coordinate, of the `native` model, of `pycolmap`'s, and of the `run`'s final one"
     )
-    mapping: MappingCompared = Field(
+    mapping: ResultsCompared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
         "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
         "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
         "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
         "with that of the camera in its group, circles held together"
     )
-    result: ResultCompared = Field(
+    result: ResultsCompared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
         "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
-    plain: FacesCompared = Field(
+    plain: ResultsCompared = Field(
         description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
         "`sigmas`; no tolerance applies"
     )

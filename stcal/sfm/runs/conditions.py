@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from stcal.sfm.data.group_model import GroupModel, ImageObservations
+from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import RunResult
 
 IMAGE_NOISE = 0.01  # standard deviation of the grey values, as a fraction of full scale
@@ -47,8 +48,7 @@ def _filled(model: GroupModel) -> float:
 
 def _apart_rad(model: GroupModel) -> float:
     rays = np.array([pose.inverse().translation for pose in model.camera_from_model]) - model.xyz_model.mean(axis=0)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return float(np.arccos(np.clip(rays @ rays.T, -1, 1)).max())
+    return widest_angle_rad(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _noise(image: ImageObservations, focal_px: float) -> np.ndarray:

@@ -17,21 +17,8 @@ from stcal.design import faces_of_known_shape, known_distances
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
+from stcal.io import files
 from stcal.io.cameras.read import save_camera
-from stcal.io.files import (
-    BOARD,
-    CAMERA,
-    DATABASE,
-    MODEL_BYTES,
-    MODELS,
-    REFINED_CAMERA,
-    REPORT_PDF,
-    TARGET,
-    TARGET_MODEL,
-    json_text,
-    read_bytes,
-    save,
-)
 from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
@@ -65,9 +52,9 @@ from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
 from stcal.sfm.report.run_page import CONTROL, FIRST_IMAGES, PUBLISHED, faces_table, report_html, shown_overlays
 from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
-from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun, folder_of, require_run, verify
+from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun
 from stcal.sfm.runs.stages import DetectedImages, Task
-from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
+from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, require_run, verify
 
 LONGEST_NAME, HASH_DIGITS = 200, 12
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -86,7 +73,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     common; not without ``page``.
     """
     stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
-    save(stage / "detections.csv", detections_csv(seen.observations))
+    files.save(stage / "detections.csv", detections_csv(seen.observations))
     pictures = {image.file.name: image for image in seen.detection.images}
     left_out: dict[str, frozenset[Label]] = {}
 
@@ -94,7 +81,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
         name, picture = image.observations.name, pictures[image.observations.name]
         small, crossed = (picture.thumbnail, picture.thumbnail_scale), left_out.get(name, frozenset())
         drawn = image.observations, face_ids, focal_px, len(image.notes), crossed
-        save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
+        files.save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
 
     try:
         with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
@@ -113,7 +100,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     except StcalError as error:
         if page:
             found = found_in_all(seen.labelled)
-            save(stage / "report.html", _page_on_failure(task.target.name, error, found, seen))
+            files.save(stage / "report.html", _page_on_failure(task.target.name, error, found, seen))
             error.append(f"; {found}")
         raise
 
@@ -136,20 +123,20 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
             as_measured[name][model.keypoint[rows]] = model.corrected_px()[rows]
     corrected = list(as_measured.values())
-    (out / DATABASE).parent.mkdir()
-    write_database(out / DATABASE, result.camera, observations, result.graph.pairs, corrected)
-    save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
+    (out / files.DATABASE).parent.mkdir()
+    write_database(out / files.DATABASE, result.camera, observations, result.graph.pairs, corrected)
+    files.save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
     for name, model in models.items():
-        folder = out / MODELS / name  # "models/." where the images lie directly in their folder
+        folder = out / files.MODELS / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)
     adjusted = Camera.of(result.calibration.camera, result.camera.colmap_model)
-    write_model(out / TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
-    save_camera(out / CAMERA, result.camera)
+    write_model(out / files.TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
+    save_camera(out / files.CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
-        save_camera(out / REFINED_CAMERA, refined)
-    save_target(out / TARGET, result.target_design)
+        save_camera(out / files.REFINED_CAMERA, refined)
+    save_target(out / files.TARGET, result.target_design)
     if result.board_design.rows:
-        save_board(out / BOARD, result.board_design)
+        save_board(out / files.BOARD, result.board_design)
     report = with_judgement(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
     faces = None
@@ -157,7 +144,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
         faces = FacesFile.of(result.target, result.target_design, options, factor, rims, doubted)
-        save(out / "faces.json", json_text(faces.content()))
+        files.save(out / "faces.json", files.json_text(faces.content()))
         require_result_written(out / "faces.json", faces)
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
@@ -169,8 +156,8 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
 def write_report(out: Path, report: dict, run: Path) -> None:
     """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
     page, _ = _report_page(run, report)
-    save(out / "report.json", json_text(report))
-    save(out / "report.html", page)
+    files.save(out / "report.json", files.json_text(report))
+    files.save(out / "report.html", page)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +169,6 @@ class ReportAgain:
     notes: tuple[str, ...] = ()  # on files that are not as the run left them
 
     def text(self) -> str:
-        """Returns the text for the terminal."""
         lines = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join([*lines, *(f"report: {path}" for path in self.files)])
@@ -211,15 +197,14 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
     InputError
         Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
     """
-    run, out = folder_of(run), None if out is None else Path(out)
+    run, out = run.folder if isinstance(run, SavedRun) else Path(run), None if out is None else Path(out)
     require_run(run)
     if out is not None and out.suffix.lower() == ".pdf":
         fault = f"--out {out}: the page is HTML"
         raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {out.with_suffix('.html')}, and --pdf for {out.name}")
     if pdf:
         require_pdf()
-    complete_interrupted(run)
-    notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
+    notes = tuple(verify(run).notes(but=("report.html", files.REPORT_PDF)))
     with contextlib.nullcontext(run) if out else added_results(run) as stage:
         file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
         with as_written(run / "report.json"):
@@ -227,7 +212,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
             page, gone = _report_page(run, report)
         contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
         for place, content in contents.items():
-            save(place, content)
+            files.save(place, content)
     return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), gone, notes)
 
 
@@ -242,7 +227,7 @@ def _report_page(run: Path, report: dict) -> tuple[str, int]:
     free = 1 - unknown / (2 * max(report["summary"]["observations"], 1))
     factor = report["summary"]["sigma_factor"] * float(np.sqrt(max(free, 0.01)))
     with as_written(run / "labels.csv"):
-        for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
+        for row in csv_rows(files.read_bytes(run / "labels.csv", files.MODEL_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 rows[row["image"]].append([float(row[key]) for key in DRAWN])
     residuals = {name: _with_normalised(np.array(own).reshape(-1, len(DRAWN)), factor) for name, own in rows.items()}
@@ -294,7 +279,6 @@ def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedIma
 
 
 def run_text(result: RunResult) -> str:
-    """Returns the result of a run for the terminal."""
     return "\n".join(part for line in document_of(result).text().splitlines() for part in wrapped(line))
 
 
@@ -330,9 +314,9 @@ def document_of(result: RunResult) -> Document:
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
     if (out := result.out) is not None:
-        files = [f"faces:  {out / 'faces.json'}"] if faces else []
-        files += [f"camera: {out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
-        blocks.append(Printed([*files, f"report: {out / 'report.html'}"]))
+        written = [f"faces:  {out / 'faces.json'}"] if faces else []
+        written += [f"camera: {out / files.REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
+        blocks.append(Printed([*written, f"report: {out / 'report.html'}"]))
     first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
     return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)

@@ -17,7 +17,7 @@ from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
-from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
+from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD, widest_angle_rad
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.comparisons import Comparison, Crosscheck
@@ -179,7 +179,6 @@ class ReportFile(ResultFile):
 
 
 def report_of(result: RunResult) -> ReportFile:
-    """Returns the report of a run."""
     models, options, camera = result.final_models(), result.options, result.calibration.camera
     residual = {name: model.residuals_px(camera) for name, model in models.items()}
     shown = ("solve", "frame", "eccentricity", "refine_camera")
@@ -402,8 +401,7 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
                 rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
     circles = []
     for label, sightings in rays.items():
-        direction = np.array([ray for _, ray in sightings])
-        angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
+        angle = float(np.degrees(widest_angle_rad(np.array([ray for _, ray in sightings]))))
         needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
         if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}

@@ -99,7 +99,6 @@ class DetectedImages(Brief):
 
     @property
     def observations(self) -> list[ImageObservations]:
-        """Labelled centres of all images."""
         return [image.observations for image in self.labelled]
 
     @property
@@ -229,7 +228,6 @@ class Groups:
 
     @property
     def observations(self) -> list[ImageObservations]:
-        """Labelled centres of all images."""
         return [image.observations for image in self.labelled]
 
     @property

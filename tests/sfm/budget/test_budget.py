@@ -29,8 +29,8 @@ from stcal.sfm.budget.budget_tables import as_exact
 from stcal.sfm.budget.certificate import REQUIRED, drawings
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
-from stcal.sfm.runs.saved import adjusted_run, verify
-from stcal.sfm.runs.transaction import MarkerFile
+from stcal.sfm.runs.saved import adjusted_run
+from stcal.sfm.runs.transaction import MarkerFile, verify
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 
