@@ -141,7 +141,7 @@ def detect(
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
-    from stcal.sfm.runs.folder import detection_text, found_in_all
+    from stcal.sfm.runs.folder import found_in_all, found_lines, skipped_lines
     from stcal.sfm.runs.run_options import RunOptions
 
     options = RunOptions(
@@ -153,7 +153,7 @@ def detect(
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         found = detect_images(images, camera, out, target, board, options, progress)
     print_each("note", found.notes)
-    say(detection_text(found.detection, found.labelled))
+    say("\n".join([*found_lines(found.labelled), *skipped_lines(found.detection), found_in_all(found.labelled)]))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
     if not any(len(image.observations) for image in found.labelled):
         raise ChecksFailed("E-NOTHING-SEEN", f"{images}: {found_in_all(found.labelled)}; look at the overlays")

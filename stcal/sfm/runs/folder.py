@@ -40,7 +40,7 @@ from stcal.report.document import (
 )
 from stcal.report.text import join, wrapped
 from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.data.group_model import Note, detections_csv
+from stcal.sfm.data.group_model import ImageObservations, Note, detections_csv
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
@@ -118,17 +118,17 @@ def overlay_path(out: Path, name: str) -> Path:
 def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     """Writes database, models, faces and report beside the overlays; returns the run as it was written."""
     observations, models = result.observations, {s.model.group: s.model for s in result.solutions}
-    ids, as_measured = image_ids(observations), {image.name: image.centre_px.copy() for image in observations}
+    ids, by_name = image_ids(observations), {image.name: image for image in observations}
+    keypoints = {name: image.centre_px for name, image in by_name.items()}
     for model in models.values():  # as the models of the groups correct them
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            as_measured[name][model.keypoint[rows]] = model.corrected_px()[rows]
-    corrected = list(as_measured.values())
+            keypoints[name] = model.keypoints_px(by_name[name], rows)
+    corrected = list(keypoints.values())
     (out / files.DATABASE).parent.mkdir()
     write_database(out / files.DATABASE, result.camera, observations, result.graph.pairs, corrected)
     files.save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
-    for name, model in models.items():
-        folder = out / files.MODELS / name  # "models/." where the images lie directly in their folder
-        write_model(folder, [model], observations, ids, result.camera)
+    for name, model in models.items():  # "models/." where the images lie directly in their folder
+        write_model(out / files.MODELS / name, [model], observations, ids, result.camera)
     adjusted = Camera.of(result.calibration.camera, result.camera.colmap_model)
     write_model(out / files.TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
     save_camera(out / files.CAMERA, result.camera)
@@ -137,9 +137,8 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     save_target(out / files.TARGET, result.target_design)
     if result.board_design.rows:
         save_board(out / files.BOARD, result.board_design)
-    report = with_judgement(report_of(result).content())
+    report, faces = with_judgement(report_of(result).content()), None
     judgement = Judgement.model_validate(report["judgement"])
-    faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
@@ -261,9 +260,8 @@ def require_report(saved: SavedRun) -> None:
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows = []
-    for each in seen.labelled:
-        image = each.observations
-        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+    for image in seen.observations:
+        dots = _count_dots(image)
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
     left_out = [f"{each.observations.name}: {note}" for each in seen.labelled for note in each.notes]
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
@@ -327,7 +325,7 @@ def _remarks(result: RunResult) -> Iterator[str]:
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
     noted = {image.observations.name: image.notes for image in result.labelled if image.notes}
     outliers = sum(len(solution.outliers) for solution in result.solutions)
-    for lines in (_skipped(result.detection), unmapped):
+    for lines in (skipped_lines(result.detection), unmapped):
         yield from lines[:FIRST]
         if len(lines) > FIRST:
             yield f"and {len(lines) - FIRST} more, which the report names"
@@ -346,10 +344,8 @@ def _remarks(result: RunResult) -> Iterator[str]:
         source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
         yield f"rims: faces are those of the luminous surface, behind rims of {height:.3f}{source}"
     if of_dots:
-        yield (
-            f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated, and no face depends "
-            "on it"
-        )
+        before = f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated"
+        yield f"{before}, and no face depends on it"
     if result.options.solve == "paper" or not result.options.eccentricity:
         yield PUBLISHED if result.options.solve == "paper" else CONTROL
 
@@ -375,21 +371,17 @@ def _on_size(result: RunResult) -> Iterator[str]:
         yield f"scale: from {distances}"
     if "drawing" in sources:
         (drawn,) = known_distances(result.board_design)
-        yield (
-            f"scale: unknown, nothing of known size is in view; the unit is such that {drawn.first} and {drawn.second} "
-            f"are {drawn.mm:g} mm apart, as drawn"
-        )
+        apart = f"{drawn.first} and {drawn.second} are {drawn.mm:g} mm apart, as drawn"
+        yield f"scale: unknown, nothing of known size is in view; the unit is such that {apart}"
 
 
 def _on_camera(result: RunResult) -> Iterator[str]:
     """Yields how well a camera that was found from the photographs is determined, or that its stated σ is left out."""
     given, refined = result.camera.covariance, result.refined_camera
     if given is not None and not result.options.refine_camera:
-        yield (
-            f"the camera file states σ of its parameters ({np.sqrt(given[0, 0]):.2g} px of the focal length), and this "
-            "run takes them as exact: no σ below includes them; --refine-camera adjusts the intrinsics within them and "
-            "includes them in all σ"
-        )
+        stated = f"the camera file states σ of its parameters ({np.sqrt(given[0, 0]):.2g} px of the focal length)"
+        remedy = "--refine-camera adjusts the intrinsics within them and includes them in all σ"
+        yield f"{stated}, and this run takes them as exact: no σ below includes them; {remedy}"
     if result.camera_given or refined is None or refined.covariance is None:
         return
     sigma, focal, centre = np.sqrt(np.diag(refined.covariance)), refined.focal, refined.centre
@@ -405,20 +397,18 @@ def _on_camera(result: RunResult) -> Iterator[str]:
         )
 
 
-def _skipped(detection: DetectionResult) -> list[str]:
+def skipped_lines(detection: DetectionResult) -> list[str]:
     return [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
 
 
-def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
-    """Returns faces and dots of each image, and what was left out."""
-    return "\n".join([*found_lines(labelled), *_skipped(detection), found_in_all(labelled)])
+def _count_dots(image: ImageObservations) -> int:
+    return sum(isinstance(label, DotLabel) for label in image.labels)
 
 
 def found_in_all(labelled: Sequence[LabelledImage]) -> str:
     """Returns in how many images faces and board are, and what was left out in most of them."""
     images, count = [each.observations for each in labelled], len(labelled)
-    faces = sum(bool(image.face_ids()) for image in images)
-    dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
+    faces, dots = sum(bool(image.face_ids()) for image in images), sum(_count_dots(image) > 0 for image in images)
     alike: dict[str, list[str]] = {}
     for each in labelled:
         for kind, note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
@@ -433,7 +423,7 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
 
 def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
     """Yields faces and dots of each image, and what was left out in it and helps."""
-    counts = [sum(isinstance(label, DotLabel) for label in each.observations.labels) for each in labelled]
+    counts = [_count_dots(each.observations) for each in labelled]
     for each, dots in zip(labelled, counts, strict=True):
         image = each.observations
         faces = ", ".join(sorted(image.face_ids())) or "none"
