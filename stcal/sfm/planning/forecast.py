@@ -36,15 +36,13 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
         if missing := [face.id for face in target.faces if face.id not in rough]:
             *more, last = missing
             named = f"faces {', '.join(more)} and {last} are" if more else f"face {last} is"
-            raise InputError(
-                "E-TARGET-ROUGH-POSE",
-                f"target {target.name}: the design does not say where {named}; add approximate {ROUGH_KEYS} "
-                "to each [[face]] of the target file, or for `plan` give --faces, the faces.json of an earlier run",
-            )
+            fault = f"target {target.name}: the design does not say where {named}"
+            remedy = f"add approximate {ROUGH_KEYS} to each [[face]] of the target file"
+            alternative = "or for `plan` give --faces, the faces.json of an earlier run"
+            raise InputError("E-TARGET-ROUGH-POSE", f"{fault}; {remedy}, {alternative}")
         return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
-    missing = [face.id for face in target.faces if face.id not in poses]
-    if missing:
+    if missing := [face.id for face in target.faces if face.id not in poses]:
         fault = f"{faces}: no face {missing[0]} of target {target.name}"
         raise InputError("E-TARGET-NO-FACE", f"{fault}; give a run that shows all of its faces")
     return {face.id: poses[face.id] for face in target.faces}

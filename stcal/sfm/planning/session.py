@@ -439,10 +439,8 @@ def plan_text(plan: Plan, noise: str) -> str:
         "2.8 times as wide from twice as far; what it moves is corrected to about 15 %",
     ]
     if assumed := [face.id for face in plan.setup.target.faces if face.outline_mm is None]:
-        lines.append(
-            f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles "
-            "(--margin-mm, or outline_mm in target.toml)"
-        )
+        plates = f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles"
+        lines.append(f"{plates} (--margin-mm, or outline_mm in target.toml)")
     if board.rows:
         lines.append("the random places of board and cameras (--seed) change it by about ±3 %")
     else:
@@ -459,12 +457,8 @@ def _photographs_said(plan: Plan) -> str:
         prints = sorted({MICRO * (face.sigma_mm or 0.0) for face in faces})
         ends = " to ".join(dict.fromkeys(f"{each:g}" for each in (prints[0], prints[-1])))
         found = "found from them" if options.camera is None else "of the file"
-        return (
-            f"{options.images} images, {size}, of a body in random poses that show two or more of {len(faces)} faces; "
-            f"camera {found}, σ of print {ends} µm"
-        )
+        shown = f"of a body in random poses that show two or more of {len(faces)} faces"
+        return f"{options.images} images, {size}, {shown}; camera {found}, σ of print {ends} µm"
     boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
-    return (
-        f"groups {', '.join(plan.groups)}, {options.images} images each, {size}, spread ±{options.spread_deg:g}°; "
-        f"{boards}, σ {MICRO * board.sigma_mm:g} µm"
-    )
+    views = f"{options.images} images each, {size}, spread ±{options.spread_deg:g}°"
+    return f"groups {', '.join(plan.groups)}, {views}; {boards}, σ {MICRO * board.sigma_mm:g} µm"

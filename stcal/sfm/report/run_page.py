@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
-from itertools import chain, compress, product
+from itertools import chain, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -79,11 +79,10 @@ def report_html(
     summary, options = report["summary"], report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
+    why = "their overlays were no longer in the run's folder when this page was made"
     pictures = [
         macro("photographs", shown, rest) if shown["each"] else "" if gone else "There are none",
-        f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
-        if gone
-        else "",
+        f"{gone} photographs are not shown: {why}" if gone else "",
     ]
     sections = [
         Section("Faces", _answer(report, colours)),
@@ -101,13 +100,9 @@ def report_html(
         f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
         f"{summary['images_mapped']} mapped, {summary['faces']} faces"
     )
-    warnings = {
-        ALONE: not report["faces"],
-        PUBLISHED: options["solve"] == "paper",
-        CONTROL: not options["eccentricity"],
-    }
-    warning = [text for text, applies in warnings.items() if applies][:1]
-    banner = [alarms(warning), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
+    alone, published, control = not report["faces"], options["solve"] == "paper", not options["eccentricity"]
+    warnings = [ALONE] * alone + [PUBLISHED] * published + [CONTROL] * control
+    banner = [alarms(warnings[:1]), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
@@ -155,10 +150,9 @@ def _faces_in_detail(report: dict) -> list[Block]:
         for row in report["between_faces"]
     ]
     ways = []
-    for face, chains in report["chains"].items():
-        for way in chains:
-            off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
-            ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
+    for face, way in ((face, way) for face, chains in report["chains"].items() for way in chains):
+        off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
+        ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
     found = ["Points found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     return [
@@ -237,9 +231,8 @@ def _residuals(report: dict, colours: dict[str, str], residuals: Mapping[str, Re
     for i, row in enumerate(report["residuals_by_image"], 1):
         coloured = swatch(row["group"], colours.get(row["group"], ""))
         images.append([i, row["image"], coloured, *cells(row, "observations rms_px:4 max_px:4 worst")])
-    worst = max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None)
     named = ""
-    if worst:
+    if worst := max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None):
         group = f" of group {worst['group']}" if worst["group"] else ""
         named = f". The worst label is {worst['label']}{group} with {worst['rms_px']:.4f} px RMS"
     table = Table(["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"], images)
@@ -308,9 +301,8 @@ def trust(report: dict, judgement: Judgement) -> list[Block]:
         absent = [] if refined else ["the camera calibration"]
         absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if has_board(report) else []
         scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
-        scope += (
-            f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
-        )
+        if absent:
+            scope += f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it"
     factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
     larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
     of_groups = f"group by group, residuals are {larger} the centres' own σ"
@@ -401,14 +393,15 @@ def checks_section(checks_of_report: list[dict]) -> list[Block]:
     """Returns the checks that did not pass; the others, and what all of them measured, folded."""
     checks = sorted(map(Check.read, checks_of_report), key=lambda check: ORDER.index(check.verdict))
     heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
-    is_open = [check.verdict in ("failed", "suspicious") for check in checks]
-    rows = []
+    of_values = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
+    open_: list[list] = []
+    others: list[list] = []
     for check in checks:
         surplus = len(check.names) - FIRST_NAMES
         names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
         value = check.measured[0].texts() if check.measured else [NONE, NONE]
-        rows.append([check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy])
-    open_, others = (list(compress(rows, of)) for of in (is_open, [not each for each in is_open]))
+        row = [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
+        (open_ if check.verdict in ("failed", "suspicious") else others).append(row)
     measured = [
         [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
         for check in checks
@@ -423,10 +416,7 @@ def checks_section(checks_of_report: list[dict]) -> list[Block]:
         fold(
             f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
         ),
-        fold(
-            "What was measured",
-            Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
-        ),
+        fold("What was measured", Table(of_values, measured, css="text")),
     ]
 
 
