@@ -123,17 +123,14 @@ def make_pattern(
             if least == 0:
                 break
         if best is None:
-            raise InputError(
-                "E-MAKE-ROOM",
-                f"face {side.name}: no room for {circles} circles of {radius_mm:.3g} and {LARGE * radius_mm:.3g} mm on "
-                f"{side.width:g} × {side.height:g} mm; fewer --circles, a smaller --radius-mm, or a larger --size",
+            radii, plate = f"{radius_mm:.3g} and {LARGE * radius_mm:.3g} mm", f"{side.width:g} × {side.height:g} mm"
+            fault = f"face {side.name}: no room for {circles} circles of {radii} on {plate}"
+            raise InputError("E-MAKE-ROOM", f"{fault}; fewer --circles, a smaller --radius-mm, or a larger --size")
+        if least > (most := circles - HIDDEN - 1):
+            fault = (
+                f"face {side.name}: {least} of {circles} circles also fit another interpretation, at most {most} may"
             )
-        if least > circles - HIDDEN - 1:
-            raise InputError(
-                "E-MAKE-CIRCLES",
-                f"face {side.name}: {least} of {circles} circles also fit another interpretation, at most "
-                f"{circles - HIDDEN - 1} may; more --circles, a smaller --radius-mm, or another --seed",
-            )
+            raise InputError("E-MAKE-CIRCLES", f"{fault}; more --circles, a smaller --radius-mm, or another --seed")
         faces.append(best)
         likeness = max(likeness, least)
     return TargetDesign(name, polarity, tuple(faces)), likeness
@@ -315,20 +312,17 @@ def make_target(options: DesignOptions, progress: Callable[[int, int], None] | N
     if radius is None:
         radius = _up_to(RADIUS_STEP_MM, max(least, RADIUS_SHARE * min(options.size_mm)))
     if radius < least:
-        raise InputError(
-            "E-MAKE-RADIUS",
-            f"--radius-mm {radius:g}: at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm "
-            "on; larger circles, a nearer camera or more pixels needed",
-        )
+        seen = f"at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm on"
+        remedy = "larger circles, a nearer camera or more pixels needed"
+        raise InputError("E-MAKE-RADIUS", f"--radius-mm {radius:g}: {seen}; {remedy}")
     camera = options.ideal_camera()
     most = diameter_limits_px(camera.width * camera.height, EllipseOptions())[1]
     largest = 2 * LARGE * radius * float(np.sqrt(camera.focal.prod())) / options.distance_mm
     if largest * FARTHER > most:
-        raise InputError(
-            "E-MAKE-RADIUS",
-            f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
-            "sought; smaller circles or a camera farther away needed",
+        fault = (
+            f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are sought"
         )
+        raise InputError("E-MAKE-RADIUS", f"{fault}; smaller circles or a camera farther away needed")
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):

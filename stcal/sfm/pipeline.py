@@ -312,11 +312,9 @@ def on_surface(result: RunResult, calibration: Calibration, evidence: Evidence) 
     if evidence.rim:
         found = evidence.rims.get("circles")
         if found is None:
-            raise InputError(
-                "E-RIM-UNKNOWN",
-                f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph them "
-                "from several angles, or state rim_mm in target.toml",
-            )
+            fault = f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts"
+            remedy = "photograph them from several angles, or state rim_mm in target.toml"
+            raise InputError("E-RIM-UNKNOWN", f"{fault}; {remedy}")
         heights, sigma_mm = dict.fromkeys(calibration.target.circles, found.height_mm), found.sigma_mm
     if not any(heights.values()):
         return calibration

@@ -228,11 +228,8 @@ def measure(
         from stcal.io.images import SUFFIXES
 
         if images.is_file() and images.suffix.lower() not in SUFFIXES:
-            raise InputError(
-                "E-IMAGES-FOLDER",
-                f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or "
-                "give the folder of its frames",
-            )
+            remedy = "for the pose in each picture of a video give --live --json -, or give the folder of its frames"
+            raise InputError("E-IMAGES-FOLDER", f"{images}: a file, and no image; {remedy}")
         shared.load_ahead(workers)
     from stcal.boards.board_file import load_dots
     from stcal.boards.target_file import target_of

@@ -305,10 +305,8 @@ def crosscheck(
     say(comparison_text(check))
     say(f"report: {run / 'report.html'}")
     if check.differences:
-        raise MappingError(
-            "E-CROSSCHECK-DIFFERS",
-            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}",
-        )
+        differ = f"native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
+        raise MappingError("E-CROSSCHECK-DIFFERS", f"cross-check: {differ}")
 
 
 @app.command()

@@ -157,18 +157,14 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     notes = []
     for source in read:
         if not source.camera.same_as(read[0].camera):
-            raise InputError(
-                "E-MODEL-CAMERAS",
-                f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
-                "or give one model at a time",
-            )
+            fault = f"models {read[0].path}, {source.path}: different cameras"
+            remedy = "keep the intrinsics fixed in the mapper, or give one model at a time"
+            raise InputError("E-MODEL-CAMERAS", f"{fault}; {remedy}")
         if not source.camera.same_as(run.camera):
             ideal = np.concatenate([image.centre for image in run.observations])
             off_px = np.abs(source.camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max()
-            notes.append(
-                f"model {source.path}: its camera is up to {off_px:.2g} px off the run's at the keypoints; the model's "
-                "is used"
-            )
+            off = f"its camera is up to {off_px:.2g} px off the run's at the keypoints"
+            notes.append(f"model {source.path}: {off}; the model's is used")
         counts = {
             "points left out, since their keypoints name no one circle": source.unlabelled,
             "circles that are several points each, longest tracks taken": source.split,
@@ -316,11 +312,9 @@ def _compared(
             first, second = (next(i for i in group if i.name == chosen[which]) for which in ("first", "second"))
             pair, shared = (ids[first.name], ids[second.name]), len(set(first.labels) & set(second.labels))
             if shared < MIN_INLIERS:  # few tags have few corners
-                raise MappingError(
-                    "E-CROSSCHECK-FEW",
-                    f"group {name}: {first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to "
-                    "begin with; COLMAP cannot map it, check the run with the checks of its report",
-                )
+                fault = f"{first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to begin with"
+                remedy = "COLMAP cannot map it, check the run with the checks of its report"
+                raise MappingError("E-CROSSCHECK-FEW", f"group {name}: {fault}; {remedy}")
             map_natively(native, folder / "native.db", work, names, mapper_options(native, names, pair), timeout_s)
             path, model = _native_model(work / "models", name, native, run, ids)
             native_models.append(model)
@@ -389,11 +383,9 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     try:
         models = find_models(folder)
     except InputError as error:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; the pair may "
-            "share too few labels, or be too near to each other; add images from further apart",
-        ) from error
+        fault = f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair"
+        why = "the pair may share too few labels, or be too near to each other"
+        raise MappingError("E-COLMAP-NO-MODEL", f"{fault}; {why}; add images from further apart") from error
     try:
         path = max(models, key=lambda model: open_model(model).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
@@ -405,11 +397,9 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
 def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run used its own relative "
-            "pose); a cross-check is not possible",
-        )
+        fault = f"group {group}: pycolmap makes no model from the run's initial pair alone"
+        own = "the run used its own relative pose"
+        raise MappingError("E-COLMAP-NO-MODEL", f"{fault} ({own}); a cross-check is not possible")
     written = place / "own-model"
     written.mkdir()
     write_reconstruction(reconstruction, written)

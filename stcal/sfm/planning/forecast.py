@@ -36,10 +36,10 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
         if missing := [face.id for face in target.faces if face.id not in rough]:
             *more, last = missing
             named = f"faces {', '.join(more)} and {last} are" if more else f"face {last} is"
-            fault = f"target {target.name}: the design does not say where {named}"
+            unplaced = f"target {target.name}: the design does not say where {named}"
             remedy = f"add approximate {ROUGH_KEYS} to each [[face]] of the target file"
             alternative = "or for `plan` give --faces, the faces.json of an earlier run"
-            raise InputError("E-TARGET-ROUGH-POSE", f"{fault}; {remedy}, {alternative}")
+            raise InputError("E-TARGET-ROUGH-POSE", f"{unplaced}; {remedy}, {alternative}")
         return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
     if missing := [face.id for face in target.faces if face.id not in poses]:

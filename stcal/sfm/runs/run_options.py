@@ -104,11 +104,9 @@ class RunOptions:
             target.face(face)
         settled = replace(self, **asdict(self.adjustment(target)))
         if settled.solve != "joint" and (self.rim or any(target.rim_of().values())):
-            raise InputError(
-                "E-RIM-SOLVE",
-                f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}: only the joint "
-                "adjustment corrects rims; use --solve joint, or leave the rims out",
-            )
+            given = f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}"
+            fault = f"{given}: only the joint adjustment corrects rims"
+            raise InputError("E-RIM-SOLVE", f"{fault}; use --solve joint, or leave the rims out")
         return settled
 
     def for_run(self, camera: CameraModel | None, target: TargetDesign, board: BoardDesign) -> "RunOptions":
@@ -129,22 +127,16 @@ class RunOptions:
             fault = f"{name}: only for targets of circles, and faces of this one have boards or tags"
             raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
         if camera is None and not (board.rows or printed):
-            raise InputError(
-                "E-CAMERA-NEEDED",
-                "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-                "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or "
-                "tags",
-            )
+            fault = "circles without a board of dots need a camera file, which `stcal-sfm calibrate-camera` makes"
+            remedy = "the camera is also found if a board is in view, or if faces have a board or tags"
+            raise InputError("E-CAMERA-NEEDED", f"missing option '--camera': {fault}; {remedy}")
         options = options.settled(target)
         if options.compare:
             require_dots(board, f"--compare {options.compare}")
             if options.solve != "joint" or not options.eccentricity:
-                raise InputError(
-                    "E-OPTION-CONFLICT",
-                    f"--compare paper: compares with the joint adjustment, but --solve is {options.solve}"
-                    f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity "
-                    "out",
-                )
+                given = f"--solve is {options.solve}{'' if options.eccentricity else ' without eccentricity'}"
+                fault = f"--compare paper: compares with the joint adjustment, but {given}"
+                raise InputError("E-OPTION-CONFLICT", f"{fault}; leave --solve and --no-eccentricity out")
         return options
 
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:

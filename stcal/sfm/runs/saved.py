@@ -3,6 +3,7 @@ from it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
@@ -179,11 +180,8 @@ class SavedRun(Brief):
 
 def no_faces(folder: Path) -> InputError:
     """Returns the error of a run without a result for faces."""
-    return InputError(
-        "E-RUN-NO-FACES",
-        f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
-        "that show them",
-    )
+    fault = f"run {folder}: no faces.json: of the board alone, or of another version"
+    return InputError("E-RUN-NO-FACES", f"{fault}; for faces, run it on photographs that show them")
 
 
 def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
@@ -318,11 +316,8 @@ class RunResult(SavedRun):
 
     def unadjusted(self) -> dict[str, frozenset[Label]]:
         """Returns the labels of the keypoints that are not in the result, by image."""
-        residuals = self.residuals_px()
-        return {
-            image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residuals[image.name]).any(axis=1)))
-            for image in self.observations
-        }
+        without = {name: np.isnan(residual).any(axis=1) for name, residual in self.residuals_px().items()}
+        return {image.name: frozenset(compress(image.labels, without[image.name])) for image in self.observations}
 
     def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
         """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
@@ -511,8 +506,7 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         texts = [[row[column] for column in COLUMNS] for row in image_rows]
         values = frozen(np.array(texts, float).reshape(-1, len(COLUMNS)), (None, len(COLUMNS)), name)
         centre_px, covariance = values[:, :2], values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
-        fault = first_fault(covariance, OF_PIXEL, definite=True)
-        if fault is not None:
+        if (fault := first_fault(covariance, OF_PIXEL, definite=True)) is not None:
             raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
         centre, shape = camera.normalised_from_pixel(centre_px), np.zeros_like(covariance)
         observations.append(ImageObservations(name, group, labels, centre_px, centre, shape, covariance))

@@ -241,8 +241,8 @@ def require_ours(out: Path) -> None:
 def _require_no_link(out: Path) -> None:
     for name in (files.INTERNAL, files.CACHE, STAGE, READY):
         if (out / name).is_symlink():
-            fault = f"output folder {out}: {name} in it is a link"
-            raise InputError("E-OUTPUT-LINK", f"{fault}; remove it, a run writes through none")
+            link = f"output folder {out}: {name} in it is a link"
+            raise InputError("E-OUTPUT-LINK", f"{link}; remove it, a run writes through none")
 
 
 def require_run(folder: Path) -> None:
