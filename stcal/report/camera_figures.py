@@ -44,10 +44,10 @@ def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[st
     lines = [f"{called} has no place here: {fitted} over {where}, {found.most_px:.2g} px at most"]
     turn = np.degrees(found.camera_from_lens.log()[:3])
     if turn.any():
-        lines.append(
-            f"the fitted camera is turned by {np.linalg.norm(turn):.4f}° ({', '.join(f'{v:.4f}' for v in turn)}) about "
-            "the axes of the lens: poses that the other program gave do not apply to it"
+        turned = (
+            f"turned by {np.linalg.norm(turn):.4f}° ({', '.join(f'{v:.4f}' for v in turn)}) about the axes of the lens"
         )
+        lines.append(f"the fitted camera is {turned}: poses that the other program gave do not apply to it")
     if found.most_px > POOR_PX:
         remedy = "refine it (`--refine-camera`), or calibrate anew"
         lines.append(f"a fit more than {POOR_PX:g} px off is a start only: {remedy}")

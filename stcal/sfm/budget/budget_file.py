@@ -83,11 +83,10 @@ class LengthTest:
         agrees = largest <= limit * (1 + 1e-9)
         verdict = f"agrees: all {count} lengths within U, largest |E_n| {number(largest, 2)}"
         if beyond:
-            verdict = (
-                f"{'may agree' if agrees else 'differs'}: {beyond} of {count} lengths beyond U, where 1 in 22 is by "
-                f"chance; largest |E_n| {number(largest, 2)}, which reaches {limit:.2f} by chance in one of 22 tests "
-                f"of {count}"
-            )
+            how_many = f"{beyond} of {count} lengths beyond U, where 1 in 22 is by chance"
+            reaches = f"which reaches {limit:.2f} by chance in one of 22 tests of {count}"
+            word = "may agree" if agrees else "differs"
+            verdict = f"{word}: {how_many}; largest |E_n| {number(largest, 2)}, {reaches}"
         return cls(reference, list(lengths), largest, beyond, limit, agrees, verdict, notes)
 
     def without_u(self) -> "LengthTest":
@@ -116,10 +115,8 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
         tested.append(_tested((a, b), own, (float(value), float(sigma_mm) ** 2, 0.0)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
     if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
-        notes += (
-            f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
-            "not corrected to another",
-        )
+        needed = f"{path} must state lengths for the temperature at which the target was photographed"
+        notes += (f"{needed}: those of the run are not corrected to another",)
     return LengthTest.of(str(path), tested, notes)
 
 
@@ -147,10 +144,8 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     )
     notes = (note,) if same else ()
     if budget.conditions.temperature_c != other.conditions.temperature_c:
-        notes += (
-            "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
-            "board and target for both",
-        )
+        remedy = "state expansion and temperature of board and target for both"
+        notes += (f"the lengths of the two calibrations hold at different temperatures; {remedy}",)
     return LengthTest.of(str(folder), tested, notes)
 
 
@@ -161,13 +156,9 @@ SAME_VIEW_PX = 0.2
 def common_views(first: Sequence[ImageObservations], second: Sequence[ImageObservations]) -> tuple[str, ...]:
     """Returns a note on photographs of which both runs have the same view; none if there are none."""
     common = sum(any(_same_view(image, other) for other in second) for image in first)
-    if not common:
-        return ()
-    return (
-        f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px: the two "
-        "calibrations are not independent, and what both have wrong cannot be seen here; compare with a run of other "
-        "photographs",
-    )
+    same = f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px"
+    why = "the two calibrations are not independent, and what both have wrong cannot be seen here"
+    return (f"{same}: {why}; compare with a run of other photographs",) if common else ()
 
 
 def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
@@ -182,11 +173,9 @@ def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
 
 def _require_size(budget: Budget) -> None:
     if not budget.conditions.size_known:
-        raise InputError(
-            "E-BUDGET-NO-SIZE",
-            "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared; "
-            "state one of the lengths with [[scale]] in target.toml, and run again",
-        )
+        fault = "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared"
+        remedy = "state one of the lengths with [[scale]] in target.toml, and run again"
+        raise InputError("E-BUDGET-NO-SIZE", f"{fault}; {remedy}")
 
 
 Length = tuple[float, float, float]
@@ -514,8 +503,7 @@ def _unusual(statement: Statement) -> list[str]:
     for body, size in (("board", statement.board), ("target", statement.target)):
         warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
         if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
-            fahrenheit = (warm - 32) / 1.8
-            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {fahrenheit:.1f} °C?")
+            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {(warm - 32) / 1.8:.1f} °C?")
         if sigma > USUAL_SIGMA_K:
             asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")
         if abs(rate) > USUAL_EXPANSION:

@@ -73,10 +73,9 @@ def _answer(file: BudgetFile) -> Answer:
 
 def _about(file: BudgetFile) -> str:
     groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
-    return (
-        f"{Path(file.run.folder).name}: {sum(each.images for each in file.views)} photographs in {groups}; faces "
-        f"against face {file.reference_face}, the target frame"
-    )
+    photographs = f"{sum(each.images for each in file.views)} photographs in {groups}"
+    faces = f"faces against face {file.reference_face}, the target frame"
+    return f"{Path(file.run.folder).name}: {photographs}; {faces}"
 
 
 def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
@@ -97,9 +96,8 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
     for each in file.distances[:1]:
         length = as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
         ends = "–".join(each.circles)
-        headline.append(
-            (significant(each.distance_um.expanded), "µm", f"U of the longest distance {ends}, {length} mm")
-        )
+        value = significant(each.distance_um.expanded)
+        headline.append((value, "µm", f"U of the longest distance {ends}, {length} mm"))
     if not file.size_known:
         headline.append(("no", "size", "only the shape is known: no lengths and no positions in mm"))
     unknown, assumed = (sum(each.origin == origin for each in file.sources) for origin in ("not stated", "assumed"))

@@ -244,9 +244,8 @@ def _of_statement(found: Contributions, statement: Statement) -> Iterator[Budget
         ("board", statement.board, found.by_scale),
         ("target", statement.target, -(grown - grown.mean(0)).ravel()),
     ):
-        together.append(
-            (body, stated, (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size)
-        )
+        warmed = (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size
+        together.append((body, stated, warmed))
         for key, name, needed, factor, unit in (
             ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
             ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer_k(stated), "ppm/K"),
@@ -306,10 +305,9 @@ def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
     there = "the temperature" if photographed is None else f"{photographed:g} °C,"
     why = ": expansion and temperature of the target are not both stated"
     if of_board is None:
-        why = (
-            ", as far as the board's grid had the size of its file there: expansion and temperature of the board are "
-            "not both stated, and without them the target's are not corrected for"
-        )
+        unstated = "expansion and temperature of the board are not both stated"
+        uncorrected = "without them the target's are not corrected for"
+        why = f", as far as the board's grid had the size of its file there: {unstated}, and {uncorrected}"
     words = f"{holds} {there} at which the target was photographed{corrected}{why}"
     return StatedConditions(True, total, photographed, words)
 

@@ -541,10 +541,9 @@ def faces_text(calibration: Calibration, run: SavedRun) -> str:
     lines = [*calibration.notes]
     for model in calibration.models:
         scale = calibration.scales[model.group]
-        lines.append(
-            f"group {model.group}: {len(model.images)} images, {len(model.labels)} circles, {scale.mm_per_unit:.6g} mm "
-            f"per unit, {'board' if scale.source == 'board' else scale.source} within {1e3 * scale.rms_mm():.1f} µm RMS"
-        )
+        within = f"{scale.source} within {1e3 * scale.rms_mm():.1f} µm RMS"
+        counts = f"{len(model.images)} images, {len(model.labels)} circles"
+        lines.append(f"group {model.group}: {counts}, {scale.mm_per_unit:.6g} mm per unit, {within}")
     difference = face_differences(calibration.target, run)
     rows = [["face", "x", "y", "z", "mm   against the run: µm", "mdeg"]]
     for face_id, pose in calibration.target.target_from_face.items():

@@ -384,17 +384,14 @@ def _on_camera(result: RunResult) -> Iterator[str]:
         yield f"{stated}, and this run takes them as exact: no σ below includes them; {remedy}"
     if result.camera_given or refined is None or refined.covariance is None:
         return
-    sigma, focal, centre = np.sqrt(np.diag(refined.covariance)), refined.focal, refined.centre
-    yield (
-        f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
-        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px from the centre of the "
-        "first pixel (in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more)"
-    )
+    sigma, focal = np.sqrt(np.diag(refined.covariance)), refined.focal
+    fx, fy, cx, cy = (f"{v:.2f} ± {s:.2f}" for v, s in zip((*focal, *refined.centre), sigma, strict=False))
+    corner = "in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more"
+    centre = f"principal point {cx}, {cy} px from the centre of the first pixel ({corner})"
+    yield f"camera: found from the photographs: f {fx}, {fy} px, {centre}"
     if sigma[0] > WEAK_FOCAL * focal[0]:
-        yield (
-            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from a shorter "
-            f"distance, and of faces tilted by 30° to 60°, or give a camera file"
-        )
+        views = "take views from a shorter distance, and of faces tilted by 30° to 60°, or give a camera file"
+        yield f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: {views}"
 
 
 def skipped_lines(detection: DetectionResult) -> list[str]:

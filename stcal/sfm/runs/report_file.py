@@ -408,9 +408,8 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
             reason = "seen in one mapped image of its group only, 2 needed; photograph it from another place too"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
-            reason = (
-                f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
-            )
+            within = f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed"
+            reason = f"{within}; add views from further apart"
         circles += [{"image": name, "label": str(label), "reason": reason} | gate for name, _ in sightings]
     return circles
 
