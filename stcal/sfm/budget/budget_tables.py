@@ -67,9 +67,8 @@ def results(file: BudgetFile) -> list[Block]:
         ["–".join(each.faces), as_exact(each.angle_deg, 1e-3 * (u := each.angle_mdeg.expanded)), significant(u)]
         for each in file.angles
     ]
-    corrected = ["corrected for what is stated, mm"]
-    corrected *= any(own.corrected_mm != own.length_mm for own in file.distances)
-    lengths = []
+    is_corrected = any(own.corrected_mm != own.length_mm for own in file.distances)
+    corrected, lengths = ["corrected for what is stated, mm"] * is_corrected, []
     for own in file.distances:
         u, values = own.distance_um.expanded, (own.length_mm, own.corrected_mm)[: 1 + len(corrected)]
         lengths.append(["–".join(own.circles), *(as_exact(v, 1e-3 * u) for v in values), significant(u)])

@@ -42,11 +42,9 @@ def certificate(file: BudgetFile) -> Document:
     images, groups = sum(each.images for each in file.views), len(file.views)
     given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
     head = [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
-    how = (
-        f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the points of all faces and the "
-        f"poses of the camera were adjusted together (bundle adjustment by stcal {file.run.version}, uncertainties by "
-        f"stcal {file.version})"
-    )
+    programs = f"bundle adjustment by stcal {file.run.version}, uncertainties by stcal {file.version}"
+    adjusted = f"the points of all faces and the poses of the camera were adjusted together ({programs})"
+    how = f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; {adjusted}"
     tests = [block for test in file.length_tests for block in length_test(test)]
     return Document(
         f"Certificate of calibration no. {file.fields['number'].strip()}",
@@ -67,11 +65,8 @@ def _conditions(file: BudgetFile) -> Table:
     """Returns what is stated of the bodies, a column for each."""
     bodies = dict.fromkeys(row.body for row in file.stated)
     values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
-    rows = [
-        [words, *(values.get((body, key), NONE) for body in bodies)]
-        for key, words in STATED.items()
-        if any((body, key) in values for body in bodies)
-    ]
+    stated = {words: [values.get((body, key), NONE) for body in bodies] for key, words in STATED.items()}
+    rows = [[words, *row] for words, row in stated.items() if set(row) - {NONE}]
     return Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
 
 
@@ -87,7 +82,7 @@ def drawings(file: BudgetFile) -> Block:
     for label, each in file.circles.items():
         face, _, circle = label.partition(":")
         circles.setdefault(face, {})[circle] = np.array(each.position_mm)
-    poses = {file.reference_face: Rigid(np.eye(3), np.zeros(3))} | {
+    poses = {file.reference_face: Rigid()} | {
         name: Rigid(Rotation.from_rotvec(each.rotation_vector_deg, degrees=True), each.position_mm)
         for name, each in file.faces.items()
         if each.position_mm is not None

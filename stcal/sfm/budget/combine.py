@@ -4,7 +4,7 @@ uncertainties of faces and of the target's largest distances."""
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date, time
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, product
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -37,7 +37,7 @@ from stcal.sfm.adjust.uncertainty import (
     contributions_of,
     derivatives,
 )
-from stcal.sfm.data.group_model import MetricModel
+from stcal.sfm.data.group_model import MetricModel, rows_by
 from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
@@ -469,11 +469,10 @@ def budget(
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
     """Returns positions and rotations of all faces except the reference face, angles, and the longest distances."""
     other_faces = [face for face in own.target_from_face if face != reference_face]
-    kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
+    rows_of: dict[Kind, slice] = {"position": slice(3, 6), "rotation": slice(0, 3)}
     poses = [
         Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
-        for kind, rows in kinds
-        for face in other_faces
+        for (kind, rows), face in product(rows_of.items(), other_faces)
     ]
     angles = [_angle(own, a, b) for a, b in combinations(own.target_from_face, 2)]
     longest = longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]
@@ -491,12 +490,10 @@ def _angle(own: Derivatives, a: str, b: str) -> Measurand:
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
     """Returns, for every two faces and within each, the two circles farthest apart, the longest distance first."""
-    faces: dict[str, list[int]] = {}
-    for i, label in enumerate(labels):
-        faces.setdefault(label.face, []).append(i)
+    faces = {face: rows.tolist() for face, rows in rows_by(label.face for label in labels).items()}
     pairs = []
     for a, b in combinations_with_replacement(faces, 2):
-        ends = combinations(faces[a], 2) if a == b else ((i, j) for i in faces[a] for j in faces[b])
+        ends = combinations(faces[a], 2) if a == b else product(faces[a], faces[b])
         pairs += sorted(ends, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:1]
     return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))
 
@@ -505,11 +502,10 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     """Returns the measurand of the distance between two circles."""
     difference = joint.xyz_model[j] - joint.xyz_model[i]
     length = float(np.linalg.norm(difference))
-    jacobian = np.zeros((1, joint.xyz_model.size))
-    jacobian[0, 3 * j : 3 * j + 3] = difference / length
-    jacobian[0, 3 * i : 3 * i + 3] = -difference / length
+    jacobian = np.zeros(joint.xyz_model.shape)
+    jacobian[j], jacobian[i] = difference / length, -difference / length
     ends = joint.labels[i], joint.labels[j]
-    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian, np.zeros((1, 0)))
+    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian.reshape(1, -1), np.zeros((1, 0)))
 
 
 def _row(

@@ -64,13 +64,11 @@ class NativeColmap:
 
 def find_colmap(path: str | Path | None = None) -> NativeColmap:
     """Returns the program at ``path``, or the one on the PATH."""
-    executable = shutil.which("colmap" if path is None else str(path))
-    if executable is None:
+    if (executable := shutil.which("colmap" if path is None else str(path))) is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
         raise _unfit(f"no program {where}; {INSTALL}, or give its path with --colmap")
     program = Path(executable)
-    version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", _answer(program, "help"))
-    if version is None:
+    if (version := re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", _answer(program, "help"))) is None:
         raise _unfit(f"{program} does not say a COLMAP version; {INSTALL}, or give another --colmap")
     options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
     return NativeColmap(program, version[1], frozenset(options))
@@ -120,15 +118,10 @@ def _end(code: int, output: str) -> str:
 def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
     """Exit code of a command, None after the time limit, and its last output; no child process outlives it."""
     with tempfile.TemporaryFile() as output:  # no pipe, which a child of its own session may hold open
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
+        variables = os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment
         try:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment,
-                start_new_session=True,
-            )
+            process = subprocess.Popen(command, **streams, env=variables, start_new_session=True)
         except OSError as error:
             raise _unfit(f"{command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
         try:
@@ -329,13 +322,8 @@ def _compared(
     if heights:
         again = on_luminous_surface(again, heights, rim_sigma_mm, run.target_design, options.frame)
     native_images, own_images = ({name for m in of.models for name in m.images} for of in (of_native, of_pycolmap))
-    images = ImagesRegistered(
-        native=len(native_images),
-        pycolmap=len(own_images),
-        run=len(run.observations),
-        only_native=sorted(native_images - own_images),
-        only_pycolmap=sorted(own_images - native_images),
-    )
+    only = {"only_native": sorted(native_images - own_images), "only_pycolmap": sorted(own_images - native_images)}
+    images = ImagesRegistered(native=len(native_images), pycolmap=len(own_images), run=len(run.observations), **only)
     ours = of_pycolmap.target
     between = _targets(of_native.target, ours.target_from_face, ours.circles, run)
     mapping = between.model_copy(update={"cameras": _cameras(of_native, of_pycolmap, run)})
@@ -416,13 +404,10 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    return ResultsCompared(
-        faces=face_differences(target, run, faces),
-        circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
-        circles_sigmas={
-            label: _sigmas(v, covariances[label], FACE_FLOOR[3:]) for label, v in off.items() if label in covariances
-        },
-    )
+    um = {label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()}
+    known = {label: v for label, v in off.items() if label in covariances}
+    sigmas = {label: _sigmas(v, covariances[label], FACE_FLOOR[3:]) for label, v in known.items()}
+    return ResultsCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
 
 
 def face_differences(
@@ -473,12 +458,11 @@ def comparison_text(check: Crosscheck) -> str:
     residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
     rows = [["face", *("µm", "mdeg", "σ") * 3]]
     for face in check.mapping.faces:
-        cells = [face]
+        rows.append([face])
         for compared in (check.mapping, check.result, check.plain):
             row = compared.faces.get(face)
             values = (row.translation_um, row.rotation_mdeg, row.sigmas) if row else (None, None, None)
-            cells += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
-        rows.append(cells)
+            rows[-1] += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
     width = max(6, *(len(row[0]) for row in rows))
     circles = check.mapping.circles_um
     lines = [

@@ -81,11 +81,13 @@ class Content:
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
+        counts = (
+            f"{len(faces.target_from_face)} faces, {len(faces.circles)} circles, {len(self.photographs)} photographs"
+        )
+        frames = f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face"
         lines = [
-            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(faces.target_from_face)} faces, "
-            f"{len(faces.circles)} circles, {len(self.photographs)} photographs",
-            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
-            f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
+            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {counts}",
+            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); {frames}",
         ]
         if not self.target.face_covariance:
             return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
@@ -126,8 +128,7 @@ def content_of(run: SavedRun, root: str) -> Content:
     views = {(each.image, each.group): Rigid(each.axes.T, each.position_mm) for each in report.scene.cameras}
     content = Content(root, run, target_in(run.faces), camera, views)
     names = [root, *(each.child for each in content.statics())]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
         fault = f"frames: {twice[0]} would be the name of two frames"
         raise InputError("E-FRAME-NAME", f"{fault}; rename a face or a circle of the target")
     return content
@@ -201,8 +202,7 @@ MM_M = 1 / METRE_MM
 
 def urdf(content: Content) -> str:
     """Returns a ``robot`` of massless links: the target, the faces with visible circles, and the circles."""
-    root = quoteattr(content.root)
-    comments = [f"<!-- {line} -->" for line in _in_comments(content)]
+    root, comments = quoteattr(content.root), (f"<!-- {line} -->" for line in _in_comments(content))
     head = ['<?xml version="1.0"?>', *comments, f"<robot name={root}>", f"<link name={root}/>"]
     return "\n".join([*head, *_body(content, str), "</robot>\n"])
 
