@@ -66,8 +66,7 @@ class TestedValue:
     probability: float | None  # of as much or more by chance, None if the value is not tested
 
     def words(self) -> str:
-        value, limit = self.texts()
-        return value + (f", limit {limit}" if limit else "")
+        return ", limit ".join(filter(None, self.texts()))
 
     def texts(self) -> list[str]:
         """Returns the value with its unit, and the limit, to three digits, large ones without an exponent."""

@@ -29,16 +29,14 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     colour scale."""
     cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
-    per_cell = reach_um if reach_um > 0 else 1.0
-    height_um = height_um if height_um > 0 else 1.0
-    bar_um = round_below(per_cell)
-    drawing = Drawing(4.3, 3.5)
+    per_cell, height_um = (value if value > 0 else 1.0 for value in (reach_um, height_um))
+    bar_um, drawing = round_below(per_cell), Drawing(4.3, 3.5)
     last = cells.max(0) if len(cells) else np.zeros(2)
     pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
     box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
     axes = Axes(drawing, box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
-    marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
-    rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
+    marks = [range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12)))) for end in last]
+    rows, columns = ((values, [str(value) for value in values]) for values in marks)
     axes.frame("column", "row", "", columns, rows, SMALL)
     places = axes.at(cells[:, 1], cells[:, 0])
     colours = mixed_names((1 + vectors[:, 2] / height_um) / 2, RED_BLUE)
