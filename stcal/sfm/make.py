@@ -60,11 +60,11 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
         ("left", d, h, (-y, z), (-w, d, -h)),
         ("top", w, d, (x, y), (-w, -d, h)),
     )
-    box = {row[0]: row for row in rows}
-    return [
-        Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
-        for name, width, height, (x, y), corner in map(box.__getitem__, names)
-    ]
+    sides = {
+        name: Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
+        for name, width, height, (x, y), corner in rows
+    }
+    return [sides[name] for name in names]
 
 
 def faces_of(text: str) -> tuple[str, ...]:
@@ -265,8 +265,8 @@ class DesignOptions(Brief):
         text = ",".join(self.faces)
         for name in self.faces:
             if name not in NAMES:
-                sides = ", ".join(NAMES)
-                raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {sides}")
+                fault = f"--faces {text}: {name!r} is no side"
+                raise InputError("E-OPTION-VALUE", f"{fault}; use some of {', '.join(NAMES)}")
             if self.faces.count(name) > 1:
                 raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
         if len(self.faces) < 2 or set(self.faces) in ({"front", "back"}, {"left", "right"}):
@@ -354,9 +354,9 @@ def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
 def made_text(made: Made) -> str:
     """Returns a text that describes the target and how well its faces are told apart."""
     options, target, alike = made.options, made.target, made.likeness
+    radii = f"radius {made.radius_mm:g} and {LARGE * made.radius_mm:g} mm"
     return (
-        f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
-        f"{LARGE * made.radius_mm:g} mm, {target.polarity}\n"
+        f"{target.name}: {len(target.faces)} faces of {options.circles} circles, {radii}, {target.polarity}\n"
         f"smallest radius that is seen well at {options.distance_mm:g} mm: {made.least_mm:.2f} mm\n"
         f"a face has {f'at most {alike} of its circles' if alike else 'never four circles'} in common with another "
         "face, a mirror image or itself turned\n"
@@ -489,6 +489,7 @@ def _saved(folder: Path | None, target: TargetDesign, board: BoardDesign | None)
     if folder is None:
         return ()
     save_target(folder / "target.toml", target)
-    if board is not None:
-        save_board(folder / "board.toml", board)
-    return (folder / "target.toml", *([] if board is None else [folder / "board.toml"]))
+    if board is None:
+        return (folder / "target.toml",)
+    save_board(folder / "board.toml", board)
+    return folder / "target.toml", folder / "board.toml"

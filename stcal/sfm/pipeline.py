@@ -174,8 +174,7 @@ def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
     calibration = calibration_by(task, groups)
-    doubted = {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}
-    if doubted:
+    if doubted := {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}:
         with suppress(StcalError):
             again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
@@ -275,13 +274,13 @@ def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> R
 def _cause(result: RunResult) -> Check | None:
     """Returns what of the input is wrong for all images together, if it is known before the checks."""
     target, board = result.target_design, result.board_design
-    if sized := cause_of_size(result.target.circles, target, board):
-        return sized
-    cause = cause_of_drawing(result.target.target_from_face, target)
     is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
-    if is_misfit and result.camera_given and not result.options.refine_camera:
-        return wrong_file(result.observations, result.camera, board) or cause
-    return cause
+    by_file = is_misfit and result.camera_given and not result.options.refine_camera
+    return (
+        cause_of_size(result.target.circles, target, board)
+        or (wrong_file(result.observations, result.camera, board) if by_file else None)
+        or cause_of_drawing(result.target.target_from_face, target)
+    )
 
 
 def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
@@ -359,16 +358,14 @@ def detect_images(
         fault = f"output folder {out}: holds a finished calibration"
         raise InputError("E-OUTPUT-EXISTS", f"{fault}; give another folder with --out")
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
-        notes, model = [], task.camera
+        note, model = "", task.camera
         if model is None:
             model, note = model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
             with suppress(DetectionError, DegenerateError):
                 if task.board.rows:
                     model = camera_by_dots(task, None)
                     note = f"no --camera: found by the dots of the board, f {model.focal[0]:.0f} px"
-            notes += [note] if task.target.with_faces(printed=False).faces else []
-        seen = detect_with(task, model)
-        if unseen := unseen_faces(task, seen):
-            notes.append(unseen)
+        seen, has_circles = detect_with(task, model), bool(task.target.with_faces(printed=False).faces)
+        notes = note * has_circles, unseen_faces(task, seen)
         with overlays_beside(seen, task, page=False):
-            return replace(seen, notes=tuple(notes))
+            return replace(seen, notes=tuple(filter(None, notes)))
