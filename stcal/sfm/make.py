@@ -265,8 +265,9 @@ class DesignOptions(Brief):
         text = ",".join(self.faces)
         for name in self.faces:
             if name not in NAMES:
-                fault = f"--faces {text}: {name!r} is no side"
-                raise InputError("E-OPTION-VALUE", f"{fault}; use some of {', '.join(NAMES)}")
+                raise InputError(
+                    "E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}"
+                )
             if self.faces.count(name) > 1:
                 raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
         if len(self.faces) < 2 or set(self.faces) in ({"front", "back"}, {"left", "right"}):

@@ -455,28 +455,29 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
 
 
 def comparison_text(check: Crosscheck) -> str:
-    residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
+    residual, images, mapping = check.residual_rms_px, check.images, check.mapping
     rows = [["face", *("µm", "mdeg", "σ") * 3]]
-    for face in check.mapping.faces:
+    for face in mapping.faces:
         rows.append([face])
-        for compared in (check.mapping, check.result, check.plain):
+        for compared in (mapping, check.result, check.plain):
             row = compared.faces.get(face)
             values = (row.translation_um, row.rotation_mdeg, row.sigmas) if row else (None, None, None)
             rows[-1] += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
     width = max(6, *(len(row[0]) for row in rows))
-    circles = check.mapping.circles_um
+    of_native = f"{images.native} of {images.run} images, residual {residual.native:.4f} px RMS"
+    of_pycolmap = f"{images.pycolmap} of {images.run} images, residual {residual.pycolmap:.4f} px RMS"
+    circles, circle_sigmas = (max(v.values(), default=0.0) for v in (mapping.circles_um, mapping.circles_sigmas))
+    um, mdeg, sigmas = (
+        max((getattr(camera, key) for camera in mapping.cameras), default=0.0)
+        for key in ("position_um", "rotation_mdeg", "sigmas")
+    )
     lines = [
-        f"COLMAP {check.native} (schema {check.schema_}): {images.native} of {images.run} images, residual "
-        f"{residual.native:.4f} px RMS",
-        f"pycolmap {check.pycolmap}: {images.pycolmap} of {images.run} images, residual "
-        f"{residual.pycolmap:.4f} px RMS; the run: {residual.run:.4f} px",
+        f"COLMAP {check.native} (schema {check.schema_}): {of_native}",
+        f"pycolmap {check.pycolmap}: {of_pycolmap}; the run: {residual.run:.4f} px",
         f"{'':{width}} {'native – pycolmap':>24} {'adjusted – faces.json':>28} {'as it is – faces.json':>28}",
         *text_table(rows, least=(6, 10, 8, 4, 14, 8, 4, 14, 8, 4), gap=1),
-        f"largest between the two programs: circles {max(circles.values(), default=0.0):.3f} µm, "
-        f"{max(check.mapping.circles_sigmas.values(), default=0.0):.2f} σ; "
-        f"cameras {max((c.position_um for c in cameras), default=0.0):.2f} µm and "
-        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg, "
-        f"{max((c.sigmas for c in cameras), default=0.0):.2f} σ",
+        f"largest between the two programs: circles {circles:.3f} µm, {circle_sigmas:.2f} σ; "
+        f"cameras {um:.2f} µm and {mdeg:.3f} mdeg, {sigmas:.2f} σ",
         f"allowed: {allowed_text(check.tolerances)}: {'exceeded' if check.differences else 'they agree'}",
     ]
     return "\n".join([*check.notes, *lines])

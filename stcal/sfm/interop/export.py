@@ -490,10 +490,10 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     """
     path = Path(out)
     suffixes = {known.suffix: each for each, known in FORMS.items()}
-    if not form and path.suffix.lower() not in suffixes:
+    form = form or suffixes.get(path.suffix.lower(), "")
+    if not form:
         fault = f"{path}: suffix {path.suffix or 'missing'}"
         raise InputError("E-OUTPUT-SUFFIX", f"{fault}; one of {', '.join(suffixes)} needed, or --form")
-    form = form or suffixes[path.suffix.lower()]
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
     require_new(path)

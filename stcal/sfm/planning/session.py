@@ -147,11 +147,9 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
     if unknown := [name for name in names if name not in pair_of_name]:
-        raise InputError(
-            "E-OPTION-VALUE",
-            f"--groups: {unknown[0]!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: "
-            "ids of one character beside each other, longer ones with a hyphen",
-        )
+        remedy = f"use for example {', '.join(list(pair_of_name)[:3])}"
+        form = "ids of one character beside each other, longer ones with a hyphen"
+        raise InputError("E-OPTION-VALUE", f"--groups: {unknown[0]!r} is not a pair of faces; {remedy}: {form}")
     return tuple(pair_of_name[name] for name in names)
 
 

@@ -202,11 +202,9 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
             case _:
                 unknown.append(name)
     if not images:
-        raise InputError(
-            "E-COMPARE-IMAGES",
-            f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
-            f"photographs{f', with names like {next(iter(true))}' if true else ''}",
-        )
+        fault = f"{poses}, truth {truth}: no image in common that the truth states one pose of"
+        names = f", with names like {next(iter(true))}" if true else ""
+        raise InputError("E-COMPARE-IMAGES", f"{fault}; give the truth of the same photographs{names}")
     true_mm, measured_mm = np.median(distances, axis=0).tolist()
     _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", true_mm, measured_mm, "poses")
     return ComparePosesFile(images=images, not_in_truth=unknown)
@@ -228,11 +226,9 @@ def _require_same_unit(where: str, kind: str, true: float, measured: float, side
     for unit, factor in LENGTHS.items():
         for name, small, large in (("truth", true, measured), (side, measured, true)):
             if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
-                raise InputError(
-                    "E-COMPARE-UNITS",
-                    f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
-                    f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
-                )
+                times = f"{measured / true:.4g} times those of the truth, 1 ± {OF_A_UNIT:g} expected"
+                remedy = f"if the {name} is in {unit}, multiply its lengths by {factor:g}"
+                raise InputError("E-COMPARE-UNITS", f"{where}: distances between {kind} are {times}; {remedy}")
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
