@@ -285,13 +285,6 @@ class DesignOptions(Brief):
                 raise InputError("E-CAMERA-SIZE", f"{fault}; add it to the file")
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
-    def least_radius_mm(self) -> float:
-        """Least radius of circles that are found even where they are farthest away and most tilted, with a margin."""
-        camera = self.ideal_camera()
-        least, _ = diameter_limits_px(camera.width * camera.height, EllipseOptions())
-        px_per_mm = np.sqrt(camera.focal.prod()) / (FARTHER * self.distance_mm)
-        return float(WELL_SEEN * least / (2 * px_per_mm * np.sqrt(np.cos(MAX_TILT_RAD))))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
@@ -309,20 +302,21 @@ class Made:
 def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
     """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` is called with (done,
     total) cases of hidden circles."""
-    least, radius = options.least_radius_mm(), options.radius_mm
+    camera, radius = options.ideal_camera(), options.radius_mm
+    least_px, most_px = diameter_limits_px(camera.width * camera.height, EllipseOptions())
+    focal_px, farthest_mm = float(np.sqrt(camera.focal.prod())), FARTHER * options.distance_mm
+    # of circles that are found even where they are farthest away and most tilted, with a margin
+    least = float(WELL_SEEN * least_px / (2 * (focal_px / farthest_mm) * np.sqrt(np.cos(MAX_TILT_RAD))))
     if radius is None:
         radius = _up_to(RADIUS_STEP_MM, max(least, RADIUS_SHARE * min(options.size_mm)))
     if radius < least:
         seen = f"at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm on"
         remedy = "larger circles, a nearer camera or more pixels needed"
         raise InputError("E-MAKE-RADIUS", f"--radius-mm {radius:g}: {seen}; {remedy}")
-    camera = options.ideal_camera()
-    most = diameter_limits_px(camera.width * camera.height, EllipseOptions())[1]
-    largest = 2 * LARGE * radius * float(np.sqrt(camera.focal.prod())) / options.distance_mm
-    if largest * FARTHER > most:
-        fault = (
-            f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are sought"
-        )
+    largest_px = 2 * LARGE * radius * focal_px / options.distance_mm
+    if largest_px * FARTHER > most_px:
+        allowed = f"at most {most_px / FARTHER:.0f} px are sought"
+        fault = f"radius {LARGE * radius:g} mm is {largest_px:.0f} px in the image, {allowed}"
         raise InputError("E-MAKE-RADIUS", f"{fault}; smaller circles or a camera farther away needed")
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0

@@ -89,10 +89,6 @@ class LengthTest:
             verdict = f"{word}: {how_many}; largest |E_n| {number(largest, 2)}, {reaches}"
         return cls(reference, list(lengths), largest, beyond, limit, agrees, verdict, notes)
 
-    def without_u(self) -> "LengthTest":
-        """Returns the test of a run that must not be used, of which no U holds: nothing is judged."""
-        return self.of(self.reference, [replace(own, expanded_um=None, e_n=None) for own in self.lengths], self.notes)
-
 
 def against_stated(budget: Budget, path: Path) -> LengthTest:
     """Tests the run against a CSV of ``from``, ``to`` (``face:circle``), ``length_mm`` and perhaps ``sigma_mm``."""
@@ -395,8 +391,9 @@ class BudgetFile(ResultFile):
             xyz = enlarged * np.asarray(run.faces.circles[label])
             sigma_um = (MICRO * np.sqrt(own)).tolist()
             circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, coverage_factor(freedom))
-        if any(is_refused(each) for each in (run, *others)):
-            tests = [test.without_u() for test in tests]
+        if any(is_refused(each) for each in (run, *others)):  # no U holds: nothing is judged
+            bare = ([replace(own, expanded_um=None, e_n=None) for own in test.lengths] for test in tests)
+            tests = [test.of(test.reference, own, test.notes) for test, own in zip(tests, bare, strict=True)]
         photographs = {name: Path(run.photographs) / name for name in sorted(each.name for each in run.observations)}
         return cls(
             format="stcal budget 1",

@@ -42,6 +42,14 @@ def certificate(file: BudgetFile) -> Document:
     images, groups = sum(each.images for each in file.views), len(file.views)
     given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
     head = [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
+    bodies = dict.fromkeys(row.body for row in file.stated)
+    values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
+    by_words = {words: [values.get((body, key), NONE) for body in bodies] for key, words in STATED.items()}
+    rows = [[words, *row] for words, row in by_words.items() if set(row) - {NONE}]
+    stated = Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
+    found = file.run.photographs_sha256
+    kept = f"{len(found)} of {images} photographs, as they were in their folder when this certificate was made"
+    photographs = Table(["<photograph", "<SHA-256"], list(found.items()), css="text")
     programs = f"bundle adjustment by stcal {file.run.version}, uncertainties by stcal {file.version}"
     adjusted = f"the points of all faces and the poses of the camera were adjusted together ({programs})"
     how = f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; {adjusted}"
@@ -50,30 +58,15 @@ def certificate(file: BudgetFile) -> Document:
         f"Certificate of calibration no. {file.fields['number'].strip()}",
         file.fields["laboratory"].strip(),
         [
-            Section("Method and conditions", [file.fields["method"], how, _conditions(file), file.holds]),
+            Section("Method and conditions", [file.fields["method"], how, stated, file.holds]),
             Section("What is measured", [drawings(file), bullets(file.definitions), what_u_is(file)]),
             Section("Results", [*results(file), "End of the results; the annex follows"], terminal=True),
             Section("Annex: test of lengths", tests, terminal=True),
             Section("Annex: uncertainty budget", [method(file), inputs(file), *contributions(file)], terminal=True),
-            Section("Annex: data", [hashes(file), *photographs(file), "End of the certificate"]),
+            Section("Annex: data", [hashes(file), kept, photographs, "End of the certificate"]),
         ],
         banner=[facts(head), RELATES],
     )
-
-
-def _conditions(file: BudgetFile) -> Table:
-    """Returns what is stated of the bodies, a column for each."""
-    bodies = dict.fromkeys(row.body for row in file.stated)
-    values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
-    stated = {words: [values.get((body, key), NONE) for body in bodies] for key, words in STATED.items()}
-    rows = [[words, *row] for words, row in stated.items() if set(row) - {NONE}]
-    return Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
-
-
-def photographs(file: BudgetFile) -> list[Block]:
-    found, every = file.run.photographs_sha256, sum(each.images for each in file.views)
-    said = f"{len(found)} of {every} photographs, as they were in their folder when this certificate was made"
-    return [said, Table(["<photograph", "<SHA-256"], list(found.items()), css="text")]
 
 
 def drawings(file: BudgetFile) -> Block:
