@@ -30,25 +30,12 @@ from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
+from stcal.sfm.runs import stages
 from stcal.sfm.runs.comparisons import MethodResult, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import RunResult
-from stcal.sfm.runs.stages import (
-    DetectedImages,
-    Groups,
-    Task,
-    camera_by_dots,
-    detect_and_label,
-    detect_with,
-    groups_of,
-    guessed_cameras,
-    map_groups,
-    scaled_by_drawing,
-    start_of,
-    unseen_faces,
-    wrong_file,
-)
+from stcal.sfm.runs.stages import DetectedImages, Groups, Task
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"  # what a run's folder states as the folder of its images where there is none
@@ -122,10 +109,10 @@ def run(
         with scratch_folder("run") as scratch:
             return replace(run(images, camera, scratch, target, board, options, progress, checks, every), out=None)
     with begun(frames_of_video(images, out, every), camera, out, target, board, options, progress) as task:
-        seen = detect_and_label(task)
+        seen = stages.detect_and_label(task)
         with overlays_beside(seen, task) as left_out:
-            task = scaled_by_drawing(task, seen, board is not None)
-            groups = map_groups(task, groups_of(task, seen))
+            task = stages.scaled_by_drawing(task, seen, board is not None)
+            groups = stages.map_groups(task, stages.groups_of(task, seen))
             groups, calibration = scale_chain_adjust(task, groups)
             result = result_of(task, seen, groups, calibration)
             left_out.update(result.unadjusted())
@@ -176,7 +163,7 @@ def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]
     calibration = calibration_by(task, groups)
     if doubted := {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}:
         with suppress(StcalError):
-            again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
+            again = stages.map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
             refined = replace(groups, solutions=tuple(by_name.get(s.model.group, s) for s in groups.solutions))
             calibration, groups = calibration_by(task, refined), refined
@@ -188,8 +175,8 @@ def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]
     except ConvergenceError:  # a lens that folds its image
         warnings.warn(PLAIN, InputNote, stacklevel=2)
         plain = model_of(plain_lens(lens), PHOTOGRAPHS)
-        groups = replace(groups, camera=start_of(plain, lens, task.options))
-        return scale_chain_adjust(replace(task, camera=plain), map_groups(task, groups))
+        groups = replace(groups, camera=stages.start_of(plain, lens, task.options))
+        return scale_chain_adjust(replace(task, camera=plain), stages.map_groups(task, groups))
     return groups, calibration
 
 
@@ -248,7 +235,7 @@ def compared(task: Task, result: RunResult) -> RunResult:
     task = replace(task.named("{}, as published"), options=options)
     answer: MethodResult | StcalError
     try:
-        groups = map_groups(task, groups_of(task, detect_with(task, model)))
+        groups = stages.map_groups(task, stages.groups_of(task, stages.detect_with(task, model)))
         calibration = calibration_by(task, groups)
         models = tuple(solution.model for solution in groups.solutions)
         answer = MethodResult(calibration.target, models, calibration.scales)
@@ -278,7 +265,7 @@ def _cause(result: RunResult) -> Check | None:
     by_file = is_misfit and result.camera_given and not result.options.refine_camera
     return (
         cause_of_size(result.target.circles, target, board)
-        or (wrong_file(result.observations, result.camera, board) if by_file else None)
+        or (stages.wrong_file(result.observations, result.camera, board) if by_file else None)
         or cause_of_drawing(result.target.target_from_face, target)
     )
 
@@ -360,12 +347,12 @@ def detect_images(
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
         note, model = "", task.camera
         if model is None:
-            model, note = model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
+            model, note = model_of(stages.guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
             with suppress(DetectionError, DegenerateError):
                 if task.board.rows:
-                    model = camera_by_dots(task, None)
+                    model = stages.camera_by_dots(task, None)
                     note = f"no --camera: found by the dots of the board, f {model.focal[0]:.0f} px"
-        seen, has_circles = detect_with(task, model), bool(task.target.with_faces(printed=False).faces)
-        notes = note * has_circles, unseen_faces(task, seen)
+        seen, has_circles = stages.detect_with(task, model), bool(task.target.with_faces(printed=False).faces)
+        notes = note * has_circles, stages.unseen_faces(task, seen)
         with overlays_beside(seen, task, page=False):
             return replace(seen, notes=tuple(filter(None, notes)))
