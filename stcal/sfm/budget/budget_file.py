@@ -20,21 +20,8 @@ from stcal.io.files import RUN_MARKER, digest_of
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.io.table import LENGTHS, read_table
 from stcal.report.text import join, number
-from stcal.sfm.budget.combine import (
-    BY_CHANCE,
-    COVERAGE_FACTOR,
-    FIELDS,
-    REFERENCE_C,
-    Budget,
-    GroupViews,
-    Origin,
-    Row,
-    Statement,
-    coverage_factor,
-    distance,
-    longest_of,
-    reference_temperature_c,
-)
+from stcal.sfm.budget import combine
+from stcal.sfm.budget.combine import FIELDS, Budget, GroupViews, Origin, Row, Statement
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, Use, judgement_of
@@ -75,7 +62,7 @@ class LengthTest:
         """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
         chance (Bonferroni)."""
         count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
-        limit = float(-ndtri(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
+        limit = float(-ndtri(combine.BY_CHANCE / 2 / count) / combine.COVERAGE_FACTOR)
         if not e_n:
             verdict = f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
             return cls(reference, list(lengths), None, None, limit, None, verdict, notes)
@@ -110,7 +97,7 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
         own = _corrected(budget, (places[a], places[b]))
         tested.append(_tested((a, b), own, (float(value), float(sigma_mm) ** 2, 0.0)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
-    if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
+    if budget.conditions.temperature_c != combine.reference_temperature_c(budget.statement.target):
         needed = f"{path} must state lengths for the temperature at which the target was photographed"
         notes += (f"{needed}: those of the run are not corrected to another",)
     return LengthTest.of(str(path), tested, notes)
@@ -122,7 +109,7 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
     rows, other_rows = ([each.joint.labels.index(label) for label in common] for each in (budget, other))
-    pairs = longest_of(common, budget.joint.xyz_model[rows])
+    pairs = combine.longest_of(common, budget.joint.xyz_model[rows])
     if not pairs:
         fault = f"run {folder}: {len(common)} circles in common, 2 needed"
         raise InputError("E-BUDGET-LENGTHS", f"{fault}; give a run of the same target")
@@ -180,7 +167,7 @@ Length = tuple[float, float, float]
 
 def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = ()) -> Length:
     """Returns a corrected length of the run, with its variance by all sources except ``without``."""
-    measurand = distance(budget.joint, *ends)
+    measurand = combine.distance(budget.joint, *ends)
     variances = {
         each.key: (each.evaluation, float(measurand.covariance(each, 0.0)[0, 0]))
         for each in budget.sources
@@ -195,7 +182,7 @@ def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLen
     """Returns a length against a reference, with U of their difference."""
     (measured_mm, *_), (reference_mm, *_) = own, reference
     variance, lost = (own[i] + reference[i] for i in (1, 2))
-    k = coverage_factor(variance**2 / lost if lost else np.inf)
+    k = combine.coverage_factor(variance**2 / lost if lost else np.inf)
     expanded, error = 1e3 * k * float(np.sqrt(variance)), 1e3 * (measured_mm - reference_mm)
     e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
     return TestedLength(tuple(circles), measured_mm, reference_mm, error, expanded, e_n)
@@ -390,7 +377,7 @@ class BudgetFile(ResultFile):
         for label, own, freedom in zip(budget.joint.labels, variance, budget.circles_freedom, strict=True):
             xyz = enlarged * np.asarray(run.faces.circles[label])
             sigma_um = (MICRO * np.sqrt(own)).tolist()
-            circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, coverage_factor(freedom))
+            circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, combine.coverage_factor(freedom))
         if any(is_refused(each) for each in (run, *others)):  # no U holds: nothing is judged
             bare = ([replace(own, expanded_um=None, e_n=None) for own in test.lengths] for test in tests)
             tests = [test.of(test.reference, own, test.notes) for test, own in zip(tests, bare, strict=True)]
@@ -417,7 +404,7 @@ class BudgetFile(ResultFile):
             size_known=known,
             reference_temperature_c=conditions.temperature_c,
             holds="" if refused else conditions.words,
-            coverage_factor=COVERAGE_FACTOR,
+            coverage_factor=combine.COVERAGE_FACTOR,
             sigma0=budget.joint.sigma_scale,
             redundancy=budget.joint.redundancy,
             views=list(budget.views),
@@ -445,7 +432,7 @@ def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
         for key, value in values.items():
             yield StatedRow(body, key, value, statement.origin[body, key])
         if values.keys() - {"pitch_sigma_ppm"} and size.reference_temperature_c is None:
-            yield StatedRow(body, "reference_temperature_c", REFERENCE_C, "assumed, ISO 1")
+            yield StatedRow(body, "reference_temperature_c", combine.REFERENCE_C, "assumed, ISO 1")
 
 
 def _definitions(run: SavedRun) -> list[str]:
@@ -499,7 +486,7 @@ def _unusual(statement: Statement) -> list[str]:
     asked = []
     for body, size in (("board", statement.board), ("target", statement.target)):
         warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
-        if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
+        if warm is not None and abs(warm - combine.REFERENCE_C) > USUAL_K:
             asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {(warm - 32) / 1.8:.1f} °C?")
         if sigma > USUAL_SIGMA_K:
             asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")

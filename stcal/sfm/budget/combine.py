@@ -21,22 +21,10 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.toml import Strict, load_toml
 from stcal.labels import CircleLabel
+from stcal.sfm.adjust import uncertainty
 from stcal.sfm.adjust.calibration import FLATNESS_MM, rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import (
-    BOARD,
-    CIRCLES,
-    DISTANCES,
-    DOTS,
-    FLATNESS,
-    INTRINSICS,
-    PRINT,
-    SIZES,
-    Contributions,
-    Derivatives,
-    contributions_of,
-    derivatives,
-)
+from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
 from stcal.sfm.data.group_model import MetricModel, rows_by
 from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
@@ -175,41 +163,43 @@ def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float 
         return ("assumed", words + DEFAULT) if default else ("stated", words)
 
     title = "corners and centres of faces" if faces else "centres of circles"
-    yield row("circle_centres", title, CIRCLES, stated, sigma_px[CIRCLES], "px")
+    yield row("circle_centres", title, uncertainty.CIRCLES, stated, sigma_px[uncertainty.CIRCLES], "px")
     if board.rows:
-        yield row("dot_centres", "centres of dots", DOTS, stated, sigma_px[DOTS], "px")
+        yield row("dot_centres", "centres of dots", uncertainty.DOTS, stated, sigma_px[uncertainty.DOTS], "px")
         common = f"{100 * joint.board_common:.0f} % of it common to all groups"
         words = f"sigma_mm of board.toml × σ₀ {factor:.3f}; {common if joint.board_common else 'each group its own'}"
         stated = or_default(words, board.sigma_mm == DOTS_SIGMA_MM)
-        yield row("board_dots", "places of dots", BOARD, stated, 1e3 * board.sigma_mm * factor)
+        yield row("board_dots", "places of dots", uncertainty.BOARD, stated, 1e3 * board.sigma_mm * factor)
     if faces:
         own, within = joint.print_factor * factor, max(face.sigma_mm or 0.0 for face in faces)
         words = f"sigma_mm of target.toml × {own:.2f}, in the plane; off it --flatness"
-        yield row("print", "print of faces", PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own)
+        yield row(
+            "print", "print of faces", uncertainty.PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own
+        )
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, edges = largest.size_sigma, "a common displacement of the edges of all tags"
         stated = "assumed" if sigma else "not stated", f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
         if sigma > 0 and largest.edge_share < 1:
             stated = "stated", "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
-        yield row("print_size", "size of print", SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
+        yield row("print_size", "size of print", uncertainty.SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
     if known and known[0].drawn:
         stated = "not known", "nothing of known size was in view: only the shape is known"
-        yield row("distances", "size", DISTANCES, stated, None)
+        yield row("distances", "size", uncertainty.DISTANCES, stated, None)
     elif known:
         stated = "stated", f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
         largest_mm = max(each.sigma_mm for each in known)
-        yield row("distances", "known distances", DISTANCES, stated, 1e3 * largest_mm * factor)
-    if not faces or found.covariance_mm2[FLATNESS].any():
+        yield row("distances", "known distances", uncertainty.DISTANCES, stated, 1e3 * largest_mm * factor)
+    if not faces or found.covariance_mm2[uncertainty.FLATNESS].any():
         words, sigma_um = f"--flatness of the run × σ₀ {factor:.3f}", None
         stated = "not stated", "--flatness off: faces need not be flat"
         if flatness_mm is not None:
             is_default, sigma_um = flatness_mm == FLATNESS_MM, 1e3 * flatness_mm * factor
             stated = ("assumed", f"the default of {words}") if is_default else ("stated", words)
-        yield row("flatness", "flatness of faces", FLATNESS, stated, sigma_um)
+        yield row("flatness", "flatness of faces", uncertainty.FLATNESS, stated, sigma_um)
 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
-    covariance = contributions.covariance_mm2[INTRINSICS]
+    covariance = contributions.covariance_mm2[uncertainty.INTRINSICS]
     if not camera_given:
         words = "found from these photographs, without a camera file; adjusted with all else"
         return BudgetSource("intrinsics", "intrinsics", "A", "estimated", words, None, "", covariance)
