@@ -390,6 +390,8 @@ class GroupViews:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
+    """The uncertainty budget of a run."""
+
     joint: JointResult
     reference_face: str
     sources: tuple[BudgetSource, ...]
@@ -402,6 +404,7 @@ class Budget:
     conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
 
     def of_kind(self, kind: Kind) -> list[Row]:
+        """Returns the rows of one kind."""
         return [row for row in self.rows if row.measurand.kind == kind]
 
 

@@ -95,6 +95,7 @@ class ImageObservations(Measured):
         return ImageObservations(self.name, self.group, self.labels + other.labels, *arrays)
 
     def select(self, keep) -> "ImageObservations":
+        """Returns the circles of the indices ``keep``."""
         arrays = {f.name: getattr(self, f.name)[keep] for f in fields(self)[3:]}
         return replace(self, labels=tuple(self.labels[i] for i in keep), **arrays)
 
@@ -372,6 +373,7 @@ class Note(str):
 
     @property
     def note(self) -> str:
+        """The whole sentence."""
         return str(self)
 
     @classmethod

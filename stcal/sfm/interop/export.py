@@ -41,6 +41,8 @@ class _Report(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
+    """Content of an export."""
+
     root: str  # name of the target frame
     run: SavedRun
     target: CalibratedTarget  # of faces.json
@@ -48,6 +50,7 @@ class Content:
     photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
 
     def circles_of(self, face: str) -> list[CircleLabel]:
+        """Returns the circles of a face, in the order of the design."""
         return [label for label in self.target.circles if label.face == face]
 
     def xyz_face(self, label: CircleLabel) -> np.ndarray:
@@ -55,6 +58,7 @@ class Content:
         return self.target.target_from_face[label.face].inverse() @ self.target.circles[label]
 
     def face_frame(self, face: str) -> str:
+        """Returns the name of the frame of a face."""
         return f"{self.root}_{face}"
 
     def circle_frame(self, label: CircleLabel) -> str:

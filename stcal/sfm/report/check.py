@@ -59,6 +59,8 @@ the others, but groups that contradict one another make no fault within one of t
 
 @dataclass(frozen=True, slots=True)
 class TestedValue:
+    """One tested value."""
+
     name: str  # image, label, face, group, row …
     value: float
     limit: float | None  # in ``unit``; beyond it the value is suspicious
@@ -66,6 +68,7 @@ class TestedValue:
     probability: float | None  # of as much or more by chance, None if the value is not tested
 
     def words(self) -> str:
+        """Returns value and limit as text."""
         return ", limit ".join(filter(None, self.texts()))
 
     def texts(self) -> list[str]:

@@ -168,6 +168,7 @@ class ReportAgain:
     notes: tuple[str, ...] = ()  # on files that are not as the run left them
 
     def text(self) -> str:
+        """Returns the text for the terminal."""
         lines = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join([*lines, *(f"report: {path}" for path in self.files)])

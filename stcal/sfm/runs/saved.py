@@ -368,6 +368,7 @@ class RunResult(SavedRun):
         return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
     def evidence(self) -> Evidence:
+        """Returns the input of the checks."""
         blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
         return Evidence(
             models=tuple(s.model for s in self.solutions),

@@ -99,6 +99,7 @@ class DetectedImages(Brief):
 
     @property
     def observations(self) -> list[ImageObservations]:
+        """Labelled centres of all images."""
         return [image.observations for image in self.labelled]
 
     @property
