@@ -85,9 +85,8 @@ class Content:
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
-        counts = (
-            f"{len(faces.target_from_face)} faces, {len(faces.circles)} circles, {len(self.photographs)} photographs"
-        )
+        parts = {"faces": faces.target_from_face, "circles": faces.circles, "photographs": self.photographs}
+        counts = ", ".join(f"{len(content)} {name}" for name, content in parts.items())
         frames = f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face"
         lines = [
             f"stcal {stcal.__version__}: target {self.run.target_design.name}, {counts}",

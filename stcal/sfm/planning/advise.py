@@ -118,15 +118,8 @@ def known_scene(joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
         keep = [i for i, label in enumerate(face.labels()) if label in circles]
         ids = tuple(face.ids[i] for i in keep)
         faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
-    return Scene(
-        target=replace(setup.target, faces=tuple(faces)),
-        board=setup.board,
-        camera=Camera.of(setup.camera, colmap_model),
-        target_from_face=setup.start.target_from_face,
-        circles_target=circles,
-        groups=groups,
-        seed=0,
-    )
+    target, camera = replace(setup.target, faces=tuple(faces)), Camera.of(setup.camera, colmap_model)
+    return Scene(target, setup.board, camera, setup.start.target_from_face, circles, groups, seed=0)
 
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
