@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -481,15 +481,10 @@ class AdviceFile(ResultFile):
 
     @classmethod
     def of_advice(cls, advice: Advice) -> "AdviceFile":
-        return cls(
-            format="stcal advice 1",
-            now=ForecastPart.of(advice.now, advice.shares),
-            choices=list(advice.choices),
-            new_groups=advice.new_groups,
-            board_dominates=advice.board_dominates,
-            half_board_sigma_um=MICRO * advice.better_board.worst()[1],
-            tried=advice.tried,
-        )
+        same: dict[str, Any] = {name: getattr(advice, name) for name in ("new_groups", "board_dominates", "tried")}
+        now, half_um = ForecastPart.of(advice.now, advice.shares), MICRO * advice.better_board.worst()[1]
+        choices = list(advice.choices)
+        return cls(format="stcal advice 1", now=now, choices=choices, half_board_sigma_um=half_um, **same)
 
 
 HOW_TO_GO = (

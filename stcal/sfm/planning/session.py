@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -282,17 +282,10 @@ def _beside_board(
 ) -> tuple[Scene, list[MetricModel], Setup]:
     """Returns the photographs of a plan with a board: scene with the nominal geometry, in which nothing is misplaced,
     models with their σ, input of a forecast."""
-    shape = SceneOptions(
-        seed=options.seed,
-        distance_mm=options.distance_mm,
-        spread_deg=options.spread_deg,
-        images_per_group=options.images,
-        groups=options.groups,
-        width=options.width,
-        height=round(options.width * 2 / 3),
-        margin_mm=options.margin_mm,
-        **dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0),
-    )
+    same = ("seed", "distance_mm", "spread_deg", "groups", "width", "margin_mm")
+    given: dict[str, Any] = {name: getattr(options, name) for name in same}
+    given |= dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0)
+    shape = SceneOptions(images_per_group=options.images, height=round(options.width * 2 / 3), **given)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
     run = options.run.adjustment(scene.target)
     kept = _kept_dots(board)
@@ -396,19 +389,11 @@ class PlanFile(ResultFile):
 
     @classmethod
     def of_plan(cls, plan: Plan) -> "PlanFile":
-        return cls(
-            format="stcal plan 1",
-            images_per_group=plan.options.images,
-            groups=plan.groups,
-            spread_deg=plan.options.spread_deg,
-            distance_mm=plan.options.distance_mm,
-            reference_face=plan.setup.start.reference_face,
-            observations=plan.observations,
-            centre_sigma_px=plan.centre_sigma_px,
-            aperture_mm=plan.aperture_mm,
-            forecast=ForecastPart.of(plan.forecast, plan.shares),
-            remedies=plan.remedies,
-        )
+        same = ("groups", "observations", "centre_sigma_px", "aperture_mm", "remedies")
+        given: dict[str, Any] = {name: getattr(plan, name) for name in same}
+        given |= {name: getattr(plan.options, name) for name in ("spread_deg", "distance_mm")}
+        given |= {"images_per_group": plan.options.images, "reference_face": plan.setup.start.reference_face}
+        return cls(format="stcal plan 1", forecast=ForecastPart.of(plan.forecast, plan.shares), **given)
 
 
 USUAL_FOCAL_MM = 24.0  # focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide
