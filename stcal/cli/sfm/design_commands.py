@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -136,17 +136,9 @@ def simulate(
     elif unused := {name: mm for name, mm in {"--focus-mm": focus, "--focal-mm": focal}.items() if mm is not None}:
         name, mm = next(iter(unused.items()))
         raise InputError("E-OPTION-NEEDS", f"{name} {mm:g}: only with a thin lens; add --f-number")
-    rendering = RenderOptions(
-        noise=noise,
-        blur_px=blur,
-        clutter=clutter,
-        reflectance=reflectance,
-        bit_depth=16 if sixteen_bit else 8,
-        seed=seed,
-        lens=lens,
-        rim_mm=rim,
-        slope=slope,
-    )
+    look: dict[str, Any] = {"noise": noise, "blur_px": blur, "clutter": clutter, "reflectance": reflectance}
+    depth = 16 if sixteen_bit else 8
+    rendering = RenderOptions(bit_depth=depth, seed=seed, lens=lens, rim_mm=rim, slope=slope, **look)
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)

@@ -168,11 +168,8 @@ def opencv(content: Content) -> str:
     """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
     covariances of circles."""
     lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
-    lines += [
-        f"reference_face: {_quoted(content.run.faces.reference_face)}",
-        f"said: {_list(content.said())}",
-        "faces:",
-    ]
+    lines += [f"reference_face: {_quoted(content.run.faces.reference_face)}"]
+    lines += [f"said: {_list(content.said())}", "faces:"]
     target, radius = content.target, content.run.faces.radius_mm
     for face, pose in target.target_from_face.items():
         labels = content.circles_of(face)

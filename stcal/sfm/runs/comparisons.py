@@ -128,11 +128,8 @@ def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, S
     """Returns the lengths of the board's residuals, and the RMS of the images' per coordinate."""
     board = MICRO * np.concatenate([np.linalg.norm(scale.residuals_mm, axis=1) for scale in scales.values()])
     residuals = np.concatenate([model.residuals_px(camera) for model in models])
-    return {
-        "board_mean_um": float(board.mean()),
-        "board_spread_um": float(board.std()),
-        "residual_rms_px": rms(residuals),
-    }
+    lengths = {"board_mean_um": float(board.mean()), "board_spread_um": float(board.std())}
+    return lengths | {"residual_rms_px": rms(residuals)}
 
 
 @dataclass(frozen=True, slots=True)

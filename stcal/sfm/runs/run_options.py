@@ -118,11 +118,8 @@ class RunOptions:
             options = replace(options, refine_camera=True)
             known = f"camera file {camera.source}: states its focal length to ±{focal_sigma_px(camera):.3g} px only"
             warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
-        of_circles = {
-            "--solve paper": options.solve == "paper",
-            "--compare paper": options.compare is not None,
-            "--board-only": options.board_only,
-        }
+        of_circles = {"--solve paper": options.solve == "paper", "--compare paper": options.compare is not None}
+        of_circles["--board-only"] = options.board_only
         for name in (name for name, is_given in of_circles.items() if printed and is_given):
             fault = f"{name}: only for targets of circles, and faces of this one have boards or tags"
             raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")

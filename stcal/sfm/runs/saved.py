@@ -257,12 +257,8 @@ class RunResult(SavedRun):
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
         board, drawn = self.board_design, self.target_design.up_to_scale
-        known = {
-            "board": board.rows,
-            "faces": faces_of_known_shape(board),
-            "distances": known_distances(board) and not drawn,
-            "drawing": drawn,
-        }
+        known: dict[str, Any] = {"board": board.rows, "faces": faces_of_known_shape(board), "drawing": drawn}
+        known["distances"] = known_distances(board) and not drawn
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
