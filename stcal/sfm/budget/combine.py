@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.random import Generator
 from pydantic import BeforeValidator, Field
 from scipy.linalg import null_space
 from scipy.special import ndtr, stdtrit
@@ -501,14 +502,9 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian.reshape(1, -1), np.zeros((1, 0)))
 
 
-def _row(
-    measurand: Measurand,
-    sources: Sequence[BudgetSource],
-    designed_sigma_mm: float,
-    freedom: int,
-    rng: np.random.Generator,
-) -> Row:
-    covariances = {source.key: measurand.covariance(source, designed_sigma_mm) for source in sources}
+def _row(measurand: Measurand, sources: Sequence[BudgetSource], sigma_mm: float, freedom: int, rng: Generator) -> Row:
+    """Returns the uncertainty of a measurand; ``sigma_mm`` : of circles that were not mapped."""
+    covariances = {source.key: measurand.covariance(source, sigma_mm) for source in sources}
     covariance = np.sum(list(covariances.values()), axis=0)
     variance = float(np.trace(covariance))
     estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
@@ -518,15 +514,9 @@ def _row(
     errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     # The estimated variance scatters about the true one.
     drawn = np.sqrt(rng.chisquare(effective, DRAWS) / effective) if np.isfinite(effective) else 1.0
-    return Row(
-        measurand,
-        {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()},
-        covariance,
-        standard,
-        expanded,
-        float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean()),
-        effective,
-    )
+    coverage = float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean())
+    contributions = {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()}
+    return Row(measurand, contributions, covariance, standard, expanded, coverage, effective)
 
 
 def _view(model: MetricModel) -> GroupViews:

@@ -249,14 +249,11 @@ def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | N
     joint = setup.adjusted(models).result(1.0)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
-    reference = setup.start.reference_face
-    circles = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
-    return Forecast(
-        {face: c for face, c in used_derivatives.face_covariance(covariance).items() if face != reference},
-        dict(zip(joint.labels, circles.tolist(), strict=True)),
-        scale_sigma(joint.xyz_model, covariance),
-        used_derivatives,
-    )
+    circles_mm = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
+    circles = dict(zip(joint.labels, circles_mm.tolist(), strict=True))
+    faces = used_derivatives.face_covariance(covariance)
+    others = {face: faces[face] for face in faces if face != setup.start.reference_face}
+    return Forecast(others, circles, scale_sigma(joint.xyz_model, covariance), used_derivatives)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -290,12 +290,9 @@ def _beside_board(
     run = options.run.adjustment(scene.target)
     kept = _kept_dots(board)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
-    start = CalibratedTarget(
-        run.reference_face,
-        {face: pose for face, pose in scene.target_from_face.items() if face in linked},
-        scene.circles_target,
-        dict.fromkeys(scene.groups, Rigid()),
-    )
+    poses = {face: pose for face, pose in scene.target_from_face.items() if face in linked}
+    groups = dict.fromkeys(scene.groups, Rigid())
+    start = CalibratedTarget(run.reference_face, poses, scene.circles_target, groups)
     setup = Setup(
         target=scene.target,
         board=board,

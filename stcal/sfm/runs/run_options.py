@@ -89,14 +89,10 @@ class RunOptions:
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """Returns the options of the adjustment, with every default decided. Raises InputError: no such choice."""
         eccentricity = self.eccentricity and self.solve != "paper"
-        return AdjustOptions(
-            target.face(self.reference_face or target.faces[0].id).id,
-            self.solve or ("joint" if eccentricity else "chain"),
-            self.frame or ("plane" if eccentricity else "three-point"),
-            eccentricity,
-            self.flatness_mm,
-            self.refine_camera,
-        )
+        reference = target.face(self.reference_face or target.faces[0].id).id
+        solve = self.solve or ("joint" if eccentricity else "chain")
+        frame = self.frame or ("plane" if eccentricity else "three-point")
+        return AdjustOptions(reference, solve, frame, eccentricity, self.flatness_mm, self.refine_camera)
 
     def settled(self, target: TargetDesign) -> "RunOptions":
         """Returns the same options with every default decided. Raises InputError: no such choice."""

@@ -191,18 +191,11 @@ def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
 
 def target_in(faces: FacesFile) -> CalibratedTarget:
     """Returns the target in the content of ``faces.json``, which has no poses of groups."""
-    joint = faces.circles_joint_covariance_mm2
-    return CalibratedTarget(
-        faces.reference_face,
-        faces.poses(),
-        by_circle(faces.circles),
-        {},
-        dict(faces.target_from_face_covariance),
-        by_circle(faces.circle_covariance_mm2),
-        {},
-        None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
-        None if joint is None else joint.matrix(),
-    )
+    joint, ppm = faces.circles_joint_covariance_mm2, faces.scale_sigma_ppm
+    scale_sigma, whole = None if ppm is None else 1e-6 * ppm, None if joint is None else joint.matrix()
+    covariances = dict(faces.target_from_face_covariance), by_circle(faces.circle_covariance_mm2)
+    circles = by_circle(faces.circles)
+    return CalibratedTarget(faces.reference_face, faces.poses(), circles, {}, *covariances, {}, scale_sigma, whole)
 
 
 AnyRun = SavedRun | str | Path
