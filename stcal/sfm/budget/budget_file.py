@@ -14,7 +14,7 @@ from pydantic import Field, TypeAdapter
 from scipy.special import ndtri
 
 import stcal
-from stcal.design import BoardDesign, StatedSize
+from stcal.design import BoardDesign, FaceDesign, StatedSize
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, digest_of
 from stcal.io.json import ByName, Finite, Part, ResultFile
@@ -168,14 +168,11 @@ Length = tuple[float, float, float]
 def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = ()) -> Length:
     """Returns a corrected length of the run, with its variance by all sources except ``without``."""
     measurand = combine.distance(budget.joint, *ends)
-    variances = {
-        each.key: (each.evaluation, float(measurand.covariance(each, 0.0)[0, 0]))
-        for each in budget.sources
-        if each.key not in without
-    }
-    estimated = sum(variance for evaluation, variance in variances.values() if evaluation == "A")
+    used = [each for each in budget.sources if each.key not in without]
+    variances = [float(measurand.covariance(each, 0.0)[0, 0]) for each in used]
+    estimated = sum(variance for each, variance in zip(used, variances, strict=True) if each.evaluation == "A")
     length = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
-    return length, sum(variance for _, variance in variances.values()), estimated**2 / budget.freedom
+    return length, sum(variances), estimated**2 / budget.freedom
 
 
 def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLength:
@@ -439,18 +436,19 @@ def _definitions(run: SavedRun) -> list[str]:
     plane = run.faces.frame == "plane"
     normal = "normal to the plane of all its circles, " if plane else ""
     foot = ", at its foot on the plane of all circles" if plane else ""
+
+    def axes_of(face: FaceDesign) -> str:
+        if face.printed is not None:
+            return "the frame of its drawing, Z into the body"
+        xy = f"X towards circle {face.x}, Y on the side of circle {face.y}"
+        return f"origin at circle {face.origin}{foot}, {xy}, Z {normal}out of the body"
+
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
         "the angle of two faces is that between their Z axes",
         "a distance a–b is that of the points a and b, face:circle, numbered as in the drawing",
-        *(
-            f"face {face.id}: the frame of its drawing, Z into the body"
-            if face.printed is not None
-            else f"face {face.id}: origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of "
-            f"circle {face.y}, Z {normal}out of the body"
-            for face in run.target_design.faces
-        ),
+        *(f"face {face.id}: {axes_of(face)}" for face in run.target_design.faces),
     ]
 
 

@@ -51,8 +51,7 @@ def budget_in_brief(file: BudgetFile, page: bool) -> str:
         *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
-        _no_certificate(file, brief=True)
-        or ("--report FILE.html writes a certificate of calibration" if offered else ""),
+        _no_certificate(file, brief=True) or "--report FILE.html writes a certificate of calibration" * offered,
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
         "" if page else f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
     ]

@@ -356,11 +356,9 @@ def settings(report: dict) -> list[list[str]]:
 def crosscheck_section(check: dict) -> list[Block]:
     """Returns the section on the cross-check with the native COLMAP."""
     mapping = check["mapping"]
-    names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
-    models = [
-        [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
-        for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
-    ]
+    names = {"native": f"COLMAP {check['native']}", "pycolmap": f"pycolmap {check['pycolmap']}", "run": "this result"}
+    images, rms_px = check["images"], check["residual_rms_px"]
+    models = [[name, images[key], number(rms_px[key], 4)] for key, name in names.items()]
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
         largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
