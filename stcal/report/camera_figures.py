@@ -79,9 +79,10 @@ def comparison_text(found: CameraDifference) -> list[str]:
     rows, columns = length.shape
     middle = length[rows // 4 : -(rows // 4), columns // 4 : -(columns // 4)]
     corners = length[[0, 0, -1, -1], [0, -1, 0, -1]]
+    rms_px, middle_px = (np.sqrt(np.nanmean(each**2)) for each in (length, middle))
+    over = f"{rms_px:.4f} px RMS over the image, {np.nanmax(length):.4f} px at most"
     lines = [
-        f"apart: {np.sqrt(np.nanmean(length**2)):.4f} px RMS over the image, {np.nanmax(length):.4f} px at most; "
-        f"{np.sqrt(np.nanmean(middle**2)):.4f} px RMS in its middle half",
+        f"apart: {over}; {middle_px:.4f} px RMS in its middle half",
         f"corners: {join(number(v, 4) for v in corners)} px",
         f"the second camera is turned by {np.linalg.norm(turn):.5f}° ({', '.join(f'{v:.5f}' for v in turn)})",
     ]

@@ -445,10 +445,8 @@ def budget(
     rng = np.random.default_rng(0)
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
-    rows = [
-        _row(measurand, sources, own.designed_sigma_mm, freedom, rng)
-        for measurand in measurands(joint, own, reference_face)
-    ]
+    every = measurands(joint, own, reference_face)
+    rows = tuple(_row(measurand, sources, own.designed_sigma_mm, freedom, rng) for measurand in every)
     views = tuple(_view(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
@@ -457,7 +455,7 @@ def budget(
     traces = (np.trace(covariances, axis1=1, axis2=2).tolist() for covariances in (circles, estimated))
     freedoms = np.array([effective_freedom(*variances, freedom) for variances in zip(*traces, strict=True)])
     conditions = conditions_of(statement, board)
-    return Budget(joint, reference_face, sources, tuple(rows), circles, freedoms, freedom, views, statement, conditions)
+    return Budget(joint, reference_face, sources, rows, circles, freedoms, freedom, views, statement, conditions)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:

@@ -22,14 +22,8 @@ from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
 K = TypeVar("K")
-ROW_SHAPES = {
-    "centre_px": (2,),
-    "centre": (2,),
-    "shape": (2, 2),
-    "covariance_px2": (2, 2),
-    "uneven_px": (2,),
-    "domes": (3,),
-}
+ROW_SHAPES: dict[str, tuple[int, ...]] = dict.fromkeys(("centre_px", "centre", "uneven_px"), (2,))
+ROW_SHAPES |= {"shape": (2, 2), "covariance_px2": (2, 2), "domes": (3,)}
 """Shape of a circle's value in each field of measured circles that is not one number."""
 
 

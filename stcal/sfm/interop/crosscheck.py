@@ -467,10 +467,8 @@ def comparison_text(check: Crosscheck) -> str:
     of_native = f"{images.native} of {images.run} images, residual {residual.native:.4f} px RMS"
     of_pycolmap = f"{images.pycolmap} of {images.run} images, residual {residual.pycolmap:.4f} px RMS"
     circles, circle_sigmas = (max(v.values(), default=0.0) for v in (mapping.circles_um, mapping.circles_sigmas))
-    um, mdeg, sigmas = (
-        max((getattr(camera, key) for camera in mapping.cameras), default=0.0)
-        for key in ("position_um", "rotation_mdeg", "sigmas")
-    )
+    cameras = [(row.position_um, row.rotation_mdeg, row.sigmas) for row in mapping.cameras]
+    um, mdeg, sigmas = np.max([(0.0, 0.0, 0.0), *cameras], axis=0)
     lines = [
         f"COLMAP {check.native} (schema {check.schema_}): {of_native}",
         f"pycolmap {check.pycolmap}: {of_pycolmap}; the run: {residual.run:.4f} px",

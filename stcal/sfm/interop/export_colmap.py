@@ -193,11 +193,9 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
             copy.commit()
             copy.execute("ATTACH ? AS own", (str(own),))
             for table in wanted.tables:
-                theirs, ours = (
-                    [name for _, name, *_ in copy.execute(f"PRAGMA {database}.table_info({table})")]
-                    for database in ("main", "own")
-                )
-                columns = ", ".join(name for name in theirs if name in ours)
+                main, ours = (copy.execute(f"PRAGMA {name}.table_info({table})").fetchall() for name in ("main", "own"))
+                known = {name for _, name, *_ in ours}
+                columns = ", ".join(name for _, name, *_ in main if name in known)
                 copy.execute(f"INSERT INTO {table} ({columns}) SELECT {columns} FROM own.{table} ORDER BY rowid")
     except sqlite3.Error as error:
         fault = f"{path}: cannot be written ({error})"
@@ -207,11 +205,9 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
 
 def database_text(written: Exported) -> str:
     """Returns a text on the contents of the copied database, and how to open it."""
-    return (
-        f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
-        f"camera model {', '.join(written.camera_models)}\n"
-        f"open it with: colmap gui --database_path {written.path} --image_path IMAGES"
-    )
+    content = f"{written.images} images, {written.pairs} pairs, camera model {', '.join(written.camera_models)}"
+    how = f"colmap gui --database_path {written.path} --image_path IMAGES"
+    return f"schema {written.schema}, checked: {content}\nopen it with: {how}"
 
 
 FORMATS = ("colmap-bin", "colmap-txt")  # formats of a model, which is a folder
@@ -306,7 +302,5 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Seque
 
 def model_text(written: ExportedModel) -> str:
     """Returns a text on the contents of the model."""
-    return (
-        f"{written.images} images and {written.points} points; mm, target frame: {written.path}\n"
-        f"labels: {written.labels}"
-    )
+    counts = f"{written.images} images and {written.points} points"
+    return f"{counts}; mm, target frame: {written.path}\nlabels: {written.labels}"

@@ -96,10 +96,9 @@ def report_html(
         Section("Settings", [Table(["<Setting", "<Value"], settings(report), css="text facts")]),
         Section("Overlays", pictures),
     ]
-    counts = (
-        f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
-        f"{summary['images_mapped']} mapped, {summary['faces']} faces"
-    )
+    groups = f"{summary['groups']} group{'' if summary['groups'] == 1 else 's'}"
+    mapped = f"{summary['images_mapped']} mapped, {summary['faces']} faces"
+    counts = f"{summary['images']} images in {groups}, {mapped}"
     alone, published, control = not report["faces"], options["solve"] == "paper", not options["eccentricity"]
     warnings = [ALONE] * alone + [PUBLISHED] * published + [CONTROL] * control
     banner = [alarms(warnings[:1]), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
@@ -193,15 +192,11 @@ def _scale(report: dict) -> list[Block]:
     residuals = [vector for scale in boards.values() for vector in scale["board_residuals_um"].values()]
     reach = max((math.hypot(*vector[:2]) for vector in residuals), default=0.0)
     height = max((abs(vector[2]) for vector in residuals), default=0.0)
-    pictures = [
-        plot(
-            partial(board_residuals, scale["board_residuals_um"], reach, height),
-            f"Residual vectors of the board, group {name}",
-            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
-            "",
-        )
-        for name, scale in boards.items()
-    ]
+    pictures = []
+    for name, scale in boards.items():
+        draw = partial(board_residuals, scale["board_residuals_um"], reach, height)
+        caption = f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm"
+        pictures.append(plot(draw, f"Residual vectors of the board, group {name}", caption, ""))
     of_boards = [
         subheading("Board residuals"),
         "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "

@@ -77,11 +77,8 @@ def compare_with_paper(result: "RunResult", published: MethodResult | StcalError
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
-    sigma = {
-        face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5)
-        for face, c in whole.face_covariance.items()
-        if face != whole.reference_face
-    }
+    others = {face: c for face, c in whole.face_covariance.items() if face != whole.reference_face}
+    sigma = {face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5) for face, c in others.items()}
     return Comparison(method="paper", rows=[ComparedRow(**row.model_dump()) for row in rows], sigma=sigma)
 
 
@@ -89,10 +86,8 @@ def in_steps(result: "RunResult") -> dict[str, MethodResult | StcalError]:
     """Answers, or errors, from the run's own circles by the step added last, with λ by rows, three-point frames and
     single transforms, without the joint adjustment."""
     camera, designs = result.camera, (result.target_design, result.board_design)
-    weighted = [solution.model for solution in result.solutions]
-    equal = [
-        replace(m, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (len(m.measured_px), 1, 1))) for m in weighted
-    ]
+    weighted, one = [solution.model for solution in result.solutions], EQUAL_SIGMA_PX**2 * np.eye(2)
+    equal = [replace(model, covariance_px2=np.tile(one, (len(model.measured_px), 1, 1))) for model in weighted]
     # The models hold the corrections already; the calibration itself works without eccentricity.
     plain: dict[str, Any] = {"solve": "paper", "frame": "three-point", "eccentricity": False, "refine_camera": False}
     options = replace(result.options.adjustment(result.target_design), **plain)
