@@ -152,16 +152,13 @@ def _faces_in_detail(report: dict) -> list[Block]:
     for face, way in ((face, way) for face, chains in report["chains"].items() for way in chains):
         off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
         ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
+    distances = Table(["<Faces", "Distance (mm)", "σ (µm)", "Angle (°)"], between)
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
     found = ["Points found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     return [
         Table(["<Face", *found], rests),
         columns(
-            [
-                subheading("Between faces"),
-                "Distance of the origins, angle of the normals",
-                Table(["<Faces", "Distance (mm)", "σ (µm)", "Angle (°)"], between),
-            ],
+            [subheading("Between faces"), "Distance of the origins, angle of the normals", distances],
             [
                 subheading("Chains"),
                 "Ways to each face through single groups, before these are adjusted together, and how far each is off "
@@ -319,6 +316,8 @@ def settings(report: dict) -> list[list[str]]:
     solve, frame = str(options["solve"]), str(options["frame"])
     round_ = not report["faces"] or not report["faces"].keys() <= set(summary.get("printed_faces", []))
     single = sum(row.get("gate") == "views" for row in left_out["circles"])
+    points = f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows"
+    source = "as given" if summary.get("camera_given", True) else "found from the photographs"
     eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
     rows = [
         ["Solve", SOLVES.get(solve, solve)],
@@ -330,16 +329,9 @@ def settings(report: dict) -> list[list[str]]:
         ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
         ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
-        [
-            "Left out",
-            f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
-            f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows",
-        ],
+        ["Left out", f"{len(left_out['files'])} files, {len(left_out['images'])} images, {points}"],
         ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
-        [
-            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
-            f"{camera['model']}, {sizes} px",
-        ],
+        [f"Camera, {source}", f"{camera['model']}, {sizes} px"],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
         ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
         ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
@@ -389,26 +381,24 @@ def checks_section(checks_of_report: list[dict]) -> list[Block]:
     of_values = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     open_: list[list] = []
     others: list[list] = []
+    measured: list[list] = []
     for check in checks:
         surplus = len(check.names) - FIRST_NAMES
         names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
         value = check.measured[0].texts() if check.measured else [NONE, NONE]
         row = [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
         (open_ if check.verdict in ("failed", "suspicious") else others).append(row)
-    measured = [
-        [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
-        for check in checks
-        for m in check.measured
-    ]
+        for m in check.measured:
+            chance = NONE if m.probability is None else f"{m.probability:.1g}"
+            measured.append([check.title, m.name, *m.texts(), chance])
+    passed = f"{len(others)} checks that passed, were not possible or not applicable"
     halved = next((check for check in checks_of_report if check["key"] == "halves" and check["measured"]), None)
     return [
         f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
         "images or points it tested",
         Table(heads, open_, css="text"),
         plots(plot(partial(halves, halved["measured"]), halved["title"], css="")) if halved else "",
-        fold(
-            f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
-        ),
+        fold(passed, Table(heads, others, css="text")),
         fold("What was measured", Table(of_values, measured, css="text")),
     ]
 
