@@ -50,9 +50,7 @@ NO_PANGO = (
 
 def pdf_of(page: str) -> bytes:
     """Return the PDF of a page whose content is all embedded, A4 with page numbers; equal pages give equal bytes.
-
-    Raises InputError: WeasyPrint, or Pango, which it uses, is not installed.
-    """
+    Raises InputError: WeasyPrint, or Pango, which it uses, is not installed."""
     try:
         from weasyprint import HTML
         from weasyprint.urls import URLFetcher

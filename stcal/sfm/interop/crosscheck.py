@@ -504,10 +504,8 @@ def _differences(
                 in_sigma = "" if own is None else f", {own:.2f} σ"
                 measured = f"{um:.1f} µm, {mdeg:.2f} mdeg{in_sigma}"
                 clauses.append(f"face {face} ({source}) {measured}; {', '.join(allowed)} allowed")
-        largest += [
-            (f"circle {{}} ({source})", compared.circles_um, "µm", limits.circle_um),
-            (f"circle {{}} ({source})", compared.circles_sigmas, "σ", sigma),
-        ]
+        of_circles = (compared.circles_um, "µm", limits.circle_um), (compared.circles_sigmas, "σ", sigma)
+        largest += [(f"circle {{}} ({source})", *each) for each in of_circles]
     largest += [
         ("camera {}: position", {c.image: c.position_um for c in mapping.cameras}, "µm", limits.camera_um),
         ("camera {}: attitude", {c.image: c.rotation_mdeg for c in mapping.cameras}, "mdeg", limits.camera_mdeg),

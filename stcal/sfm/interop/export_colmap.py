@@ -176,10 +176,8 @@ def _complete(place: Path) -> Iterator[Path]:
 
 
 def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
-    """Writes a new database of a run's images and labels; returns the number of its pairs.
-
-    It is in rollback-journal mode, which is a single file that any program opens.
-    """
+    """Writes a new database of a run's images and labels; returns the number of its pairs. It is in rollback-journal
+    mode, which is a single file that any program opens."""
     own = path.with_name(f"own-{path.name}")
     pairs = image_graph(run.observations, run.board_design).pairs
     write_database(own, run.camera, run.observations, pairs, run.corrected_px)

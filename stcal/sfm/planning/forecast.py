@@ -60,10 +60,8 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
             keep = circles.must_find & (rng.random(len(circles.labels)) >= missing)
             ideal = circle_image_offset(circles.xyz_camera[keep], circles.normal_camera[keep], circles.radius_mm[keep])
             centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(ideal), 2))
-            centre, labels = (
-                scene.camera.normalised_from_pixel(centre_px),
-                tuple(compress(circles.labels, keep.tolist())),
-            )
+            centre = scene.camera.normalised_from_pixel(centre_px)
+            labels = tuple(compress(circles.labels, keep.tolist()))
             covariance_px2 = np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(ideal), 1, 1))
             shape, image = np.zeros((len(ideal), 2, 2)), f"{name}/{i:04d}"
             images.append(ImageObservations(image, name, labels, centre_px, centre, shape, covariance_px2))

@@ -144,11 +144,9 @@ def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
 
 
 def without_sigma(report: dict) -> dict:
-    return report | {
-        "faces": without_sigma_of(report["faces"]),
-        "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
-        "summary": report["summary"] | {"scale_sigma_ppm": None},
-    }
+    between = [row | {"distance_sigma_um": None} for row in report["between_faces"]]
+    summary = report["summary"] | {"scale_sigma_ppm": None}
+    return report | {"faces": without_sigma_of(report["faces"]), "between_faces": between, "summary": summary}
 
 
 def _faces(names: list[str]) -> str:

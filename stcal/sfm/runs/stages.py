@@ -271,10 +271,8 @@ def groups_of(task: Task, seen: DetectedImages) -> Groups:
     board_alone = options.board_only or is_board_alone(seen.detection)
     if board_alone and options.solve == "joint":
         options = replace(options, solve="chain", refine_camera=False)
-    board, camera = (
-        with_edge_sigma(task.board, observations),
-        start_of(seen.camera, seen.detection.camera, task.options),
-    )
+    board = with_edge_sigma(task.board, observations)
+    camera = start_of(seen.camera, seen.detection.camera, task.options)
     needs_board = not task.target.has_scale
     usable, notes = usable_groups(by_group(observations), seen.detection.skipped, board_alone, needs_board)
     task.progress("map", 0, len(usable))

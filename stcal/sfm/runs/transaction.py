@@ -271,10 +271,8 @@ class Verified:
 
 
 def verify(run: Path) -> Verified:
-    """Compares the files of a finished run's folder with the hashes that were kept when it ended.
-
-    Raises InputError: not a run's folder, or one without hashes.
-    """
+    """Compares the files of a finished run's folder with the hashes that were kept when it ended. Raises InputError:
+    not a run's folder, or one without hashes."""
     require_run(run)
     complete_interrupted(run)
     content = read_json(run / files.RUN_MARKER, "run", AGAIN)
