@@ -174,9 +174,8 @@ def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float 
     if faces:
         own, within = joint.print_factor * factor, max(face.sigma_mm or 0.0 for face in faces)
         words = f"sigma_mm of target.toml × {own:.2f}, in the plane; off it --flatness"
-        yield row(
-            "print", "print of faces", uncertainty.PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own
-        )
+        stated = or_default(words, within == TAG_SIGMA_MM)
+        yield row("print", "print of faces", uncertainty.PRINT, stated, 1e3 * within * own)
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, edges = largest.size_sigma, "a common displacement of the edges of all tags"
         stated = "assumed" if sigma else "not stated", f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
@@ -206,8 +205,7 @@ def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, cam
         return BudgetSource("intrinsics", "intrinsics", "A", "estimated", words, None, "", covariance)
     origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
     if refined:
-        known = "the camera file" if origin == "stated" else "a calibration of some age"
-        words = f"adjusted; σ before that of {known}"
+        words = f"adjusted; σ before that of {'the camera file' if origin == 'stated' else 'a calibration of some age'}"
     else:
         words = "fixed; σ of the camera file" if origin == "stated" else "fixed; no σ in the camera file"
         effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
