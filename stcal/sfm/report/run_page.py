@@ -50,11 +50,6 @@ SOLVES = {
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-def has_board(report: dict) -> bool:
-    """Returns whether a board of dots gives the scale."""
-    return "board" in report["summary"].get("scale_from", ["board"])
-
-
 PUBLISHED = (
     "as published, for comparison: centres of contours with equal weights, without the eccentricity; faces are off by "
     "tens of µm, and no residual shows it"
@@ -120,7 +115,7 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
 
 def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
     """Returns the faces with σ, and the target in space."""
-    with_it = "boards and cameras" if has_board(report) else "cameras"
+    with_it = "boards and cameras" if "board" in report["summary"].get("scale_from", ["board"]) else "cameras"
     views = [("target", "Target"), ("all", f"With {with_it}")]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
@@ -280,7 +275,7 @@ def _left_out(report: dict) -> list[Block]:
 def trust(report: dict, judgement: Judgement) -> list[Block]:
     """Returns for what σ hold, and the worst value of each kind."""
     summary, options = report["summary"], report["options"]
-    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
+    scale_from = summary.get("scale_from", ["board"])
     if options["solve"] != "joint":
         scope = (
             "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
@@ -291,7 +286,8 @@ def trust(report: dict, judgement: Judgement) -> list[Block]:
     else:
         refined = options.get("refine_camera", False)
         absent = [] if refined else ["the camera calibration"]
-        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if has_board(report) else []
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if "board" in scale_from else []
+        size = " and ".join(SIZES[source] for source in scale_from)
         scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
         if absent:
             scope += f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it"
