@@ -7,7 +7,7 @@ both agree."""
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -364,7 +364,7 @@ class BudgetFile(ResultFile):
         for row in budget.of_kind("angle"):
             a, b = (poses[face].rotation[:, 2] for face in row.measurand.faces)
             angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-            own = {"angle_deg": angle_deg, "angle_mdeg": Uncertainty.of(row, MILLIDEGREES)}
+            own: dict[str, Any] = {"angle_deg": angle_deg, "angle_mdeg": Uncertainty.of(row, MILLIDEGREES)}
             angles.append(AngleUncertainty(faces=list(row.measurand.faces), **own))
         for row in budget.of_kind("distance"):
             length = row.measurand.length_mm or 0.0

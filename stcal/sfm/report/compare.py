@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -292,7 +292,7 @@ def _face(face_id: str, found: ComparedFaces, known: TruthFile) -> FaceErrors:
         turn, sigma = np.split(1e3 * np.sqrt(np.maximum(np.diag(c), 0)), 2)
         turn = np.degrees(turn)
     of_pose = _pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump()
-    of_circles = {"circles": len(labels), "circles_mean_um": mean, "circles_max_um": largest}
+    of_circles: dict[str, Any] = {"circles": len(labels), "circles_mean_um": mean, "circles_max_um": largest}
     return FaceErrors(**of_pose, **of_circles, translation_sigma_um=sigma, rotation_sigma_mdeg=turn)
 
 
