@@ -32,7 +32,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
-from stcal.sfm.budget.combine import FIELDS, Budget, Statement, budget, conditions_of
+from stcal.sfm.budget.combine import FIELDS, Budget, Statement, budget, conditions_of, sources_of
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
@@ -174,9 +174,8 @@ def stated_by(case: Case) -> Stated:
     state = adjusted(models, case.board, case.camera, case.flatness_mm, case.prior)
     found = contributions_of(state)
     own = derivatives(found.joint, start, case.scene.target, "plane")
-    rows = budget(
-        found, own, case.camera, case.board, case.flatness_mm, case.refined, case.statement, start.reference_face
-    )
+    sources = sources_of(found, case.camera, case.board, case.flatness_mm, case.refined, case.statement)
+    rows = budget(found.joint, own, sources, case.board, case.statement, start.reference_face)
     return Stated(factors, found.joint.board_common, rows)
 
 

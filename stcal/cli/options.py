@@ -155,6 +155,40 @@ class JoinOptions:
 JOINED, JOINED_BY_POSE, JOINED_BY_NAME = JoinOptions(), JoinOptions(key="pose"), JoinOptions(key="name")
 
 
+@dataclass(frozen=True, slots=True)
+class DetectionOptions:
+    """Options of commands that detect circles in images: their sizes, and where the images are processed."""
+
+    min_diameter: MinDiameter = None
+    max_diameter: MaxDiameter = 450.0
+    workers: Workers = None
+    scheduler: Scheduler = None
+    send_images: SendImages = False
+
+    def ellipses(self) -> "EllipseOptions":
+        """Returns the detection options for circles of these sizes."""
+        from stcal.sfm.detect.candidates import EllipseOptions
+
+        if self.min_diameter is not None and self.max_diameter <= self.min_diameter:
+            fault = f"--max-diameter {self.max_diameter:g}: over --min-diameter {self.min_diameter:g} needed"
+            raise InputError("E-OPTION-RANGE", fault)
+        return EllipseOptions(min_diameter_px=self.min_diameter, max_diameter_px=self.max_diameter)
+
+    def handed_over(self) -> AbstractContextManager[None]:
+        """Returns the context in which images are processed: on a Dask cluster, or by processes of this machine."""
+        if self.scheduler is None:
+            if self.send_images:
+                fault = "--send-images: only with --scheduler"
+                raise InputError("E-OPTION-NEEDS", f"{fault}, to whose machines they are sent")
+            return nullcontext()
+        from stcal.workflows.cluster import dask_cluster
+
+        return dask_cluster(self.scheduler, self.send_images)
+
+
+DETECTION = DetectionOptions()
+
+
 def several_tables(
     given: Path | None,
     first: Path | None,
@@ -195,17 +229,6 @@ def name_of(source: "Path | Table") -> str:
     return source.name if isinstance(source, Path) else source.where
 
 
-def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextManager[None]:
-    """Returns the context in which images are processed: on a Dask cluster, or by processes of this machine."""
-    if scheduler is None:
-        if send_images:
-            raise InputError("E-OPTION-NEEDS", "--send-images: only with --scheduler, to whose machines they are sent")
-        return nullcontext()
-    from stcal.workflows.cluster import dask_cluster
-
-    return dask_cluster(scheduler, send_images)
-
-
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None, verdict: str = "") -> None:
     """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
     command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
@@ -238,16 +261,6 @@ def load_ahead(workers: int | None) -> None:
     from stcal.parallel import load_ahead
 
     load_ahead(workers)
-
-
-def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
-    """Returns the detection options for circles of these sizes."""
-    from stcal.sfm.detect.candidates import EllipseOptions
-
-    if min_diameter is not None and max_diameter <= min_diameter:
-        fault = f"--max-diameter {max_diameter:g}: over --min-diameter {min_diameter:g} needed"
-        raise InputError("E-OPTION-RANGE", fault)
-    return EllipseOptions(min_diameter_px=min_diameter, max_diameter_px=max_diameter)
 
 
 def require_new(outputs: Sequence[tuple[str, Path]]) -> None:

@@ -30,9 +30,8 @@ def shown(camera: Camera) -> list[str]:
     ]
     moved = moved_px(camera)[1]
     if share := np.isnan(moved).any(axis=2).mean():
-        lines.append(
-            f"warning: {share:.1%} of the image has no ray: the distortion folds over there, or leads beyond 89°"
-        )
+        folds = "the distortion folds over there, or leads beyond 89°"
+        lines.append(f"warning: {share:.1%} of the image has no ray: {folds}")
     if share < 1:
         lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
     return lines
@@ -41,20 +40,17 @@ def shown(camera: Camera) -> list[str]:
 def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[str]:
     """Return lines on the quality of a fitted lens; ``region`` : whether the file states where the lens is valid."""
     where = "its valid_intrinsics_region" if region else "the image"
-    lines = [
-        f"{called} has no place here: {found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off over "
-        f"{where}, {found.most_px:.2g} px at most"
-    ]
+    fitted = f"{found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off"
+    lines = [f"{called} has no place here: {fitted} over {where}, {found.most_px:.2g} px at most"]
     turn = np.degrees(found.camera_from_lens.log()[:3])
     if turn.any():
-        lines.append(
-            f"the fitted camera is turned by {np.linalg.norm(turn):.4f}° ({', '.join(f'{v:.4f}' for v in turn)}) about "
-            "the axes of the lens: poses that the other program gave do not apply to it"
+        turned = (
+            f"turned by {np.linalg.norm(turn):.4f}° ({', '.join(f'{v:.4f}' for v in turn)}) about the axes of the lens"
         )
+        lines.append(f"the fitted camera is {turned}: poses that the other program gave do not apply to it")
     if found.most_px > POOR_PX:
-        lines.append(
-            f"a fit more than {POOR_PX:g} px off is a start only: refine it (`--refine-camera`), or calibrate anew"
-        )
+        remedy = "refine it (`--refine-camera`), or calibrate anew"
+        lines.append(f"a fit more than {POOR_PX:g} px off is a start only: {remedy}")
     if found.share < 1:
         lines.append(f"in {1 - found.share:.0%} of the directions {where} reaches beyond 89° from the axis: unused")
     return lines
@@ -67,10 +63,8 @@ def field_deg(camera: Camera, one: tuple[float, float], two: tuple[float, float]
 
 
 def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (r, c, 2) over the image, and their distortion (r, c, 2), px.
-
-    The distortion is relative to a camera with the same focal lengths and projection, but without distortion.
-    """
+    """Return pixels (r, c, 2) over the image, and their distortion (r, c, 2), px, relative to a camera with the same
+    focal lengths and projection, but without distortion."""
     pixels = image_grid(camera)
     rays_camera = rays(camera, pixels.reshape(-1, 2))
     ideal = Camera(camera.width, camera.height, camera.focal, camera.centre, np.zeros(12), camera.fisheye)
@@ -85,17 +79,16 @@ def comparison_text(found: CameraDifference) -> list[str]:
     rows, columns = length.shape
     middle = length[rows // 4 : -(rows // 4), columns // 4 : -(columns // 4)]
     corners = length[[0, 0, -1, -1], [0, -1, 0, -1]]
+    rms_px, middle_px = (np.sqrt(np.nanmean(each**2)) for each in (length, middle))
+    over = f"{rms_px:.4f} px RMS over the image, {np.nanmax(length):.4f} px at most"
     lines = [
-        f"apart: {np.sqrt(np.nanmean(length**2)):.4f} px RMS over the image, {np.nanmax(length):.4f} px at most; "
-        f"{np.sqrt(np.nanmean(middle**2)):.4f} px RMS in its middle half",
+        f"apart: {over}; {middle_px:.4f} px RMS in its middle half",
         f"corners: {join(number(v, 4) for v in corners)} px",
         f"the second camera is turned by {np.linalg.norm(turn):.5f}° ({', '.join(f'{v:.5f}' for v in turn)})",
     ]
-    if np.isnan(length).any():
-        share = np.isnan(length).mean()
-        lines.append(
-            f"{share:.1%} of the image has no ray in one of both, or is outside of where both are valid: unused"
-        )
+    if share := np.isnan(length).mean():
+        unused = "of the image has no ray in one of both, or is outside of where both are valid: unused"
+        lines.append(f"{share:.1%} {unused}")
     return lines
 
 

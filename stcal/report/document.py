@@ -23,13 +23,8 @@ from stcal.report.text import NONE, join, number, text_table
 @cache
 def environment() -> Environment:
     """Return the template environment, which escapes everything but markup, and refuses undefined names."""
-    env = Environment(
-        loader=PackageLoader("stcal", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    loader = PackageLoader("stcal", ".")
+    env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     env.filters["with_code"] = with_code
     env.filters["number"] = number
     macros = vars(env.get_template("report/templates/macros.html.jinja").module)
@@ -55,9 +50,7 @@ NO_PANGO = (
 
 def pdf_of(page: str) -> bytes:
     """Return the PDF of a page whose content is all embedded, A4 with page numbers; equal pages give equal bytes.
-
-    Raises InputError: WeasyPrint, or Pango, which it uses, is not installed.
-    """
+    Raises InputError: WeasyPrint, or Pango, which it uses, is not installed."""
     try:
         from weasyprint import HTML
         from weasyprint.urls import URLFetcher
@@ -75,8 +68,7 @@ def require_pdf() -> None:
     pdf_of("<p></p>")
 
 
-MOST_ROWS, MOST_PRINTED = 500, 60
-"""Largest number of rows of a table on a page, and on the terminal."""
+MOST_ROWS, MOST_PRINTED = 500, 60  # largest number of rows of a table on a page, and on the terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +94,7 @@ class Table:
             return [f"{name}: {value}" for name, value in self.rows if value != NONE]
         above = [text for text, span in self.over for _ in range(span)] or [""] * len(self.heads)
         heads = [
-            ("<" if head.startswith("<") else "") + f"{text} {head.removeprefix('<')}".strip()
+            "<" * head.startswith("<") + f"{text} {head.removeprefix('<')}".strip()
             for text, head in zip(above, self.heads, strict=True)
         ]
         lines = text_table([heads, *([str(cell) for cell in row] for row in self.rows[:MOST_PRINTED])])
@@ -126,7 +118,6 @@ class Printed:
         return len(self.content) > 0
 
     def lines(self) -> list[str]:
-        """Return the lines."""
         return list(self.content)
 
     def __html__(self) -> str:
@@ -204,7 +195,6 @@ class Answer:
     said: str = ""
 
     def lines(self) -> list[str]:
-        """Return the answer as a line."""
         return [f"{self.question} {self._said()}"]
 
     def __html__(self) -> str:
@@ -246,18 +236,10 @@ class Document:
     def page(self) -> str:
         """Return the page, which opens offline."""
         with one_thread():  # small matrices of figures, on which threads wait for each other
-            sections = [(each.anchor(), each.heading, html(*each.blocks)) for each in self.sections]
-            return (
-                environment()
-                .get_template("report/templates/base.html.jinja")
-                .render(
-                    title=self.title,
-                    about=self.about,
-                    banner=html(*self.banner),
-                    sections=[section for section in sections if section[2].strip()],
-                    window=self.window or self.title,
-                )
-            )
+            written = [(each.anchor(), each.heading, html(*each.blocks)) for each in self.sections]
+            parts = {"banner": html(*self.banner), "sections": [section for section in written if section[2].strip()]}
+            names = {"title": self.title, "about": self.about, "window": self.window or self.title}
+            return environment().get_template("report/templates/base.html.jinja").render(names | parts)
 
     def text(self) -> str:
         """Return the sections for the terminal; headings tell them apart where there are several."""

@@ -36,8 +36,7 @@ RED_BLUE = "#053061 #2166ac #4393c3 #92c5de #d1e5f0 #f7f7f7 #fddbc7 #f4a582 #d66
 VIRIDIS = "#440154 #472d7b #3b528b #2c728e #21918c #28ae80 #5ec962 #addc30 #fde725"
 """The ramp viridis (van der Walt & Smith 2015), dark to light."""
 DASH = "5 4"
-LETTER = 0.55
-"""Mean width of a letter as a share of the font's size."""
+LETTER = 0.55  # mean width of a letter as a share of the font's size
 MARKS = {
     "dot": "h0",
     "ring": "m-{1:.1f} 0a{1:.1f} {1:.1f} 0 1 0 {0:.1f} 0a{1:.1f} {1:.1f} 0 1 0 -{0:.1f} 0",
@@ -48,14 +47,11 @@ MARKS = {
     "diamond": "m0 -{1:.1f}l{1:.1f} {1:.1f}l-{1:.1f} {1:.1f}l-{1:.1f} -{1:.1f}z",
 }
 """Path of each mark from its middle; {0} is its size, {1} half of it, pt."""
-Ticks = tuple[Sequence[float], Sequence[str]]
-"""Values of an axis, and their words."""
-UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
-"""Characters that no XML file may contain."""
+Ticks = tuple[Sequence[float], Sequence[str]]  # values of an axis, and their words
+UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  # characters that no XML file may contain
 
 
-Box = tuple[float, float, float, float]
-"""Left, top, right and bottom in a drawing, pt."""
+Box = tuple[float, float, float, float]  # left, top, right and bottom in a drawing, pt
 
 
 class Drawing:
@@ -117,13 +113,11 @@ class Drawing:
             self.words((x + 12, y), text, anchor="start")
             x += 28 + LETTER * SMALL * len(text)
 
-    def discs(self, xy: np.ndarray, radius: float, fills: Sequence[str], edge: str = "none") -> None:
+    def discs(self, xy: np.ndarray, radius: float, fills: Sequence[str], edge: str) -> None:
         """Draws discs at places (n, 2) in colours of their own."""
-        discs = "".join(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}"/>'
-            for (x, y), fill in zip(xy.tolist(), fills, strict=True)
-        )
-        self._parts.append(f'<g stroke="{edge}" stroke-width="0.5">{discs}</g>')
+        places = zip(xy.tolist(), fills, strict=True)
+        discs = (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}"/>' for (x, y), fill in places)
+        self._parts.append(f'<g stroke="{edge}" stroke-width="0.5">{"".join(discs)}</g>')
 
     def words(
         self,
@@ -136,7 +130,7 @@ class Drawing:
         weight: str = "normal",
     ) -> None:
         """Writes words in the middle of the height of a line at a place (2,)."""
-        x, y = float(at[0]), float(at[1])
+        x, y = map(float, at)
         turn = f' transform="rotate({turned_deg:.1f} {x:.1f} {y:.1f})"' if turned_deg else ""
         written = escape(UNWRITABLE.sub("\ufffd", text.encode("utf-8", "backslashreplace").decode()))
         self._parts.append(
@@ -178,7 +172,6 @@ class Drawing:
         )
 
     def uri(self) -> str:
-        """Returns the drawing as a data URI."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
 
@@ -202,10 +195,8 @@ class Axes:
 
     @classmethod
     def equal(cls, drawing: Drawing, box: Box, xy: np.ndarray, margin: float = 0.05, down: bool = False) -> "Axes":
-        """Returns axes with the same scale for x and y that hold points (n, 2) and a margin, a share of their extent.
-
-        ``down`` : whether y grows downwards
-        """
+        """Returns axes with the same scale for x and y that hold points (n, 2) and a margin, a share of their extent;
+        ``down`` : whether y grows downwards."""
         low, high = (xy.min(0), xy.max(0)) if len(xy) else (np.zeros(2), np.ones(2))
         room = np.array([box[2] - box[0], box[3] - box[1]])
         extent = np.maximum((1 + 2 * margin) * (high - low), 1e-9)
@@ -252,11 +243,9 @@ class Axes:
     def shade(
         self, values: np.ndarray, extent: Box, low: float, high: float, ramp: str, bands: int = 0, smooth: bool = True
     ) -> None:
-        """Shades values (rows, columns) in colours of a ramp from low to high; nan stays empty.
-
-        ``extent`` : x and y of the first value, x and y of the last one; ``bands`` : number of steps of the colours, 0
-        for none; ``smooth`` : whether values are interpolated
-        """
+        """Shades values (rows, columns) in colours of a ramp from low to high; nan stays empty. ``extent`` : x and y of
+        the first and of the last value; ``bands`` : number of steps of the colours, 0 for none; ``smooth`` : whether
+        values are interpolated."""
         from scipy.ndimage import zoom
 
         share = (values - low) / ((high - low) or 1.0)
@@ -278,10 +267,8 @@ class Axes:
         y_ticks: Ticks | None = None,
         size: float = SMALL + 1,
     ) -> None:
-        """Draws left and lower line with ticks (values and words) and the names of the axes.
-
-        ``grid`` : the axes whose ticks get lines across
-        """
+        """Draws left and lower line with ticks (values and words) and the names of the axes; ``grid`` : the axes whose
+        ticks get lines across."""
         drawing, (left, top, right, bottom) = self.drawing, self.box
         x_values, x_texts = self._ticks("x", (right - left) / 45) if x_ticks is None else x_ticks
         y_values, y_texts = self._ticks("y", (bottom - top) / 22) if y_ticks is None else y_ticks
@@ -309,10 +296,8 @@ class Axes:
 
 
 def limits(values, margin: float = 0.05, low: float | None = None) -> tuple[float, float]:
-    """Returns limits of an axis that hold all finite values and a margin, a share of their extent.
-
-    ``low`` : the lower limit, if it is given
-    """
+    """Returns limits of an axis that hold all finite values and a margin, a share of their extent; ``low`` : the lower
+    limit, if it is given."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     first, last = (values.min(), values.max()) if len(values) else (0.0, 1.0)
@@ -371,14 +356,10 @@ def arrows(start: np.ndarray, along: np.ndarray, width: float) -> list[np.ndarra
     """Returns the outlines (7, 2) of arrows from places (n, 2) along vectors (n, 2), with shafts of a width."""
     outlines = []
     for at, vector in zip(start, along, strict=True):
-        length = float(np.hypot(*vector))
-        if length <= 0:
-            continue
-        unit = vector / length
-        head = min(5 * width, length)
-        wide = 1.5 * width * head / (5 * width)
-        thin = min(width / 2, wide / 2)
-        shape = [(0, thin), (length - head, thin), (length - head, wide), (length, 0), (length - head, -wide)]
-        shape += [(length - head, -thin), (0, -thin)]
-        outlines.append(at + np.array(shape) @ np.array([unit, [-unit[1], unit[0]]]))
+        if (length := float(np.hypot(*vector))) > 0:
+            unit, head = vector / length, min(5 * width, length)
+            neck, wide = length - head, 1.5 * width * head / (5 * width)
+            thin = min(width / 2, wide / 2)
+            shape = [(0, thin), (neck, thin), (neck, wide), (length, 0), (neck, -wide), (neck, -thin), (0, -thin)]
+            outlines.append(at + np.array(shape) @ np.array([unit, [-unit[1], unit[0]]]))
     return outlines

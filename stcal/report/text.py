@@ -12,10 +12,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.rotations import fixed
 
 NONE = "–"
-WIDTH = 100
-"""Largest number of characters of a line of sentences."""
-WIDEST = 10_000
-"""Largest number of characters of a line: no line is ever wrapped, whatever the terminal."""
+WIDTH = 100  # largest number of characters of a line of sentences
+WIDEST = 10_000  # largest number of characters of a line: no line is ever wrapped, whatever the terminal
 
 
 def number(value: float | None, digits: int) -> str:
@@ -25,12 +23,10 @@ def number(value: float | None, digits: int) -> str:
     return fixed(value, digits)
 
 
-def significant(value: float | None, digits: int = 2) -> str:
-    """Return a number with this many significant digits, as uncertainties are stated (JCGM 100:2008, 7.2.6)."""
-    if not value or not math.isfinite(value):
-        return number(value, digits)
-    decimals = digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2])
-    return number(round(value, decimals), max(decimals, 0))
+def significant(value: float | None) -> str:
+    """Return a number with two significant digits, as uncertainties are stated (JCGM 100:2008, 7.2.6)."""
+    decimals = 1 - int(f"{value:.1e}".partition("e")[2]) if value and math.isfinite(value) else 2
+    return number(value and round(value, decimals), max(decimals, 0))
 
 
 def cells(row: dict, spec: str) -> list:
@@ -43,20 +39,18 @@ def join(values: Iterable) -> str:
     return ", ".join(str(value) for value in values) or NONE
 
 
-def wrapped(line: str, width: int = WIDTH) -> list[str]:
-    """Return a sentence in lines of at most this width, the further ones indented; a row of a table stays whole."""
-    start = line[: len(line) - len(line.lstrip())]
-    if len(line) <= width or "  " in line.lstrip():
+def wrapped(line: str) -> list[str]:
+    """Return a sentence in lines of a limited width, the further ones indented; a row of a table stays whole."""
+    if len(line) <= WIDTH or "  " in line.lstrip():
         return [line]
-    return textwrap.wrap(line, width, subsequent_indent=f"{start}    ", break_long_words=False, break_on_hyphens=False)
+    indent = line[: len(line) - len(line.lstrip())] + "    "
+    return textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: int = 2) -> list[str]:
-    """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped.
-
-    ``rows`` : cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of
-    each column; ``gap`` : between columns, in characters.
-    """
+    """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped. ``rows`` :
+    cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of each column;
+    ``gap`` : between columns, in characters."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

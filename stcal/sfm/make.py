@@ -40,16 +40,13 @@ leaves room to cut, fold and glue."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """A side of the box."""
-
     name: str
     width: float  # of its plate, mm
     height: float
     box_from_plate: Rigid  # origin lower left as seen from outside, Y upwards, Z outwards
 
 
-NAMES = ("front", "right", "back", "left", "top")
-"""Names of the sides that may have circles."""
+NAMES = ("front", "right", "back", "left", "top")  # names of the sides that may have circles
 
 
 def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES) -> list[Side]:
@@ -63,11 +60,11 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
         ("left", d, h, (-y, z), (-w, d, -h)),
         ("top", w, d, (x, y), (-w, -d, h)),
     )
-    box = {row[0]: row for row in rows}
-    return [
-        Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
-        for name, width, height, (x, y), corner in map(box.__getitem__, names)
-    ]
+    sides = {
+        name: Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
+        for name, width, height, (x, y), corner in rows
+    }
+    return [sides[name] for name in names]
 
 
 def faces_of(text: str) -> tuple[str, ...]:
@@ -98,12 +95,9 @@ LEAST_CIRCLES = MIN_NAMING + HIDDEN
 LARGE = 1.6
 """Radius of the larger circles as a multiple of the smaller radius. Detection takes radii up to a ratio of 1.3 for
 equal."""
-GAP = 0.8
-"""Least gap between the rims of two circles, in radii of the smaller circles."""
-PLACES, TRIES = 40, 30
-"""Numbers of candidate places for each circle, and of candidate patterns for each face."""
-GRID_MM = 0.5
-"""Grid of the coordinates of circles, so that they are round numbers that can be measured again."""
+GAP = 0.8  # least gap between the rims of two circles, in radii of the smaller circles
+PLACES, TRIES = 40, 30  # numbers of candidate places for each circle, and of candidate patterns for each face
+GRID_MM = 0.5  # grid of the coordinates of circles, so that they are round numbers that can be measured again
 CORNER_SHARE = 0.15
 """Size of the area at each corner in which a circle of the frame lies, as a share of the plate's sides."""
 
@@ -129,17 +123,14 @@ def make_pattern(
             if least == 0:
                 break
         if best is None:
-            raise InputError(
-                "E-MAKE-ROOM",
-                f"face {side.name}: no room for {circles} circles of {radius_mm:.3g} and {LARGE * radius_mm:.3g} mm on "
-                f"{side.width:g} × {side.height:g} mm; fewer --circles, a smaller --radius-mm, or a larger --size",
+            radii, plate = f"{radius_mm:.3g} and {LARGE * radius_mm:.3g} mm", f"{side.width:g} × {side.height:g} mm"
+            fault = f"face {side.name}: no room for {circles} circles of {radii} on {plate}"
+            raise InputError("E-MAKE-ROOM", f"{fault}; fewer --circles, a smaller --radius-mm, or a larger --size")
+        if least > (most := circles - HIDDEN - 1):
+            fault = (
+                f"face {side.name}: {least} of {circles} circles also fit another interpretation, at most {most} may"
             )
-        if least > circles - HIDDEN - 1:
-            raise InputError(
-                "E-MAKE-CIRCLES",
-                f"face {side.name}: {least} of {circles} circles also fit another interpretation, at most "
-                f"{circles - HIDDEN - 1} may; more --circles, a smaller --radius-mm, or another --seed",
-            )
+            raise InputError("E-MAKE-CIRCLES", f"{fault}; more --circles, a smaller --radius-mm, or another --seed")
         faces.append(best)
         likeness = max(likeness, least)
     return TargetDesign(name, polarity, tuple(faces)), likeness
@@ -176,8 +167,7 @@ def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) 
     return replace(face, rough_target_from_face=side.box_from_plate @ plate_from_face, outline_mm=outline[:, :2])
 
 
-TILT_RAD = np.radians(40.0)
-"""Tilt of the face about an oblique axis in the simulated views."""
+TILT_RAD = np.radians(40.0)  # tilt of the face about an oblique axis in the simulated views
 CONTRAST = 100.0
 
 
@@ -211,21 +201,18 @@ def _seen(face: FaceDesign, target: TargetDesign, camera: Camera, distance_mm: f
     return Ellipses(centre, shape, np.full(len(centre), CONTRAST))
 
 
-FARTHER = 1.1
-"""Largest distance of a camera, as a multiple of the stated distance."""
+FARTHER = 1.1  # largest distance of a camera, as a multiple of the stated distance
 WELL_SEEN = 1.5
 """Least ratio of the smallest circle's diameter, where it is most tilted and farthest away, to the smallest diameter
 that detection looks for."""
-RADIUS_SHARE = 1 / 30
-"""Default radius of the smaller circles, as a share of the box's shortest side."""
+RADIUS_SHARE = 1 / 30  # default radius of the smaller circles, as a share of the box's shortest side
 RADIUS_STEP_MM = 0.25
 PITCH_SHARE = 0.23
 """Pitch of the board, as a share of the box's longest side. The board then reaches beyond the box on all sides."""
 FIELD_SHARE = 0.8
 """Share of the width that the camera sees at the stated distance, in which box and board stand side by side."""
 PITCH_STEP_MM = 5.0
-ATTEMPTS = 8
-"""Largest number of patterns drawn until one is identified in all cases."""
+ATTEMPTS = 8  # largest number of patterns drawn until one is identified in all cases
 ROWS, COLUMNS = 7, 9
 BOARD_SIGMA_MM = 0.02
 """Position error of dots that a good printer prints. A milled or photographic plate states its own."""
@@ -278,8 +265,9 @@ class DesignOptions(Brief):
         text = ",".join(self.faces)
         for name in self.faces:
             if name not in NAMES:
-                sides = ", ".join(NAMES)
-                raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {sides}")
+                raise InputError(
+                    "E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}"
+                )
             if self.faces.count(name) > 1:
                 raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
         if len(self.faces) < 2 or set(self.faces) in ({"front", "back"}, {"left", "right"}):
@@ -296,13 +284,6 @@ class DesignOptions(Brief):
                 fault = f"camera file {model.source} states no image size"
                 raise InputError("E-CAMERA-SIZE", f"{fault}; add it to the file")
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
-
-    def least_radius_mm(self) -> float:
-        """Least radius of circles that are found even where they are farthest away and most tilted, with a margin."""
-        camera = self.ideal_camera()
-        least, _ = diameter_limits_px(camera.width * camera.height, EllipseOptions())
-        px_per_mm = np.sqrt(camera.focal.prod()) / (FARTHER * self.distance_mm)
-        return float(WELL_SEEN * least / (2 * px_per_mm * np.sqrt(np.cos(MAX_TILT_RAD))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,24 +302,22 @@ class Made:
 def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
     """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` is called with (done,
     total) cases of hidden circles."""
-    least, radius = options.least_radius_mm(), options.radius_mm
+    camera, radius = options.ideal_camera(), options.radius_mm
+    least_px, most_px = diameter_limits_px(camera.width * camera.height, EllipseOptions())
+    focal_px, farthest_mm = float(np.sqrt(camera.focal.prod())), FARTHER * options.distance_mm
+    # of circles that are found even where they are farthest away and most tilted, with a margin
+    least = float(WELL_SEEN * least_px / (2 * (focal_px / farthest_mm) * np.sqrt(np.cos(MAX_TILT_RAD))))
     if radius is None:
         radius = _up_to(RADIUS_STEP_MM, max(least, RADIUS_SHARE * min(options.size_mm)))
     if radius < least:
-        raise InputError(
-            "E-MAKE-RADIUS",
-            f"--radius-mm {radius:g}: at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm "
-            "on; larger circles, a nearer camera or more pixels needed",
-        )
-    camera = options.ideal_camera()
-    most = diameter_limits_px(camera.width * camera.height, EllipseOptions())[1]
-    largest = 2 * LARGE * radius * float(np.sqrt(camera.focal.prod())) / options.distance_mm
-    if largest * FARTHER > most:
-        raise InputError(
-            "E-MAKE-RADIUS",
-            f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
-            "sought; smaller circles or a camera farther away needed",
-        )
+        seen = f"at {options.distance_mm:g} mm this camera sees circles well from {least:.2f} mm on"
+        remedy = "larger circles, a nearer camera or more pixels needed"
+        raise InputError("E-MAKE-RADIUS", f"--radius-mm {radius:g}: {seen}; {remedy}")
+    largest_px = 2 * LARGE * radius * focal_px / options.distance_mm
+    if largest_px * FARTHER > most_px:
+        allowed = f"at most {most_px / FARTHER:.0f} px are sought"
+        fault = f"radius {LARGE * radius:g} mm is {largest_px:.0f} px in the image, {allowed}"
+        raise InputError("E-MAKE-RADIUS", f"{fault}; smaller circles or a camera farther away needed")
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):
@@ -370,9 +349,9 @@ def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
 def made_text(made: Made) -> str:
     """Returns a text that describes the target and how well its faces are told apart."""
     options, target, alike = made.options, made.target, made.likeness
+    radii = f"radius {made.radius_mm:g} and {LARGE * made.radius_mm:g} mm"
     return (
-        f"{target.name}: {len(target.faces)} faces of {options.circles} circles, radius {made.radius_mm:g} and "
-        f"{LARGE * made.radius_mm:g} mm, {target.polarity}\n"
+        f"{target.name}: {len(target.faces)} faces of {options.circles} circles, {radii}, {target.polarity}\n"
         f"smallest radius that is seen well at {options.distance_mm:g} mm: {made.least_mm:.2f} mm\n"
         f"a face has {f'at most {alike} of its circles' if alike else 'never four circles'} in common with another "
         "face, a mirror image or itself turned\n"
@@ -502,10 +481,10 @@ def _free(out: str | Path | None) -> Path | None:
 
 
 def _saved(folder: Path | None, target: TargetDesign, board: BoardDesign | None) -> tuple[Path, ...]:
-    """Writes the designs into a folder; returns the files."""
     if folder is None:
         return ()
     save_target(folder / "target.toml", target)
-    if board is not None:
-        save_board(folder / "board.toml", board)
-    return (folder / "target.toml", *([] if board is None else [folder / "board.toml"]))
+    if board is None:
+        return (folder / "target.toml",)
+    save_board(folder / "board.toml", board)
+    return folder / "target.toml", folder / "board.toml"

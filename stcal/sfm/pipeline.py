@@ -31,25 +31,12 @@ from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
+from stcal.sfm.runs import stages
 from stcal.sfm.runs.comparisons import MethodResult, compare_with_paper
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import RunResult
-from stcal.sfm.runs.stages import (
-    DetectedImages,
-    Groups,
-    Task,
-    camera_by_dots,
-    detect_and_label,
-    detect_with,
-    groups_of,
-    guessed_cameras,
-    map_groups,
-    scaled_by_drawing,
-    start_of,
-    unseen_faces,
-    wrong_file,
-)
+from stcal.sfm.runs.stages import DetectedImages, Groups, Task
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"  # what a run's folder states as the folder of its images where there is none
@@ -123,10 +110,10 @@ def run(
         with scratch_folder("run") as scratch:
             return replace(run(images, camera, scratch, target, board, options, progress, checks, every), out=None)
     with begun(frames_of_video(images, out, every), camera, out, target, board, options, progress) as task:
-        seen = detect_and_label(task)
+        seen = stages.detect_and_label(task)
         with overlays_beside(seen, task) as left_out:
-            task = scaled_by_drawing(task, seen, board is not None)
-            groups = map_groups(task, groups_of(task, seen))
+            task = stages.scaled_by_drawing(task, seen, board is not None)
+            groups = stages.map_groups(task, stages.groups_of(task, seen))
             groups, calibration = scale_chain_adjust(task, groups)
             result = result_of(task, seen, groups, calibration)
             left_out.update(result.unadjusted())
@@ -175,10 +162,9 @@ def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]
     """Scales, chains and adjusts. Groups with gross errors are mapped again with the refined camera, where they may
     agree; all are with a plain lens if the faces do not tell the lens of a camera that was not given."""
     calibration = calibration_by(task, groups)
-    doubted = {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}
-    if doubted:
+    if doubted := {s.model.group for s in groups.solutions if s.outliers and groups.options.refine_camera}:
         with suppress(StcalError):
-            again = map_groups(task, replace(groups, camera=calibration.camera), doubted)
+            again = stages.map_groups(task, replace(groups, camera=calibration.camera), doubted)
             by_name = {s.model.group: s for s in again.solutions}
             refined = replace(groups, solutions=tuple(by_name.get(s.model.group, s) for s in groups.solutions))
             calibration, groups = calibration_by(task, refined), refined
@@ -190,8 +176,8 @@ def scale_chain_adjust(task: Task, groups: Groups) -> tuple[Groups, Calibration]
     except ConvergenceError:  # a lens that folds its image
         warnings.warn(PLAIN, InputNote, stacklevel=2)
         plain = model_of(plain_lens(lens), PHOTOGRAPHS)
-        groups = replace(groups, camera=start_of(plain, lens, task.options))
-        return scale_chain_adjust(replace(task, camera=plain), map_groups(task, groups))
+        groups = replace(groups, camera=stages.start_of(plain, lens, task.options))
+        return scale_chain_adjust(replace(task, camera=plain), stages.map_groups(task, groups))
     return groups, calibration
 
 
@@ -251,7 +237,7 @@ def compared(task: Task, result: RunResult) -> RunResult:
     task = replace(task.named("{}, as published"), options=options)
     answer: MethodResult | StcalError
     try:
-        groups = map_groups(task, groups_of(task, detect_with(task, model)))
+        groups = stages.map_groups(task, stages.groups_of(task, stages.detect_with(task, model)))
         calibration = calibration_by(task, groups)
         models = tuple(solution.model for solution in groups.solutions)
         answer = MethodResult(calibration.target, models, calibration.scales)
@@ -277,13 +263,13 @@ def checked(result: RunResult, own: Sequence[OwnCheck], progress: Progress) -> R
 def _cause(result: RunResult) -> Check | None:
     """Returns what of the input is wrong for all images together, if it is known before the checks."""
     target, board = result.target_design, result.board_design
-    if sized := cause_of_size(result.target.circles, target, board):
-        return sized
-    cause = cause_of_drawing(result.target.target_from_face, target)
     is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
-    if is_misfit and result.camera_given and not result.options.refine_camera:
-        return wrong_file(result.observations, result.camera, board) or cause
-    return cause
+    by_file = is_misfit and result.camera_given and not result.options.refine_camera
+    return (
+        cause_of_size(result.target.circles, target, board)
+        or (stages.wrong_file(result.observations, result.camera, board) if by_file else None)
+        or cause_of_drawing(result.target.target_from_face, target)
+    )
 
 
 def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
@@ -314,11 +300,9 @@ def on_surface(result: RunResult, calibration: Calibration, evidence: Evidence) 
     if evidence.rim:
         found = evidence.rims.get("circles")
         if found is None:
-            raise InputError(
-                "E-RIM-UNKNOWN",
-                f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph them "
-                "from several angles, or state rim_mm in target.toml",
-            )
+            fault = f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts"
+            remedy = "photograph them from several angles, or state rim_mm in target.toml"
+            raise InputError("E-RIM-UNKNOWN", f"{fault}; {remedy}")
         heights, sigma_mm = dict.fromkeys(calibration.target.circles, found.height_mm), found.sigma_mm
     if not any(heights.values()):
         return calibration
@@ -360,20 +344,17 @@ def detect_images(
         with scratch_folder("detect") as scratch:
             return detect_images(images, camera, scratch, target, board, options, progress)
     if (Path(out) / "faces.json").exists():
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
-        )
+        fault = f"output folder {out}: holds a finished calibration"
+        raise InputError("E-OUTPUT-EXISTS", f"{fault}; give another folder with --out")
     with begun(images, camera, out, target, board, options or RunOptions(), progress, settle=False) as task:
-        notes, model = [], task.camera
+        note, model = "", task.camera
         if model is None:
-            model, note = model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
+            model, note = model_of(stages.guessed_cameras(task.files[0])[0], PHOTOGRAPHS), ASSUMED
             with suppress(DetectionError, DegenerateError):
                 if task.board.rows:
-                    model = camera_by_dots(task, None)
+                    model = stages.camera_by_dots(task, None)
                     note = f"no --camera: found by the dots of the board, f {model.focal[0]:.0f} px"
-            notes += [note] if task.target.with_faces(printed=False).faces else []
-        seen = detect_with(task, model)
-        if unseen := unseen_faces(task, seen):
-            notes.append(unseen)
+        seen, has_circles = stages.detect_with(task, model), bool(task.target.with_faces(printed=False).faces)
+        notes = note * has_circles, stages.unseen_faces(task, seen)
         with overlays_beside(seen, task, page=False):
-            return replace(seen, notes=tuple(notes))
+            return replace(seen, notes=tuple(filter(None, notes)))

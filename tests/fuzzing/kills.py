@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.transaction import verify
 from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged
 from tests.fuzzing.judged import CODES, IN, LONGEST_S, OUT, Outcome, broken, failures, hashes, lay_out, lines_of

@@ -366,7 +366,7 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path, no_page):
     truth = json.loads((tmp_path / "set/truth.json").read_text())["camera_from_target"]
     assert np.array_equal(truth["IMG_1003.jpg"], scene.camera_from_target[3].matrix())
     assert not (tmp_path / "r/board.toml").exists()
-    again = adjusted_run(load_run(tmp_path / "r")).state.result()
+    again = adjusted_run(load_run(tmp_path / "r"))[0].result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
     tracker = Tracker(result.circles(), result.refined_camera)
     for i, path in enumerate(sorted((tmp_path / "set/images").iterdir())[:3]):  # each is searched as a whole

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,8 +17,9 @@ from stcal.errors import InputError
 from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
+    from stcal.design import BoardDesign, TargetDesign
     from stcal.synthetic.optics import ThinLens
-    from stcal.synthetic.scene import Scene, SceneOptions
+    from stcal.synthetic.scene import Scene
 
 
 app = typer.Typer()
@@ -82,10 +83,12 @@ def simulate(
     target.toml, board.toml, truth.json."""
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
+    from stcal.sfm.planning.forecast import nominal_poses
+    from stcal.sfm.planning.session import pairs_of_faces
     from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
-    from stcal.synthetic.scene import SceneOptions
+    from stcal.synthetic.scene import SceneOptions, make_scene
 
     options = SceneOptions(
         seed=seed,
@@ -119,62 +122,44 @@ def simulate(
         raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
     one_given = (target is None) != (board is None)  # both are the reference's if neither is given
     with shared.designs_told(target, board, with_target=one_given, with_board=one_given):
-        scene = _scene(options, target, board, second_design, groups, camera, fisheye)
-    rendering = RenderOptions(
-        noise=noise,
-        blur_px=blur,
-        clutter=clutter,
-        reflectance=reflectance,
-        bit_depth=16 if sixteen_bit else 8,
-        seed=seed,
-        lens=_lens(scene, f_number, focus, focal, distance, camera),
-        rim_mm=rim,
-        slope=slope,
-    )
+        designs = _designs(target, board, second_design)
+        poses = nominal_poses(designs[0], None)
+        if groups:
+            options = replace(options, groups=pairs_of_faces(groups, designs[0]))
+        if camera is not None and fisheye is not None:
+            raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
+        model = None if camera is None else read_camera(camera)
+        scene = make_scene(replace(options, fisheye_deg=fisheye), *designs, poses, model)
+    lens = None
+    if f_number is not None:
+        lens = _lens(scene, f_number, distance if focus is None else focus, focal, camera)
+    elif unused := {name: mm for name, mm in {"--focus-mm": focus, "--focal-mm": focal}.items() if mm is not None}:
+        name, mm = next(iter(unused.items()))
+        raise InputError("E-OPTION-NEEDS", f"{name} {mm:g}: only with a thin lens; add --f-number")
+    look: dict[str, Any] = {"noise": noise, "blur_px": blur, "clutter": clutter, "reflectance": reflectance}
+    depth = 16 if sixteen_bit else 8
+    rendering = RenderOptions(bit_depth=depth, seed=seed, lens=lens, rim_mm=rim, slope=slope, **look)
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
     say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
 
 
-def _lens(
-    scene: "Scene",
-    f_number: float | None,
-    focus_mm: float | None,
-    focal_mm: float | None,
-    distance_mm: float,
-    camera: Path | None,
-) -> "ThinLens | None":
+def _lens(scene: "Scene", f_number: float, focus_mm: float, focal_mm: float | None, camera: Path | None) -> "ThinLens":
     from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import SENSOR_WIDTH_MM
 
-    if f_number is None:
-        for name, value in {"--focus-mm": focus_mm, "--focal-mm": focal_mm}.items():
-            if value is not None:
-                raise InputError("E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number")
-        return None
     if focal_mm is None and camera is not None:
         fault = f"--f-number {f_number:g}: camera file {camera} states no length in mm"
         raise InputError("E-OPTION-NEEDS", f"{fault}, which the aperture's diameter needs; add --focal-mm")
     usual_mm = round(float(scene.camera.focal.mean()) * SENSOR_WIDTH_MM / scene.camera.width, 6)
-    return ThinLens(f_number, usual_mm if focal_mm is None else focal_mm, distance_mm if focus_mm is None else focus_mm)
+    return ThinLens(f_number, usual_mm if focal_mm is None else focal_mm, focus_mm)
 
 
-def _scene(
-    options: "SceneOptions",
-    target: Path | None,
-    board: Path | None,
-    second_design: bool,
-    groups: str | None,
-    camera: Path | None,
-    fisheye: float | None,
-) -> "Scene":
+def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
     from stcal.boards.board_designs import CornerBoard
     from stcal.boards.board_file import board_of
     from stcal.boards.target_file import target_of
-    from stcal.io.cameras.read import read_camera
-    from stcal.sfm.planning.forecast import nominal_poses
-    from stcal.sfm.planning.session import pairs_of_faces
     from stcal.synthetic import scene
 
     designs = scene.second_design()[:2] if second_design else (target_of(target, printed=False), board_of(board))
@@ -182,14 +167,7 @@ def _scene(
         fault = f"--board {board}: squares or tags, which are not drawn beside a target"
         needed = "a board of dots, asymmetric or hexagonal circles needed here (`run` takes this one)"
         raise InputError("E-BOARD-TYPE", f"{fault}; {needed}")
-    poses = nominal_poses(designs[0], None)
-    if groups:
-        options = replace(options, groups=pairs_of_faces(groups, designs[0]))
-    if camera is None:
-        return scene.make_scene(replace(options, fisheye_deg=fisheye), *designs, poses)
-    if fisheye is not None:
-        raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
-    return scene.make_scene(options, *designs, poses, read_camera(camera))
+    return designs
 
 
 @app.command()

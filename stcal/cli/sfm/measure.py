@@ -34,8 +34,7 @@ def plan(
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
     run: Annotated[
-        Path | None,
-        "Take the σ of the centres, and target, board and camera if not given, from this finished run.",
+        Path | None, "Take the σ of the centres, and target, board and camera if not given, from this finished run."
     ] = None,
     target: shared.TargetFile = None,
     faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,
@@ -191,11 +190,7 @@ def measure(
         float | None, "Multiply the σ of the centres by this, not by that of faces.json.", Opt(min=1e-3, max=1e3)
     ] = None,
     strict: shared.Strict = False,
-    min_diameter: shared.MinDiameter = None,
-    max_diameter: shared.MaxDiameter = 450.0,
-    workers: shared.Workers = None,
-    scheduler: shared.Scheduler = None,
-    send_images: shared.SendImages = False,
+    detection: shared.DetectionOptions = shared.DETECTION,
     serve: Annotated[bool, "Answer images sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."] = False,
     live: Annotated[
         bool,
@@ -211,15 +206,15 @@ def measure(
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from the visible faces, with its 6×6 covariance."""
-    ellipses = shared.ellipse_options(min_diameter, max_diameter)
+    ellipses = detection.ellipses()
     target = _design_beside(faces) if target is None else target
     if serve or live:
         mode, source = ("--live", "from a camera, as taken") if live else ("--serve", "over HTTP, one answer each")
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--out": out != TABLE}
         to_file = None if live and json_file == STANDARD_OUTPUT else json_file
         alone |= {"IMAGES": images if serve else None, "--json": to_file}
-        alone |= {"--previous": previous, "--sequence": sequence, "--scheduler": scheduler}
-        alone |= {"--send-images": send_images, "--strict": strict, "--workers": workers}
+        alone |= {"--previous": previous, "--sequence": sequence, "--scheduler": detection.scheduler}
+        alone |= {"--send-images": detection.send_images, "--strict": strict, "--workers": detection.workers}
         if conflict := next((name for name, value in alone.items() if value), None):
             lines = ", or give --json -, a line each" if live and conflict in ("--json", "--out") else ""
             raise InputError("E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave it out{lines}")
@@ -229,12 +224,9 @@ def measure(
         from stcal.io.images import SUFFIXES
 
         if images.is_file() and images.suffix.lower() not in SUFFIXES:
-            raise InputError(
-                "E-IMAGES-FOLDER",
-                f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or "
-                "give the folder of its frames",
-            )
-        shared.load_ahead(workers)
+            remedy = "for the pose in each picture of a video give --live --json -, or give the folder of its frames"
+            raise InputError("E-IMAGES-FOLDER", f"{images}: a file, and no image; {remedy}")
+        shared.load_ahead(detection.workers)
     from stcal.boards.board_file import load_dots
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
@@ -261,9 +253,11 @@ def measure(
         return
     assert images is not None  # else it was refused above
     table = read_table(joints, "joints") if joints else None
-    options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
+    options = work.MeasureOptions(
+        PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, detection.workers
+    )
     told = shared.designs_told(target, board, with_board=False)
-    with told, shared.handed_over(scheduler, send_images), StageProgress() as progress:
+    with told, detection.handed_over(), StageProgress() as progress:
         result = work.measure(
             images, read_camera(camera), circles, design, load_dots(board) if board else None, options, progress
         )

@@ -68,14 +68,10 @@ def run(
         Opt(metavar="FACES"),
     ] = None,
     strict: shared.StrictByDefault = True,
-    min_diameter: shared.MinDiameter = None,
-    max_diameter: shared.MaxDiameter = 450.0,
-    workers: shared.Workers = None,
-    scheduler: shared.Scheduler = None,
-    send_images: shared.SendImages = False,
+    detection: shared.DetectionOptions = shared.DETECTION,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
-    shared.load_ahead(workers)
+    shared.load_ahead(detection.workers)
     import numpy as np
 
     from stcal.sfm import pipeline
@@ -94,14 +90,14 @@ def run(
         board_only=board_only,
         compare=compare,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
-        ellipses=shared.ellipse_options(min_diameter, max_diameter),
-        workers=workers,
+        ellipses=detection.ellipses(),
+        workers=detection.workers,
         exclude=tuple(exclude or ()),
         expect_faces=() if expect_faces is None else tuple(face.strip() for face in expect_faces.split(",")),
     )
     lines, notes = "", StringIO()  # of what was assumed and noted: the verdict is the first line
     try:
-        assumed, elsewhere = shared.designs_told(target, board), shared.handed_over(scheduler, send_images)
+        assumed, elsewhere = shared.designs_told(target, board), detection.handed_over()
         with redirect_stdout(notes), assumed, elsewhere, StageProgress() as told:
             result = pipeline.run(images, camera, out, target, board, options, told, every=every)
         lines = run_text(result)
@@ -132,28 +128,21 @@ def detect(
     board: shared.BoardFile = None,
     solve: Annotated[Solve | None, "Detect as `run` does with this option."] = None,
     exclude: shared.Exclude = None,
-    min_diameter: shared.MinDiameter = None,
-    max_diameter: shared.MaxDiameter = 450.0,
-    workers: shared.Workers = None,
-    scheduler: shared.Scheduler = None,
-    send_images: shared.SendImages = False,
+    detection: shared.DetectionOptions = shared.DETECTION,
 ) -> None:
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
-    shared.load_ahead(workers)
+    shared.load_ahead(detection.workers)
     from stcal.sfm.pipeline import detect_images
-    from stcal.sfm.runs.folder import detection_text, found_in_all
+    from stcal.sfm.runs.folder import found_in_all, found_lines, skipped_lines
     from stcal.sfm.runs.run_options import RunOptions
 
     options = RunOptions(
-        solve=solve,
-        ellipses=shared.ellipse_options(min_diameter, max_diameter),
-        workers=workers,
-        exclude=tuple(exclude or ()),
+        solve=solve, ellipses=detection.ellipses(), workers=detection.workers, exclude=tuple(exclude or ())
     )
-    with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
+    with shared.designs_told(target, board), detection.handed_over(), StageProgress() as progress:
         found = detect_images(images, camera, out, target, board, options, progress)
     print_each("note", found.notes)
-    say(detection_text(found.detection, found.labelled))
+    say("\n".join([*found_lines(found.labelled), *skipped_lines(found.detection), found_in_all(found.labelled)]))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
     if not any(len(image.observations) for image in found.labelled):
         raise ChecksFailed("E-NOTHING-SEEN", f"{images}: {found_in_all(found.labelled)}; look at the overlays")
@@ -305,10 +294,8 @@ def crosscheck(
     say(comparison_text(check))
     say(f"report: {run / 'report.html'}")
     if check.differences:
-        raise MappingError(
-            "E-CROSSCHECK-DIFFERS",
-            f"cross-check: native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}",
-        )
+        differ = f"native COLMAP {check.native} and stcal differ: {'; '.join(check.differences)}"
+        raise MappingError("E-CROSSCHECK-DIFFERS", f"cross-check: {differ}")
 
 
 @app.command()

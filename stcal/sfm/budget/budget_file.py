@@ -7,38 +7,26 @@ both agree."""
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter
 from scipy.special import ndtri
 
 import stcal
-from stcal.design import BoardDesign, StatedSize
+from stcal.design import BoardDesign, FaceDesign, StatedSize
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, digest_of
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.io.table import LENGTHS, read_table
 from stcal.report.text import join, number
-from stcal.sfm.budget.combine import (
-    BY_CHANCE,
-    COVERAGE_FACTOR,
-    FIELDS,
-    REFERENCE_C,
-    Budget,
-    GroupViews,
-    Origin,
-    Row,
-    Statement,
-    coverage_factor,
-    distance,
-    longest_of,
-    reference_temperature_c,
-)
+from stcal.sfm.budget import combine
+from stcal.sfm.budget.combine import FIELDS, Budget, GroupViews, Origin, Row, Statement
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, Use, judgement_of
-from stcal.sfm.runs.saved import SavedRun, Verified
+from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.transaction import Verified
 
 SHARED = ("board_pitch", "board_expansion", "target_expansion")
 """Sources whose errors two calibrations of one target with one board share: they scale all lengths by one factor."""
@@ -74,7 +62,7 @@ class LengthTest:
         """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
         chance (Bonferroni)."""
         count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
-        limit = float(-ndtri(BY_CHANCE / 2 / count) / COVERAGE_FACTOR)
+        limit = float(-ndtri(combine.BY_CHANCE / 2 / count) / combine.COVERAGE_FACTOR)
         if not e_n:
             verdict = f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
             return cls(reference, list(lengths), None, None, limit, None, verdict, notes)
@@ -82,16 +70,11 @@ class LengthTest:
         agrees = largest <= limit * (1 + 1e-9)
         verdict = f"agrees: all {count} lengths within U, largest |E_n| {number(largest, 2)}"
         if beyond:
-            verdict = (
-                f"{'may agree' if agrees else 'differs'}: {beyond} of {count} lengths beyond U, where 1 in 22 is by "
-                f"chance; largest |E_n| {number(largest, 2)}, which reaches {limit:.2f} by chance in one of 22 tests "
-                f"of {count}"
-            )
+            how_many = f"{beyond} of {count} lengths beyond U, where 1 in 22 is by chance"
+            reaches = f"which reaches {limit:.2f} by chance in one of 22 tests of {count}"
+            word = "may agree" if agrees else "differs"
+            verdict = f"{word}: {how_many}; largest |E_n| {number(largest, 2)}, {reaches}"
         return cls(reference, list(lengths), largest, beyond, limit, agrees, verdict, notes)
-
-    def without_u(self) -> "LengthTest":
-        """Returns the test of a run that must not be used, of which no U holds: nothing is judged."""
-        return self.of(self.reference, [replace(own, expanded_um=None, e_n=None) for own in self.lengths], self.notes)
 
 
 def against_stated(budget: Budget, path: Path) -> LengthTest:
@@ -106,24 +89,17 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
     for line, (a, b), value, sigma_mm in zip(table.lines, ends, length, sigma, strict=True):
         where = f"{table.where}: line {line}"
         if unknown := {a, b} - places.keys():
-            raise InputError(
-                "E-BUDGET-LENGTHS",
-                f"{where}: no circle {min(unknown)} in the run; give one such as {budget.joint.labels[0]}",
-            )
+            fault = f"{where}: no circle {min(unknown)} in the run"
+            raise InputError("E-BUDGET-LENGTHS", f"{fault}; give one such as {budget.joint.labels[0]}")
         if a == b or value <= 0 or sigma_mm < 0:
-            raise InputError(
-                "E-BUDGET-LENGTHS",
-                f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, and a σ of 0 "
-                "or more",
-            )
+            fault = f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm"
+            raise InputError("E-BUDGET-LENGTHS", f"{fault}; a length between two circles needed, and a σ of 0 or more")
         own = _corrected(budget, (places[a], places[b]))
         tested.append(_tested((a, b), own, (float(value), float(sigma_mm) ** 2, 0.0)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
-    if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
-        notes += (
-            f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
-            "not corrected to another",
-        )
+    if budget.conditions.temperature_c != combine.reference_temperature_c(budget.statement.target):
+        needed = f"{path} must state lengths for the temperature at which the target was photographed"
+        notes += (f"{needed}: those of the run are not corrected to another",)
     return LengthTest.of(str(path), tested, notes)
 
 
@@ -133,12 +109,10 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
     rows, other_rows = ([each.joint.labels.index(label) for label in common] for each in (budget, other))
-    pairs = longest_of(common, budget.joint.xyz_model[rows])
+    pairs = combine.longest_of(common, budget.joint.xyz_model[rows])
     if not pairs:
-        raise InputError(
-            "E-BUDGET-LENGTHS",
-            f"run {folder}: {len(common)} circles in common, 2 needed; give a run of the same target",
-        )
+        fault = f"run {folder}: {len(common)} circles in common, 2 needed"
+        raise InputError("E-BUDGET-LENGTHS", f"{fault}; give a run of the same target")
     # The two runs may have used one board.
     same = len({(board.rows, board.columns, board.pitch_mm, board.corner) for board in boards}) == 1
     shared = SHARED if same else ("target_expansion",)
@@ -153,10 +127,8 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     )
     notes = (note,) if same else ()
     if budget.conditions.temperature_c != other.conditions.temperature_c:
-        notes += (
-            "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
-            "board and target for both",
-        )
+        remedy = "state expansion and temperature of board and target for both"
+        notes += (f"the lengths of the two calibrations hold at different temperatures; {remedy}",)
     return LengthTest.of(str(folder), tested, notes)
 
 
@@ -167,13 +139,9 @@ SAME_VIEW_PX = 0.2
 def common_views(first: Sequence[ImageObservations], second: Sequence[ImageObservations]) -> tuple[str, ...]:
     """Returns a note on photographs of which both runs have the same view; none if there are none."""
     common = sum(any(_same_view(image, other) for other in second) for image in first)
-    if not common:
-        return ()
-    return (
-        f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px: the two "
-        "calibrations are not independent, and what both have wrong cannot be seen here; compare with a run of other "
-        "photographs",
-    )
+    same = f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px"
+    why = "the two calibrations are not independent, and what both have wrong cannot be seen here"
+    return (f"{same}: {why}; compare with a run of other photographs",) if common else ()
 
 
 def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
@@ -188,11 +156,9 @@ def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
 
 def _require_size(budget: Budget) -> None:
     if not budget.conditions.size_known:
-        raise InputError(
-            "E-BUDGET-NO-SIZE",
-            "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared; "
-            "state one of the lengths with [[scale]] in target.toml, and run again",
-        )
+        fault = "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared"
+        remedy = "state one of the lengths with [[scale]] in target.toml, and run again"
+        raise InputError("E-BUDGET-NO-SIZE", f"{fault}; {remedy}")
 
 
 Length = tuple[float, float, float]
@@ -201,22 +167,19 @@ Length = tuple[float, float, float]
 
 def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = ()) -> Length:
     """Returns a corrected length of the run, with its variance by all sources except ``without``."""
-    measurand = distance(budget.joint, *ends)
-    variances = {
-        each.key: (each.evaluation, float(measurand.covariance(each, 0.0)[0, 0]))
-        for each in budget.sources
-        if each.key not in without
-    }
-    estimated = sum(variance for evaluation, variance in variances.values() if evaluation == "A")
+    measurand = combine.distance(budget.joint, *ends)
+    used = [each for each in budget.sources if each.key not in without]
+    variances = [float(measurand.covariance(each, 0.0)[0, 0]) for each in used]
+    estimated = sum(variance for each, variance in zip(used, variances, strict=True) if each.evaluation == "A")
     length = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
-    return length, sum(variance for _, variance in variances.values()), estimated**2 / budget.freedom
+    return length, sum(variances), estimated**2 / budget.freedom
 
 
 def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLength:
     """Returns a length against a reference, with U of their difference."""
     (measured_mm, *_), (reference_mm, *_) = own, reference
     variance, lost = (own[i] + reference[i] for i in (1, 2))
-    k = coverage_factor(variance**2 / lost if lost else np.inf)
+    k = combine.coverage_factor(variance**2 / lost if lost else np.inf)
     expanded, error = 1e3 * k * float(np.sqrt(variance)), 1e3 * (measured_mm - reference_mm)
     e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
     return TestedLength(tuple(circles), measured_mm, reference_mm, error, expanded, e_n)
@@ -386,12 +349,8 @@ class BudgetFile(ResultFile):
         cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
-        conditions, answer, refused, known = (
-            budget.conditions,
-            answer_of(run),
-            is_refused(run),
-            budget.conditions.size_known,
-        )
+        conditions, known = budget.conditions, budget.conditions.size_known
+        answer, refused = answer_of(run), is_refused(run)
         enlarged, poses, faces = 1 + conditions.correction, run.faces.poses(), {}
         for position, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
             pose = poses[position.measurand.name]
@@ -401,15 +360,12 @@ class BudgetFile(ResultFile):
                 position_um=Uncertainty.of(position, MICRO) if known else None,
                 rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
             )
-        angles = [
-            AngleUncertainty(
-                faces=list(row.measurand.faces),
-                angle_deg=_angle_deg(*(poses[face].rotation[:, 2] for face in row.measurand.faces)),
-                angle_mdeg=Uncertainty.of(row, MILLIDEGREES),
-            )
-            for row in budget.of_kind("angle")
-        ]
-        distances = []
+        angles, distances = [], []
+        for row in budget.of_kind("angle"):
+            a, b = (poses[face].rotation[:, 2] for face in row.measurand.faces)
+            angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+            own: dict[str, Any] = {"angle_deg": angle_deg, "angle_mdeg": Uncertainty.of(row, MILLIDEGREES)}
+            angles.append(AngleUncertainty(faces=list(row.measurand.faces), **own))
         for row in budget.of_kind("distance"):
             length = row.measurand.length_mm or 0.0
             own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
@@ -418,9 +374,11 @@ class BudgetFile(ResultFile):
         for label, own, freedom in zip(budget.joint.labels, variance, budget.circles_freedom, strict=True):
             xyz = enlarged * np.asarray(run.faces.circles[label])
             sigma_um = (MICRO * np.sqrt(own)).tolist()
-            circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, coverage_factor(freedom))
-        if any(is_refused(each) for each in (run, *others)):
-            tests = [test.without_u() for test in tests]
+            circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, combine.coverage_factor(freedom))
+        if any(is_refused(each) for each in (run, *others)):  # no U holds: nothing is judged
+            bare = ([replace(own, expanded_um=None, e_n=None) for own in test.lengths] for test in tests)
+            tests = [test.of(test.reference, own, test.notes) for test, own in zip(tests, bare, strict=True)]
+        photographs = {name: Path(run.photographs) / name for name in sorted(each.name for each in run.observations)}
         return cls(
             format="stcal budget 1",
             version=stcal.__version__,
@@ -432,7 +390,7 @@ class BudgetFile(ResultFile):
                 sha256=run.sha256.get(RUN_MARKER, ""),
                 faces_sha256=run.sha256.get("faces.json", ""),
                 changed=[*verified.missing, *verified.changed, *verified.added],
-                photographs_sha256=dict(_digests(run)),
+                photographs_sha256={name: digest_of(path) for name, path in photographs.items() if path.is_file()},
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
@@ -443,7 +401,7 @@ class BudgetFile(ResultFile):
             size_known=known,
             reference_temperature_c=conditions.temperature_c,
             holds="" if refused else conditions.words,
-            coverage_factor=COVERAGE_FACTOR,
+            coverage_factor=combine.COVERAGE_FACTOR,
             sigma0=budget.joint.sigma_scale,
             redundancy=budget.joint.redundancy,
             views=list(budget.views),
@@ -460,17 +418,6 @@ class BudgetFile(ResultFile):
         )
 
 
-def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-
-
-def _digests(run: SavedRun) -> Iterator[tuple[str, str]]:
-    """Yields the name and the SHA-256 of each photograph that is in its folder."""
-    for name in sorted(image.name for image in run.observations):
-        if (path := Path(run.photographs) / name).is_file():
-            yield name, digest_of(path)
-
-
 def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
     """Yields the size of the board, what is stated of both bodies, and a reference temperature that is assumed."""
     board = run.board_design
@@ -482,26 +429,26 @@ def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
         for key, value in values.items():
             yield StatedRow(body, key, value, statement.origin[body, key])
         if values.keys() - {"pitch_sigma_ppm"} and size.reference_temperature_c is None:
-            yield StatedRow(body, "reference_temperature_c", REFERENCE_C, "assumed, ISO 1")
+            yield StatedRow(body, "reference_temperature_c", combine.REFERENCE_C, "assumed, ISO 1")
 
 
 def _definitions(run: SavedRun) -> list[str]:
-    """Returns sentences that define the measurands."""
     plane = run.faces.frame == "plane"
     normal = "normal to the plane of all its circles, " if plane else ""
     foot = ", at its foot on the plane of all circles" if plane else ""
+
+    def axes_of(face: FaceDesign) -> str:
+        if face.printed is not None:
+            return "the frame of its drawing, Z into the body"
+        xy = f"X towards circle {face.x}, Y on the side of circle {face.y}"
+        return f"origin at circle {face.origin}{foot}, {xy}, Z {normal}out of the body"
+
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
         "the angle of two faces is that between their Z axes",
         "a distance a–b is that of the points a and b, face:circle, numbered as in the drawing",
-        *(
-            f"face {face.id}: the frame of its drawing, Z into the body"
-            if face.printed is not None
-            else f"face {face.id}: origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of "
-            f"circle {face.y}, Z {normal}out of the body"
-            for face in run.target_design.faces
-        ),
+        *(f"face {face.id}: {axes_of(face)}" for face in run.target_design.faces),
     ]
 
 
@@ -537,9 +484,8 @@ def _unusual(statement: Statement) -> list[str]:
     asked = []
     for body, size in (("board", statement.board), ("target", statement.target)):
         warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
-        if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
-            fahrenheit = (warm - 32) / 1.8
-            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {fahrenheit:.1f} °C?")
+        if warm is not None and abs(warm - combine.REFERENCE_C) > USUAL_K:
+            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {(warm - 32) / 1.8:.1f} °C?")
         if sigma > USUAL_SIGMA_K:
             asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")
         if abs(rate) > USUAL_EXPANSION:
@@ -551,18 +497,13 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
     failed, unknown = run.failed_checks(), [source.title for source in budget.sources if source.origin == "not stated"]
-    notes = []
-    if failed:
-        invalid = join(invalidated(check["key"] for check in failed))
-        notes.append(
-            f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
-            f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given"
-        )
-    elif is_refused(run):
-        notes.append(f"may the run be used? {answer_of(run).use} No uncertainty of it is given")
+    first, invalid = [check["title"] for check in failed][:1], join(invalidated(check["key"] for check in failed))
     corrected = conditions.size_known and conditions.correction and not is_refused(run)
     both = statement.board.temperature_sigma_k and statement.target.temperature_sigma_k
     told = {
+        f"failed checks of the run: {len(failed)}, first {join(first)}; what they found is not among the inputs: "
+        f"{invalid} do not hold before it is put right, and no uncertainty of them is given": failed,
+        f"may the run be used? {answer_of(run).use} No uncertainty of it is given": is_refused(run) and not failed,
         f"{conditions.words}; lengths of the run are in the unit of the drawing": not conditions.size_known,
         f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
         "are": unknown,
@@ -574,7 +515,6 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
         "(one_thermometer of the statement), U is too large": has_board and both and not statement.one_thermometer,
     }
     return [
-        *notes,
         *(note for note, applies in told.items() if applies),
         *_unusual(statement),
         *verified.notes(),

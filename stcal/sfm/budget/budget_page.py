@@ -1,49 +1,22 @@
 """The uncertainty budget of a run with its length tests, and its report."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
-from stcal.report.document import (
-    Answer,
-    Block,
-    Document,
-    Notes,
-    Section,
-    Table,
-    bullets,
-    page_only,
-    subheading,
-    tiles,
-)
+from stcal.report.document import Answer, Block, Document, Notes, Section, Table, bullets, page_only, subheading, tiles
 from stcal.report.text import join, number, significant, wrapped
-from stcal.sfm.budget.budget_file import (
-    BudgetFile,
-    LengthTest,
-    against_run,
-    against_stated,
-    common_views,
-    refusals,
-)
-from stcal.sfm.budget.budget_tables import (
-    as_exact,
-    contributions,
-    facts,
-    hashes,
-    inputs,
-    length_test,
-    method,
-    results,
-    what_u_is,
-)
+from stcal.sfm.budget import budget_tables as tables
+from stcal.sfm.budget.budget_file import BudgetFile, LengthTest, against_run, against_stated, common_views, refusals
 from stcal.sfm.budget.certificate import REQUIRED, certificate
 from stcal.sfm.budget.combine import FIELDS, Budget, budget_of_run, statement_of
-from stcal.sfm.runs.saved import AnyRun, saved_run, verify
+from stcal.sfm.runs.saved import AnyRun, saved_run
+from stcal.sfm.runs.transaction import verify
 
-LIMITS = 0.05
-"""Share of the variance above which a source is among those that limit a result."""
+TOGETHER = "x, y, z together"
+LIMITS = 0.05  # share of the variance above which a source is among those that limit a result
 
 
 def budget_report(file: BudgetFile) -> Document:
@@ -52,19 +25,20 @@ def budget_report(file: BudgetFile) -> Document:
     if certifies(file):
         return certificate(file)
     given = [[FIELDS.get(name, name), value] for name, value in file.fields.items() if value and name != "number"]
-    tests = [block for test in file.length_tests for block in [*length_test(test), Notes(test.notes)]]
+    tests = [block for test in file.length_tests for block in [*tables.length_test(test), Notes(test.notes)]]
+    rests = [tables.method(file), "whatever fails a check of the run is not in it", tables.hashes(file)]
     return Document(
         f"Uncertainty budget: {file.run.target}",
         _about(file),
         [
             Section("Result", _result(file), terminal=True),
             Section("Inputs", _inputs(file), terminal=True),
-            Section("Contributions", contributions(file), terminal=True),
+            Section("Contributions", tables.contributions(file), terminal=True),
             Section("Length test", tests, terminal=True),
             Section("What is measured", [bullets(file.definitions)]),
-            Section("What it rests on", [method(file), "whatever fails a check of the run is not in it", hashes(file)]),
+            Section("What it rests on", rests),
         ],
-        banner=[_answer(file), facts(given)],
+        banner=[_answer(file), tables.facts(given)],
     )
 
 
@@ -77,8 +51,7 @@ def budget_in_brief(file: BudgetFile, page: bool) -> str:
         *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
-        _no_certificate(file, brief=True)
-        or ("--report FILE.html writes a certificate of calibration" if offered else ""),
+        _no_certificate(file, brief=True) or "--report FILE.html writes a certificate of calibration" * offered,
         f"changed since the run: {join(file.run.changed)}" if file.run.changed else "",
         "" if page else f"inputs, contributions{'' if certifies(file) else ' and notes'}: -v, or --report FILE.html",
     ]
@@ -91,49 +64,44 @@ def _answer(file: BudgetFile) -> Answer:
 
 def _about(file: BudgetFile) -> str:
     groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
-    return (
-        f"{Path(file.run.folder).name}: {sum(each.images for each in file.views)} photographs in {groups}; faces "
-        f"against face {file.reference_face}, the target frame"
-    )
+    photographs = f"{sum(each.images for each in file.views)} photographs in {groups}"
+    faces = f"faces against face {file.reference_face}, the target frame"
+    return f"{Path(file.run.folder).name}: {photographs}; {faces}"
 
 
-def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
-    """Returns (value, unit, what it is) of the worst face and what limits it, the longest distance, and inputs."""
-    headline, together = [], "x, y, z together"
+def _headline(file: BudgetFile) -> Iterator[tuple[str, str, str]]:
+    """Yields (value, unit, what it is) of the worst face and what limits it, the longest distance, and inputs."""
     if file.faces:
         name, worst = max(file.faces.items(), key=lambda each: (each[1].position_um or each[1].rotation_mdeg).expanded)
-        if worst.position_um:
-            value = significant(worst.position_um.expanded)
-            headline.append((value, "µm", f"U of the position of face {name}, the worst; {together}"))
+        if position := worst.position_um:
+            yield significant(position.expanded), "µm", f"U of the position of face {name}, the worst; {TOGETHER}"
         turned, most = max(file.faces.items(), key=lambda each: each[1].rotation_mdeg.expanded)
         value = significant(most.rotation_mdeg.expanded)
-        headline.append((value, "mdeg", f"U of the rotation of face {turned}, the worst; {together}"))
-        shares = {row.title: (worst.position_um or worst.rotation_mdeg).share(row.key) for row in file.sources}
+        yield value, "mdeg", f"U of the rotation of face {turned}, the worst; {TOGETHER}"
+        shares = {row.title: (position or worst.rotation_mdeg).share(row.key) for row in file.sources}
         first, *more = sorted(shares, key=lambda title: -shares[title])
         then = "".join(f", {100 * shares[title]:.0f} % from {title}" for title in more[:2] if shares[title] > LIMITS)
-        headline.append((f"{100 * shares[first]:.0f}", "%", f"of the variance of face {name} is from {first}{then}"))
+        yield f"{100 * shares[first]:.0f}", "%", f"of the variance of face {name} is from {first}{then}"
     for each in file.distances[:1]:
-        length = as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
+        length = tables.as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
         ends = "–".join(each.circles)
-        headline.append(
-            (significant(each.distance_um.expanded), "µm", f"U of the longest distance {ends}, {length} mm")
-        )
+        yield significant(each.distance_um.expanded), "µm", f"U of the longest distance {ends}, {length} mm"
     if not file.size_known:
-        headline.append(("no", "size", "only the shape is known: no lengths and no positions in mm"))
+        yield "no", "size", "only the shape is known: no lengths and no positions in mm"
     unknown, assumed = (sum(each.origin == origin for each in file.sources) for origin in ("not stated", "assumed"))
     also = f"; {assumed} assumed" if assumed else ""
-    return [*headline, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact{also}")]
+    yield str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact{also}"
 
 
 def _result(file: BudgetFile) -> list[Block]:
     """Returns headline, notes, and the tables of results with their U."""
     tests = [("", "", f"{test.reference}: {test.verdict}") for test in file.length_tests if test.beyond is not None]
     return [
-        tiles(_headline(file) + tests),
-        what_u_is(file),
+        tiles([*_headline(file), *tests]),
+        tables.what_u_is(file),
         Notes([*filter(None, [_no_certificate(file)]), *file.notes]),
         file.holds if file.size_known else None,
-        *results(file),
+        *tables.results(file),
     ]
 
 
@@ -146,7 +114,7 @@ def _inputs(file: BudgetFile) -> list[Block]:
             "Type A: by statistics of this run; type B: by other knowledge. What is stated comes from the user's "
             "files, what is estimated from this run; what is not stated is taken as exact"
         ),
-        inputs(file, words=True),
+        tables.inputs(file, words=True),
         subheading("Stated sizes and temperatures") if stated else None,
         page_only(Table(["<of", "<key", "value", "<from"], stated)),
         subheading("Views"),
@@ -236,10 +204,8 @@ def uncertainty_budget(
         one that it belongs to.
     """
     if lengths_statement is not None and lengths is None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"--lengths-statement {lengths_statement}: it is for a second calibration; give it with --lengths",
-        )
+        fault = f"--lengths-statement {lengths_statement}: it is for a second calibration"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; give it with --lengths")
     saved = saved_run(run)
     stated = statement_of(saved.board_design.stated, statement, fields)
     budget, tests, others = budget_of_run(saved, stated), [], []
@@ -251,5 +217,5 @@ def uncertainty_budget(
         other = budget_of_run(second, statement_of(second.board_design.stated, lengths_statement or statement))
         test = against_run(budget, other, second.folder, (saved.board_design, second.board_design))
         tests.append(replace(test, notes=common_views(saved.observations, second.observations) + test.notes))
-    file = BudgetFile.of(budget, saved, verify(saved), tests, *others)
+    file = BudgetFile.of(budget, saved, verify(saved.folder), tests, *others)
     return UncertaintyBudget(budget, tuple(tests), file, tuple(refusals([saved, *others], file.length_tests)))

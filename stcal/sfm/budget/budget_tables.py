@@ -1,6 +1,6 @@
 """Tables of an uncertainty budget, which its report and its certificate share."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stcal.io.files import RUN_MARKER
@@ -28,36 +28,27 @@ DECISION_RULE = (
     "of both, E_n the error over it (ISO 13528). Decision rule: the lengths agree if the largest |E_n| is at most "
     "{test.limit:.2f}, which {count} exceed by chance in one of 22 tests"
 )
-MANY = 1e4
-"""Degrees of freedom that are as good as infinitely many."""
+MANY = 1e4  # degrees of freedom that are as good as infinitely many
 EXACT_UM = 1e-6
 """σ below which a value is exact by definition, as that of the frame's own origin is up to rounding, µm or mdeg."""
-NEGLIGIBLE = 1e-4
-"""Share of u below which a contribution has no sensitivity in the tables."""
+NEGLIGIBLE = 1e-4  # share of u below which a contribution has no sensitivity in the tables
 
 
 def method(file: BudgetFile) -> str:
-    """Returns the sentences on how the budget was computed."""
     return METHOD.format(file=file)
 
 
 def what_u_is(file: BudgetFile) -> str:
     """Returns the sentence on U and k, which are of Student's distribution where few photographs count."""
-    factors = [each.coverage_factor for each in _uncertainties(file)]
-    factors += [each.coverage_factor for each in file.circles.values()]
+    of_faces = [u for face in file.faces.values() for u in (face.position_um, face.rotation_mdeg) if u is not None]
+    others = [*(each.angle_mdeg for each in file.angles), *(each.distance_um for each in file.distances)]
+    factors = [each.coverage_factor for each in (*of_faces, *others, *file.circles.values())]
     if not factors:
         return ""
     ends = [f"{end(factors):.2f}" for end in (min, max)]
     normal = ends[1] == f"{file.coverage_factor:.2f}"
     why = "for a normal distribution" if normal else "for Student's distribution with the effective degrees of freedom"
     return WHAT_U_IS.format(k=" to ".join(dict.fromkeys(ends)), why=why) + TOGETHER
-
-
-def _uncertainties(file: BudgetFile) -> Iterator[Uncertainty]:
-    for face in file.faces.values():
-        yield from filter(None, (face.position_um, face.rotation_mdeg))
-    yield from (each.angle_mdeg for each in file.angles)
-    yield from (each.distance_um for each in file.distances)
 
 
 def results(file: BudgetFile) -> list[Block]:
@@ -76,9 +67,8 @@ def results(file: BudgetFile) -> list[Block]:
         ["–".join(each.faces), as_exact(each.angle_deg, 1e-3 * (u := each.angle_mdeg.expanded)), significant(u)]
         for each in file.angles
     ]
-    corrected = ["corrected for what is stated, mm"]
-    corrected *= any(own.corrected_mm != own.length_mm for own in file.distances)
-    lengths = []
+    is_corrected = any(own.corrected_mm != own.length_mm for own in file.distances)
+    corrected, lengths = ["corrected for what is stated, mm"] * is_corrected, []
     for own in file.distances:
         u, values = own.distance_um.expanded, (own.length_mm, own.corrected_mm)[: 1 + len(corrected)]
         lengths.append(["–".join(own.circles), *(as_exact(v, 1e-3 * u) for v in values), significant(u)])

@@ -32,61 +32,41 @@ STATED = {
     "reference_temperature_c": "reference temperature, °C",
 }
 """Words for what is stated of board and target."""
-DIRECTIONS = 200
-"""Number of directions among which that of the drawing is chosen."""
-MOST_NAMES = 40
-"""Number of points of a face up to which all are named in its drawing; of more, the outermost are."""
-SAME_PLANE_MM = 0.1
-"""Distance of a face from the middle of all within which the item is one plane."""
+DIRECTIONS = 200  # number of directions among which that of the drawing is chosen
+MOST_NAMES = 40  # number of points of a face up to which all are named in its drawing; of more, the outermost are
+SAME_PLANE_MM = 0.1  # distance of a face from the middle of all within which the item is one plane
 
 
 def certificate(file: BudgetFile) -> Document:
     """Returns the certificate of a budget for which all is stated that it needs."""
     images, groups = sum(each.images for each in file.views), len(file.views)
-    how = (
-        f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; the points of all faces and the "
-        f"poses of the camera were adjusted together (bundle adjustment by stcal {file.run.version}, uncertainties by "
-        f"stcal {file.version})"
-    )
+    given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
+    head = [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
+    bodies = dict.fromkeys(row.body for row in file.stated)
+    values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
+    by_words = {words: [values.get((body, key), NONE) for body in bodies] for key, words in STATED.items()}
+    rows = [[words, *row] for words, row in by_words.items() if set(row) - {NONE}]
+    stated = Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
+    found = file.run.photographs_sha256
+    kept = f"{len(found)} of {images} photographs, as they were in their folder when this certificate was made"
+    photographs = Table(["<photograph", "<SHA-256"], list(found.items()), css="text")
+    programs = f"bundle adjustment by stcal {file.run.version}, uncertainties by stcal {file.version}"
+    adjusted = f"the points of all faces and the poses of the camera were adjusted together ({programs})"
+    how = f"{images} photographs of the item in {groups} group{'s' * (groups != 1)}; {adjusted}"
     tests = [block for test in file.length_tests for block in length_test(test)]
     return Document(
         f"Certificate of calibration no. {file.fields['number'].strip()}",
         file.fields["laboratory"].strip(),
         [
-            Section("Method and conditions", [file.fields["method"], how, _conditions(file), file.holds]),
+            Section("Method and conditions", [file.fields["method"], how, stated, file.holds]),
             Section("What is measured", [drawings(file), bullets(file.definitions), what_u_is(file)]),
             Section("Results", [*results(file), "End of the results; the annex follows"], terminal=True),
             Section("Annex: test of lengths", tests, terminal=True),
             Section("Annex: uncertainty budget", [method(file), inputs(file), *contributions(file)], terminal=True),
-            Section("Annex: data", [hashes(file), *photographs(file), "End of the certificate"]),
+            Section("Annex: data", [hashes(file), kept, photographs, "End of the certificate"]),
         ],
-        banner=[facts(_head(file)), RELATES],
+        banner=[facts(head), RELATES],
     )
-
-
-def _head(file: BudgetFile) -> list[list[str]]:
-    """Returns the fields that are given, in the order of :data:`FIELDS`, then others."""
-    given = {"item": file.run.target} | {name: value.strip() for name, value in file.fields.items() if value.strip()}
-    return [[FIELDS.get(name, name), given[name]] for name in dict.fromkeys((*FIELDS, *given)) if name in given]
-
-
-def _conditions(file: BudgetFile) -> Table:
-    """Returns what is stated of the bodies, a column for each."""
-    bodies = dict.fromkeys(row.body for row in file.stated)
-    values = {(row.body, row.key): f"{row.value:g}" for row in file.stated}
-    rows = [
-        [words, *(values.get((body, key), NONE) for body in bodies)]
-        for key, words in STATED.items()
-        if any((body, key) in values for body in bodies)
-    ]
-    return Table(["<stated", *({"target": "item"}.get(body, body) for body in bodies)], rows)
-
-
-def photographs(file: BudgetFile) -> list[Block]:
-    """Returns the photographs with their hashes."""
-    found, every = file.run.photographs_sha256, sum(each.images for each in file.views)
-    said = f"{len(found)} of {every} photographs, as they were in their folder when this certificate was made"
-    return [said, Table(["<photograph", "<SHA-256"], list(found.items()), css="text")]
 
 
 def drawings(file: BudgetFile) -> Block:
@@ -95,7 +75,7 @@ def drawings(file: BudgetFile) -> Block:
     for label, each in file.circles.items():
         face, _, circle = label.partition(":")
         circles.setdefault(face, {})[circle] = np.array(each.position_mm)
-    poses = {file.reference_face: Rigid(np.eye(3), np.zeros(3))} | {
+    poses = {file.reference_face: Rigid()} | {
         name: Rigid(Rotation.from_rotvec(each.rotation_vector_deg, degrees=True), each.position_mm)
         for name, each in file.faces.items()
         if each.position_mm is not None

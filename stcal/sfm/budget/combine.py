@@ -4,11 +4,12 @@ uncertainties of faces and of the target's largest distances."""
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date, time
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, product
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.random import Generator
 from pydantic import BeforeValidator, Field
 from scipy.linalg import null_space
 from scipy.special import ndtr, stdtrit
@@ -21,23 +22,12 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.toml import Strict, load_toml
 from stcal.labels import CircleLabel
+from stcal.sfm.adjust import uncertainty
 from stcal.sfm.adjust.calibration import FLATNESS_MM, rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import (
-    BOARD,
-    CIRCLES,
-    DISTANCES,
-    DOTS,
-    FLATNESS,
-    INTRINSICS,
-    PRINT,
-    SIZES,
-    Contributions,
-    Derivatives,
-    contributions_of,
-    derivatives,
-)
-from stcal.sfm.data.group_model import MetricModel
+from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
+from stcal.sfm.data.group_model import MetricModel, rows_by
+from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
 FIELDS = {
@@ -61,8 +51,7 @@ FIELDS = {
 }
 """Fields of the head of a budget with their words, in the order of a certificate; empty if they are not given."""
 LONGEST_TEXT = 500
-DEFAULT = "; the default, which `design` writes too: measure it and state it"
-"""Words for a σ that nobody has changed."""
+DEFAULT = "; the default, which `design` writes too: measure it and state it"  # words for a σ that nobody has changed
 
 
 Text = Annotated[
@@ -84,8 +73,6 @@ class StatementFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What the user states."""
-
     board: StatedSize
     target: StatedSize
     origin: dict[tuple[str, str], str]  # the file that states a value, by ``board`` or ``target`` and key
@@ -104,11 +91,8 @@ def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping
         origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
     for name, value in (given or {}).items():
         if not name or len(name) > 60 or len(value) > LONGEST_TEXT:
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST_TEXT} for a "
-                "value",
-            )
+            fault = f"--field {name[:20]}: {len(f'{name}={value}')} characters"
+            raise InputError("E-OPTION-VALUE", f"{fault}; up to 60 for a name, {LONGEST_TEXT} for a value")
     named = file.fields | dict(given or {})
     named |= {name: "" for name in FIELDS if name not in named}
     return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
@@ -129,8 +113,7 @@ def fields_of(given: Sequence[str]) -> dict[str, str]:
 
 Origin = Literal["estimated", "stated", "assumed", "not stated", "not known"]
 PPM = 1e-6
-REFERENCE_C = 20.0
-"""Reference temperature of ISO 1:2022, used unless another one is stated."""
+REFERENCE_C = 20.0  # reference temperature of ISO 1:2022, used unless another one is stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,9 +143,11 @@ def sources_of(
     camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[BudgetSource, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
-    adjusted = _of_adjustment(contributions, board, flatness_mm)
-    intrinsics = _intrinsics(contributions, camera, refined, camera_given)
-    return (*adjusted, intrinsics, *(_of_statement(contributions, statement) if board.rows else ()))
+    return (
+        *_of_adjustment(contributions, board, flatness_mm),
+        _intrinsics(contributions, camera, refined, camera_given),
+        *(_of_statement(contributions, statement) if board.rows else ()),
+    )
 
 
 def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float | None) -> Iterator[BudgetSource]:
@@ -179,48 +164,48 @@ def _of_adjustment(found: Contributions, board: BoardDesign, flatness_mm: float 
         return ("assumed", words + DEFAULT) if default else ("stated", words)
 
     title = "corners and centres of faces" if faces else "centres of circles"
-    yield row("circle_centres", title, CIRCLES, stated, sigma_px[CIRCLES], "px")
+    yield row("circle_centres", title, uncertainty.CIRCLES, stated, sigma_px[uncertainty.CIRCLES], "px")
     if board.rows:
-        yield row("dot_centres", "centres of dots", DOTS, stated, sigma_px[DOTS], "px")
+        yield row("dot_centres", "centres of dots", uncertainty.DOTS, stated, sigma_px[uncertainty.DOTS], "px")
         common = f"{100 * joint.board_common:.0f} % of it common to all groups"
         words = f"sigma_mm of board.toml × σ₀ {factor:.3f}; {common if joint.board_common else 'each group its own'}"
         stated = or_default(words, board.sigma_mm == DOTS_SIGMA_MM)
-        yield row("board_dots", "places of dots", BOARD, stated, 1e3 * board.sigma_mm * factor)
+        yield row("board_dots", "places of dots", uncertainty.BOARD, stated, 1e3 * board.sigma_mm * factor)
     if faces:
         own, within = joint.print_factor * factor, max(face.sigma_mm or 0.0 for face in faces)
         words = f"sigma_mm of target.toml × {own:.2f}, in the plane; off it --flatness"
-        yield row("print", "print of faces", PRINT, or_default(words, within == TAG_SIGMA_MM), 1e3 * within * own)
+        stated = or_default(words, within == TAG_SIGMA_MM)
+        yield row("print", "print of faces", uncertainty.PRINT, stated, 1e3 * within * own)
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, edges = largest.size_sigma, "a common displacement of the edges of all tags"
         stated = "assumed" if sigma else "not stated", f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
         if sigma > 0 and largest.edge_share < 1:
             stated = "stated", "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
-        yield row("print_size", "size of print", SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
+        yield row("print_size", "size of print", uncertainty.SIZES, stated, 1e6 * sigma if sigma else None, "ppm")
     if known and known[0].drawn:
         stated = "not known", "nothing of known size was in view: only the shape is known"
-        yield row("distances", "size", DISTANCES, stated, None)
+        yield row("distances", "size", uncertainty.DISTANCES, stated, None)
     elif known:
         stated = "stated", f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
         largest_mm = max(each.sigma_mm for each in known)
-        yield row("distances", "known distances", DISTANCES, stated, 1e3 * largest_mm * factor)
-    if not faces or found.covariance_mm2[FLATNESS].any():
+        yield row("distances", "known distances", uncertainty.DISTANCES, stated, 1e3 * largest_mm * factor)
+    if not faces or found.covariance_mm2[uncertainty.FLATNESS].any():
         words, sigma_um = f"--flatness of the run × σ₀ {factor:.3f}", None
         stated = "not stated", "--flatness off: faces need not be flat"
         if flatness_mm is not None:
             is_default, sigma_um = flatness_mm == FLATNESS_MM, 1e3 * flatness_mm * factor
             stated = ("assumed", f"the default of {words}") if is_default else ("stated", words)
-        yield row("flatness", "flatness of faces", FLATNESS, stated, sigma_um)
+        yield row("flatness", "flatness of faces", uncertainty.FLATNESS, stated, sigma_um)
 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> BudgetSource:
-    covariance = contributions.covariance_mm2[INTRINSICS]
+    covariance = contributions.covariance_mm2[uncertainty.INTRINSICS]
     if not camera_given:
         words = "found from these photographs, without a camera file; adjusted with all else"
         return BudgetSource("intrinsics", "intrinsics", "A", "estimated", words, None, "", covariance)
     origin: Origin = "stated" if camera.covariance is not None else "assumed" if refined else "not stated"
     if refined:
-        known = "the camera file" if origin == "stated" else "a calibration of some age"
-        words = f"adjusted; σ before that of {known}"
+        words = f"adjusted; σ before that of {'the camera file' if origin == 'stated' else 'a calibration of some age'}"
     else:
         words = "fixed; σ of the camera file" if origin == "stated" else "fixed; no σ in the camera file"
         effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
@@ -248,9 +233,8 @@ def _of_statement(found: Contributions, statement: Statement) -> Iterator[Budget
         ("board", statement.board, found.by_scale),
         ("target", statement.target, -(grown - grown.mean(0)).ravel()),
     ):
-        together.append(
-            (body, stated, (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size)
-        )
+        warmed = (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * by_size
+        together.append((body, stated, warmed))
         for key, name, needed, factor, unit in (
             ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
             ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer_k(stated), "ppm/K"),
@@ -310,10 +294,9 @@ def conditions_of(statement: Statement, board: BoardDesign) -> StatedConditions:
     there = "the temperature" if photographed is None else f"{photographed:g} °C,"
     why = ": expansion and temperature of the target are not both stated"
     if of_board is None:
-        why = (
-            ", as far as the board's grid had the size of its file there: expansion and temperature of the board are "
-            "not both stated, and without them the target's are not corrected for"
-        )
+        unstated = "expansion and temperature of the board are not both stated"
+        uncorrected = "without them the target's are not corrected for"
+        why = f", as far as the board's grid had the size of its file there: {unstated}, and {uncorrected}"
     words = f"{holds} {there} at which the target was photographed{corrected}{why}"
     return StatedConditions(True, total, photographed, words)
 
@@ -328,14 +311,11 @@ def _growth(stated: StatedSize) -> float | None:
     return stated.expansion_ppm_per_k * PPM * warmer
 
 
-COVERAGE_FACTOR = 2.0
-"""Coverage factor k for infinitely many degrees of freedom."""
+COVERAGE_FACTOR = 2.0  # coverage factor k for infinitely many degrees of freedom
 BY_CHANCE = 2 * float(ndtr(-COVERAGE_FACTOR))
 """Probability that an error is beyond U by chance, and that any length of a test is beyond the limit."""
-LONGEST_DISTANCES = 5
-"""Number of distances in a budget."""
-DRAWS = 100_000
-"""Number of random draws for the coverage (JCGM 101:2008)."""
+LONGEST_DISTANCES = 5  # number of distances in a budget
+DRAWS = 100_000  # number of random draws for the coverage (JCGM 101:2008)
 Kind = Literal["position", "rotation", "angle", "distance"]
 PARALLEL = 1e-3
 """Sine of an angle between two axes below which both directions across them count, as none of them leads its change."""
@@ -430,73 +410,59 @@ class Budget:
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     """Returns the budget of a run that was solved jointly; without a statement, with what ``board.toml`` states."""
     if run.faces.solve != "joint" or not run.faces.eccentricity:
-        raise InputError(
-            "E-BUDGET-NO-COVARIANCE",
-            f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
-        )
-    adjusted, board, options = adjusted_run(run), run.board_design, run.options
-    found = contributions_of(adjusted.state)
-    own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
-    stated = statement or statement_of(board.stated)
+        fault = f"run {run.folder}: solved by {run.faces.solve}, which states no covariance"
+        raise InputError("E-BUDGET-NO-COVARIANCE", f"{fault}; run again with --solve joint")
+    (state, start), board, options = adjusted_run(run), run.board_design, run.options
+    found = contributions_of(state)
+    own = derivatives(found.joint, start, run.target_design, run.faces.frame)
+    stated, camera_given = statement or statement_of(board.stated), run.report["summary"].get("camera_given", True)
+    sources = sources_of(found, run.camera, board, options.flatness_mm, options.refine_camera, stated, camera_given)
     heights, sigma_mm = run.rims_mm()
-    rims: tuple[BudgetSource, ...] = ()
     if heights:
         row = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
         covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
-        rims = (BudgetSource("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance),)
-    reference, camera_given = run.faces.reference_face, run.report["summary"].get("camera_given", True)
-    return budget(
-        found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
-    )
+        rims = BudgetSource("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance)
+        sources = (*sources, rims)
+    return budget(found.joint, own, sources, board, stated, run.faces.reference_face)
 
 
 def budget(
-    found: Contributions,
+    joint: JointResult,
     own: Derivatives,
-    camera: Camera,
-    board,
-    flatness_mm: float | None,
-    refined: bool,
+    sources: tuple[BudgetSource, ...],
+    board: BoardDesign,
     statement: Statement,
     reference_face: str,
-    more: tuple[BudgetSource, ...] = (),
-    camera_given: bool = True,
 ) -> Budget:
-    """Returns the budget of an adjustment, as :func:`sources_of`; ``more``: further rows."""
-    sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
+    """Returns the budget of an adjustment by its sources."""
     if own.circles_designed.shape[2]:
         words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
         size, sigma_um = own.circles.shape[-1], 1e3 * own.designed_sigma_mm
         none = np.zeros((size, size))  # it moves faces, not circles
         sources += (BudgetSource(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
-    rng, joint = np.random.default_rng(0), found.joint
+    rng = np.random.default_rng(0)
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
-    rows = [
-        _row(measurand, sources, own.designed_sigma_mm, freedom, rng)
-        for measurand in measurands(found.joint, own, reference_face)
-    ]
-    views = tuple(_view(model) for model in found.joint.models)
+    every = measurands(joint, own, reference_face)
+    rows = tuple(_row(measurand, sources, own.designed_sigma_mm, freedom, rng) for measurand in every)
+    views = tuple(_view(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
         for kinds in ("AB", "A")
     )
-    variances = [
-        (float(np.trace(whole)), float(np.trace(part))) for whole, part in zip(circles, estimated, strict=True)
-    ]
-    freedoms = np.array([effective_freedom(*each, freedom) for each in variances])
+    traces = (np.trace(covariances, axis1=1, axis2=2).tolist() for covariances in (circles, estimated))
+    freedoms = np.array([effective_freedom(*variances, freedom) for variances in zip(*traces, strict=True)])
     conditions = conditions_of(statement, board)
-    return Budget(joint, reference_face, sources, tuple(rows), circles, freedoms, freedom, views, statement, conditions)
+    return Budget(joint, reference_face, sources, rows, circles, freedoms, freedom, views, statement, conditions)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
     """Returns positions and rotations of all faces except the reference face, angles, and the longest distances."""
     other_faces = [face for face in own.target_from_face if face != reference_face]
-    kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
+    rows_of: dict[Kind, slice] = {"position": slice(3, 6), "rotation": slice(0, 3)}
     poses = [
         Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
-        for kind, rows in kinds
-        for face in other_faces
+        for (kind, rows), face in product(rows_of.items(), other_faces)
     ]
     angles = [_angle(own, a, b) for a, b in combinations(own.target_from_face, 2)]
     longest = longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]
@@ -514,12 +480,10 @@ def _angle(own: Derivatives, a: str, b: str) -> Measurand:
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
     """Returns, for every two faces and within each, the two circles farthest apart, the longest distance first."""
-    faces: dict[str, list[int]] = {}
-    for i, label in enumerate(labels):
-        faces.setdefault(label.face, []).append(i)
+    faces = {face: rows.tolist() for face, rows in rows_by(label.face for label in labels).items()}
     pairs = []
     for a, b in combinations_with_replacement(faces, 2):
-        ends = combinations(faces[a], 2) if a == b else ((i, j) for i in faces[a] for j in faces[b])
+        ends = combinations(faces[a], 2) if a == b else product(faces[a], faces[b])
         pairs += sorted(ends, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:1]
     return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))
 
@@ -528,21 +492,15 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     """Returns the measurand of the distance between two circles."""
     difference = joint.xyz_model[j] - joint.xyz_model[i]
     length = float(np.linalg.norm(difference))
-    jacobian = np.zeros((1, joint.xyz_model.size))
-    jacobian[0, 3 * j : 3 * j + 3] = difference / length
-    jacobian[0, 3 * i : 3 * i + 3] = -difference / length
+    jacobian = np.zeros(joint.xyz_model.shape)
+    jacobian[j], jacobian[i] = difference / length, -difference / length
     ends = joint.labels[i], joint.labels[j]
-    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian, np.zeros((1, 0)))
+    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian.reshape(1, -1), np.zeros((1, 0)))
 
 
-def _row(
-    measurand: Measurand,
-    sources: Sequence[BudgetSource],
-    designed_sigma_mm: float,
-    freedom: int,
-    rng: np.random.Generator,
-) -> Row:
-    covariances = {source.key: measurand.covariance(source, designed_sigma_mm) for source in sources}
+def _row(measurand: Measurand, sources: Sequence[BudgetSource], sigma_mm: float, freedom: int, rng: Generator) -> Row:
+    """Returns the uncertainty of a measurand; ``sigma_mm`` : of circles that were not mapped."""
+    covariances = {source.key: measurand.covariance(source, sigma_mm) for source in sources}
     covariance = np.sum(list(covariances.values()), axis=0)
     variance = float(np.trace(covariance))
     estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
@@ -552,18 +510,11 @@ def _row(
     errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     # The estimated variance scatters about the true one.
     drawn = np.sqrt(rng.chisquare(effective, DRAWS) / effective) if np.isfinite(effective) else 1.0
-    return Row(
-        measurand,
-        {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()},
-        covariance,
-        standard,
-        expanded,
-        float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean()),
-        effective,
-    )
+    coverage = float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean())
+    contributions = {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()}
+    return Row(measurand, contributions, covariance, standard, expanded, coverage, effective)
 
 
 def _view(model: MetricModel) -> GroupViews:
-    axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
-    spread = np.arccos(np.clip((axes @ axes.T).min(), -1, 1))
-    return GroupViews(model.group, len(model.images), float(np.degrees(spread)))
+    spread_rad = widest_angle_rad(np.array([pose.rotation[2] for pose in model.camera_from_model]))
+    return GroupViews(model.group, len(model.images), float(np.degrees(spread_rad)))

@@ -22,14 +22,8 @@ from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
 K = TypeVar("K")
-ROW_SHAPES = {
-    "centre_px": (2,),
-    "centre": (2,),
-    "shape": (2, 2),
-    "covariance_px2": (2, 2),
-    "uneven_px": (2,),
-    "domes": (3,),
-}
+ROW_SHAPES: dict[str, tuple[int, ...]] = dict.fromkeys(("centre_px", "centre", "uneven_px"), (2,))
+ROW_SHAPES |= {"shape": (2, 2), "covariance_px2": (2, 2), "domes": (3,)}
 """Shape of a circle's value in each field of measured circles that is not one number."""
 
 
@@ -109,13 +103,11 @@ def rows_by(keys: Iterable[K]) -> dict[K, np.ndarray]:
 
 
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
-    """Returns the observations by group, in order."""
     groups = rows_by(image.group for image in observations)
     return {group: [observations[i] for i in rows] for group, rows in groups.items()}
 
 
 def detections_csv(observations: list[ImageObservations]) -> str:
-    """Returns the text of ``detections.csv``."""
     rows: list[Sequence] = [["image", "label", "x_px", "y_px", "sigma_px"]]
     for image in observations:
         for label, (x, y), sigma in zip(image.labels, image.centre_px, image.sigma_px(), strict=True):
@@ -219,7 +211,7 @@ class GroupModel(Measured):
     def keypoints_px(self, image: ImageObservations, rows: np.ndarray) -> np.ndarray:
         """Returns all keypoints of one image, (k, 2): corrected if in the model (``rows``), else measured."""
         xy = image.centre_px.copy()
-        xy[self.keypoint[rows]] = self.measured_px[rows] - self.shift_px[rows]
+        xy[self.keypoint[rows]] = self.corrected_px()[rows]
         return xy
 
     def xyz_camera(self) -> np.ndarray:
@@ -332,9 +324,8 @@ def assemble(
     """Returns the model of placed images and labelled points, with all observations of these points in these images."""
     labels = sorted(xyz)
     index = {label: i for i, label in enumerate(labels)}
-    rows = [
-        (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
-    ]
+    every = ((i, label, k) for i, image in enumerate(images) for k, label in enumerate(image.labels))
+    rows = [(i, index[label], k) for i, label, k in every if label in index]
     image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
     row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
     return kind(
@@ -360,11 +351,8 @@ BEGINNINGS = {NOT_AS_DRAWN: "not as drawn: ", GROUP_LEFT_OUT: "left out whole: "
 
 
 class Note(str):
-    """The sentence of a remark.
-
-    ``code`` : kind of remark; ``place`` : name of the face or group that it is about; ``words`` and ``remedy`` : the
-    sentence in two parts, what was found and what to do
-    """
+    """The sentence of a remark. ``code`` : kind of remark; ``place`` : name of the face or group that it is about;
+    ``words`` and ``remedy`` : the sentence in two parts, what was found and what to do."""
 
     code: str
     place: str
@@ -416,8 +404,7 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
         what = f"faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has them"
         sizes = "check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
         notes.append(Note(what, NOT_AS_DRAWN, remedy=sizes, then=": "))
-    turned = turned_faces(found, rough)
-    if not turned:
+    if not (turned := turned_faces(found, rough)):
         return notes
     what = ", ".join(f"face {face} is turned by {angle:.0f}°" for face, angle in turned.items())
     what += " against rough_pose in target.toml"
@@ -433,12 +420,11 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
 def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
     """Returns the faces that are turned against most others, with their angles, degrees."""
     off = {face: found[face].rotation @ rough[face].rotation.T for face in rough}
-    angles = {
-        anchor: {face: float(np.degrees(Rigid(own.T @ other).angle_rad())) for face, other in off.items()}
-        for anchor, own in off.items()
-    }
-    anchor = max(angles, key=lambda face: sum(angle <= MOST_TURNED_DEG for angle in angles[face].values()))
-    return {face: angle for face, angle in angles[anchor].items() if angle > MOST_TURNED_DEG}
+    turned = []  # by each face in turn taken for the anchor
+    for anchor in off.values():
+        angles = {face: float(np.degrees(Rigid(anchor.T @ other).angle_rad())) for face, other in off.items()}
+        turned.append({face: angle for face, angle in angles.items() if angle > MOST_TURNED_DEG})
+    return min(turned, key=len)
 
 
 def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[Note]:

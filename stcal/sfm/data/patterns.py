@@ -56,13 +56,10 @@ def pattern_of_board(board: BoardDesign) -> dict[str, Pattern]:
 
 
 def in_view(
-    pattern: Pattern,
-    camera_from_plane: Rigid,
-    camera: Camera,
-    border: np.ndarray,  # of :func:`ideal_border`; beyond it a lens model may fold back
-    max_tilt_rad: float = MAX_TILT_RAD,
+    pattern: Pattern, camera_from_plane: Rigid, camera: Camera, border: np.ndarray, max_tilt_rad: float
 ) -> np.ndarray:
-    """Returns the mask of the circles that face the camera and lie in the image with their whole rim."""
+    """Returns the mask of the circles that face the camera and lie in the image with their whole rim; ``border`` : of
+    :func:`ideal_border`, beyond which a lens model may fold back."""
     axes = camera_from_plane.rotation
     xyz = camera_from_plane @ pattern.xyz_mm()
     cosine = -pattern.side * (xyz @ axes[:, 2]) / np.linalg.norm(xyz, axis=1)

@@ -10,8 +10,9 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,11 +37,9 @@ from stcal.sfm.runs.comparisons import (
     CameraRow,
     Crosscheck,
     FaceDifference,
-    FacesCompared,
     ImagesRegistered,
-    MappingCompared,
     ResidualRms,
-    ResultCompared,
+    ResultsCompared,
     Tolerances,
     allowed_text,
 )
@@ -58,8 +57,6 @@ MAX_OUTPUT = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class NativeColmap:
-    """A native COLMAP program."""
-
     program: Path
     version: str  # as the program states it, like ``3.8``
     mapper_options: frozenset[str]  # names
@@ -67,13 +64,11 @@ class NativeColmap:
 
 def find_colmap(path: str | Path | None = None) -> NativeColmap:
     """Returns the program at ``path``, or the one on the PATH."""
-    executable = shutil.which("colmap" if path is None else str(path))
-    if executable is None:
+    if (executable := shutil.which("colmap" if path is None else str(path))) is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
         raise _unfit(f"no program {where}; {INSTALL}, or give its path with --colmap")
     program = Path(executable)
-    version = re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", _answer(program, "help"))
-    if version is None:
+    if (version := re.search(r"COLMAP\s+v?(\d+\.\d+(?:\.\d+)?)", _answer(program, "help"))) is None:
         raise _unfit(f"{program} does not say a COLMAP version; {INSTALL}, or give another --colmap")
     options = re.findall(r"--([\w.]+)", _answer(program, "mapper", "-h"))
     return NativeColmap(program, version[1], frozenset(options))
@@ -100,10 +95,8 @@ def map_natively(
     code, output = _run(command, timeout_s, TMPDIR=str(folder))  # COLMAP writes its logs there
     program = f"native COLMAP: `{native.program} mapper`"
     if code is None:
-        raise MappingError(
-            "E-COLMAP-TIMEOUT",
-            f"{program} is still running after {timeout_s:g} s; raise --timeout, or check the program",
-        )
+        fault = f"{program} is still running after {timeout_s:g} s"
+        raise MappingError("E-COLMAP-TIMEOUT", f"{fault}; raise --timeout, or check the program")
     if code != 0:
         raise MappingError("E-COLMAP-FAILED", f"{program} {_end(code, output)}; check the program")
 
@@ -125,15 +118,10 @@ def _end(code: int, output: str) -> str:
 def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
     """Exit code of a command, None after the time limit, and its last output; no child process outlives it."""
     with tempfile.TemporaryFile() as output:  # no pipe, which a child of its own session may hold open
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
+        variables = os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment
         try:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"QT_QPA_PLATFORM": "offscreen"} | environment,
-                start_new_session=True,
-            )
+            process = subprocess.Popen(command, **streams, env=variables, start_new_session=True)
         except OSError as error:
             raise _unfit(f"{command[0]} cannot be started ({error.strerror}); {INSTALL}") from error
         try:
@@ -152,10 +140,8 @@ Chained = Literal["chain", "paper"]
 
 
 def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
-    options = replace(run.options, solve=solve, refine_camera=False)
-    if solve == "paper":
-        options = replace(options, frame="three-point", eccentricity=False)
-    return options.adjustment(run.target_design)
+    published: dict[str, Any] = {"frame": "three-point", "eccentricity": False} if solve == "paper" else {}
+    return replace(run.options, solve=solve, refine_camera=False, **published).adjustment(run.target_design)
 
 
 def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
@@ -164,18 +150,14 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     notes = []
     for source in read:
         if not source.camera.same_as(read[0].camera):
-            raise InputError(
-                "E-MODEL-CAMERAS",
-                f"models {read[0].path}, {source.path}: different cameras; keep the intrinsics fixed in the mapper, "
-                "or give one model at a time",
-            )
+            fault = f"models {read[0].path}, {source.path}: different cameras"
+            remedy = "keep the intrinsics fixed in the mapper, or give one model at a time"
+            raise InputError("E-MODEL-CAMERAS", f"{fault}; {remedy}")
         if not source.camera.same_as(run.camera):
             ideal = np.concatenate([image.centre for image in run.observations])
             off_px = np.abs(source.camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max()
-            notes.append(
-                f"model {source.path}: its camera is up to {off_px:.2g} px off the run's at the keypoints; the model's "
-                "is used"
-            )
+            off = f"its camera is up to {off_px:.2g} px off the run's at the keypoints"
+            notes.append(f"model {source.path}: {off}; the model's is used")
         counts = {
             "points left out, since their keypoints name no one circle": source.unlabelled,
             "circles that are several points each, longest tracks taken": source.split,
@@ -292,25 +274,23 @@ def crosscheck(
         The native program fails or hangs, or makes no model of a group, or one of another database.
     """
     saved = saved_run(run)
+    compared = partial(_compared, saved, colmap, tolerances, timeout_s, progress or (lambda *_: None))
     if not into_report:
-        return _compared(saved, colmap, tolerances, timeout_s, progress)
+        return compared()
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
-            raise InputError(
-                "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
-            )
-        check = _compared(saved, colmap, tolerances, timeout_s, progress)
-        write_report(
-            stage, with_judgement(saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}), saved.folder
-        )
+            fault = f"run {saved.folder}: its results were replaced meanwhile"
+            raise InputError("E-RUN-REPLACED", f"{fault}; cross-check it again")
+        check = compared()
+        report = saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}
+        write_report(stage, with_judgement(report), saved.folder)
     return check
 
 
 def _compared(
-    run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None
+    run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress
 ) -> Crosscheck:
-    progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
@@ -325,11 +305,9 @@ def _compared(
             first, second = (next(i for i in group if i.name == chosen[which]) for which in ("first", "second"))
             pair, shared = (ids[first.name], ids[second.name]), len(set(first.labels) & set(second.labels))
             if shared < MIN_INLIERS:  # few tags have few corners
-                raise MappingError(
-                    "E-CROSSCHECK-FEW",
-                    f"group {name}: {first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to "
-                    "begin with; COLMAP cannot map it, check the run with the checks of its report",
-                )
+                fault = f"{first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to begin with"
+                remedy = "COLMAP cannot map it, check the run with the checks of its report"
+                raise MappingError("E-CROSSCHECK-FEW", f"group {name}: {fault}; {remedy}")
             map_natively(native, folder / "native.db", work, names, mapper_options(native, names, pair), timeout_s)
             path, model = _native_model(work / "models", name, native, run, ids)
             native_models.append(model)
@@ -344,13 +322,8 @@ def _compared(
     if heights:
         again = on_luminous_surface(again, heights, rim_sigma_mm, run.target_design, options.frame)
     native_images, own_images = ({name for m in of.models for name in m.images} for of in (of_native, of_pycolmap))
-    images = ImagesRegistered(
-        native=len(native_images),
-        pycolmap=len(own_images),
-        run=len(run.observations),
-        only_native=sorted(native_images - own_images),
-        only_pycolmap=sorted(own_images - native_images),
-    )
+    only = {"only_native": sorted(native_images - own_images), "only_pycolmap": sorted(own_images - native_images)}
+    images = ImagesRegistered(native=len(native_images), pycolmap=len(own_images), run=len(run.observations), **only)
     ours = of_pycolmap.target
     between = _targets(of_native.target, ours.target_from_face, ours.circles, run)
     mapping = between.model_copy(update={"cameras": _cameras(of_native, of_pycolmap, run)})
@@ -370,7 +343,7 @@ def _compared(
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
         mapping=mapping,
         result=result,
-        plain=FacesCompared(faces=face_differences(of_native.target, run)),
+        plain=ResultsCompared(faces=face_differences(of_native.target, run)),
         notes=list(of_native.notes),
         differences=_differences(images, mapping, result, tolerances),
     )
@@ -398,11 +371,9 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     try:
         models = find_models(folder)
     except InputError as error:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; the pair may "
-            "share too few labels, or be too near to each other; add images from further apart",
-        ) from error
+        fault = f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair"
+        why = "the pair may share too few labels, or be too near to each other"
+        raise MappingError("E-COLMAP-NO-MODEL", f"{fault}; {why}; add images from further apart") from error
     try:
         path = max(models, key=lambda model: open_model(model).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
@@ -414,11 +385,9 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
 def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
-        raise MappingError(
-            "E-COLMAP-NO-MODEL",
-            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run used its own relative "
-            "pose); a cross-check is not possible",
-        )
+        fault = f"group {group}: pycolmap makes no model from the run's initial pair alone"
+        own = "the run used its own relative pose"
+        raise MappingError("E-COLMAP-NO-MODEL", f"{fault} ({own}); a cross-check is not possible")
     written = place / "own-model"
     written.mkdir()
     write_reconstruction(reconstruction, written)
@@ -431,33 +400,27 @@ def _off(difference: np.ndarray) -> tuple[float, float]:
     return MICRO * shift, MICRO * turn
 
 
-def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> MappingCompared:
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultsCompared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    return MappingCompared(
-        faces=face_differences(target, run, faces),
-        circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
-        circles_sigmas={
-            label: _sigmas(v, np.asarray(covariances[label]), FACE_FLOOR[3:])
-            for label, v in off.items()
-            if label in covariances
-        },
-    )
+    um = {label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()}
+    known = {label: v for label, v in off.items() if label in covariances}
+    sigmas = {label: _sigmas(v, covariances[label], FACE_FLOOR[3:]) for label, v in known.items()}
+    return ResultsCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
 
 
 def face_differences(
     target: CalibratedTarget, run: SavedRun, faces: dict[str, Rigid] | None = None
 ) -> dict[str, FaceDifference | None]:
     """Returns the differences of a target's faces from ``faces``, or the run's; None of a face that only one has."""
-    a, b, covariance = target.target_from_face, faces, run.faces.target_from_face_covariance
-    b = run.faces.poses() if b is None else b
+    a, b = target.target_from_face, run.faces.poses() if faces is None else faces
+    covariance = run.faces.target_from_face_covariance
     rows: dict[str, FaceDifference | None] = dict.fromkeys(sorted(a.keys() | b.keys()))
     for face in a.keys() & b.keys():
         difference = a[face].difference(b[face])
-        (um, mdeg), sigmas = _off(difference), None
-        if face in covariance:
-            sigmas = _sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR)
+        um, mdeg = _off(difference)
+        sigmas = _sigmas(difference, covariance[face], FACE_FLOOR) if face in covariance else None
         rows[face] = FaceDifference(translation_um=um, rotation_mdeg=mdeg, sigmas=sigmas)
     return rows
 
@@ -474,8 +437,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
     model_of_group = {model.group: model for model in b.models}
     rows = []
     for theirs in a.models:
-        model = model_of_group.get(theirs.group)
-        if model is None:
+        if (model := model_of_group.get(theirs.group)) is None:
             continue
         common = sorted(set(theirs.labels) & set(model.labels), key=model.labels.index)
         own, other = (m.xyz_model[[m.labels.index(label) for label in common]] for m in (model, theirs))
@@ -485,46 +447,42 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
         aligned = theirs.in_world(alignment).camera_from_model
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
-            if name not in poses:
-                continue
-            um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
-            sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
-            rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
+            if name in poses:
+                um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
+                sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
+                rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
     return sorted(rows, key=lambda row: row.image)
 
 
 def comparison_text(check: Crosscheck) -> str:
-    """Returns the comparison as a text table."""
-    residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
+    residual, images, mapping = check.residual_rms_px, check.images, check.mapping
     rows = [["face", *("µm", "mdeg", "σ") * 3]]
-    for face in check.mapping.faces:
-        cells = [face]
-        for compared in (check.mapping, check.result, check.plain):
+    for face in mapping.faces:
+        rows.append([face])
+        for compared in (mapping, check.result, check.plain):
             row = compared.faces.get(face)
             values = (row.translation_um, row.rotation_mdeg, row.sigmas) if row else (None, None, None)
-            cells += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
-        rows.append(cells)
+            rows[-1] += [number(value, digits) for value, digits in zip(values, (3, 3, 2), strict=True)]
     width = max(6, *(len(row[0]) for row in rows))
-    circles = check.mapping.circles_um
+    of_native = f"{images.native} of {images.run} images, residual {residual.native:.4f} px RMS"
+    of_pycolmap = f"{images.pycolmap} of {images.run} images, residual {residual.pycolmap:.4f} px RMS"
+    circles, circle_sigmas = (max(v.values(), default=0.0) for v in (mapping.circles_um, mapping.circles_sigmas))
+    cameras = [(row.position_um, row.rotation_mdeg, row.sigmas) for row in mapping.cameras]
+    um, mdeg, sigmas = np.max([(0.0, 0.0, 0.0), *cameras], axis=0)
     lines = [
-        f"COLMAP {check.native} (schema {check.schema_}): {images.native} of {images.run} images, residual "
-        f"{residual.native:.4f} px RMS",
-        f"pycolmap {check.pycolmap}: {images.pycolmap} of {images.run} images, residual "
-        f"{residual.pycolmap:.4f} px RMS; the run: {residual.run:.4f} px",
+        f"COLMAP {check.native} (schema {check.schema_}): {of_native}",
+        f"pycolmap {check.pycolmap}: {of_pycolmap}; the run: {residual.run:.4f} px",
         f"{'':{width}} {'native – pycolmap':>24} {'adjusted – faces.json':>28} {'as it is – faces.json':>28}",
         *text_table(rows, least=(6, 10, 8, 4, 14, 8, 4, 14, 8, 4), gap=1),
-        f"largest between the two programs: circles {max(circles.values(), default=0.0):.3f} µm, "
-        f"{max(check.mapping.circles_sigmas.values(), default=0.0):.2f} σ; "
-        f"cameras {max((c.position_um for c in cameras), default=0.0):.2f} µm and "
-        f"{max((c.rotation_mdeg for c in cameras), default=0.0):.3f} mdeg, "
-        f"{max((c.sigmas for c in cameras), default=0.0):.2f} σ",
+        f"largest between the two programs: circles {circles:.3f} µm, {circle_sigmas:.2f} σ; "
+        f"cameras {um:.2f} µm and {mdeg:.3f} mdeg, {sigmas:.2f} σ",
         f"allowed: {allowed_text(check.tolerances)}: {'exceeded' if check.differences else 'they agree'}",
     ]
     return "\n".join([*check.notes, *lines])
 
 
 def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
+    images: ImagesRegistered, mapping: ResultsCompared, result: ResultsCompared, limits: Tolerances
 ) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
@@ -546,10 +504,8 @@ def _differences(
                 in_sigma = "" if own is None else f", {own:.2f} σ"
                 measured = f"{um:.1f} µm, {mdeg:.2f} mdeg{in_sigma}"
                 clauses.append(f"face {face} ({source}) {measured}; {', '.join(allowed)} allowed")
-        largest += [
-            (f"circle {{}} ({source})", compared.circles_um, "µm", limits.circle_um),
-            (f"circle {{}} ({source})", compared.circles_sigmas, "σ", sigma),
-        ]
+        of_circles = (compared.circles_um, "µm", limits.circle_um), (compared.circles_sigmas, "σ", sigma)
+        largest += [(f"circle {{}} ({source})", *each) for each in of_circles]
     largest += [
         ("camera {}: position", {c.image: c.position_um for c in mapping.cameras}, "µm", limits.camera_um),
         ("camera {}: attitude", {c.image: c.rotation_mdeg for c in mapping.cameras}, "mdeg", limits.camera_mdeg),
@@ -566,10 +522,9 @@ def faces_text(calibration: Calibration, run: SavedRun) -> str:
     lines = [*calibration.notes]
     for model in calibration.models:
         scale = calibration.scales[model.group]
-        lines.append(
-            f"group {model.group}: {len(model.images)} images, {len(model.labels)} circles, {scale.mm_per_unit:.6g} mm "
-            f"per unit, {'board' if scale.source == 'board' else scale.source} within {1e3 * scale.rms_mm():.1f} µm RMS"
-        )
+        within = f"{scale.source} within {1e3 * scale.rms_mm():.1f} µm RMS"
+        counts = f"{len(model.images)} images, {len(model.labels)} circles"
+        lines.append(f"group {model.group}: {counts}, {scale.mm_per_unit:.6g} mm per unit, {within}")
     difference = face_differences(calibration.target, run)
     rows = [["face", "x", "y", "z", "mm   against the run: µm", "mdeg"]]
     for face_id, pose in calibration.target.target_from_face.items():

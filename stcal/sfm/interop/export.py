@@ -82,19 +82,15 @@ class Content:
         sigma = np.sqrt(np.maximum(np.diag(self.target.face_covariance[face]), 0))  # the reference's is 0 but rounded
         return sigma[:3], sigma[3:]
 
-    def circle_sigma(self, label: CircleLabel) -> np.ndarray | None:
-        """Returns σ of x, y, z of a circle, mm, or None without a covariance."""
-        covariance = self.target.circle_covariance.get(label)
-        return None if covariance is None else np.sqrt(np.diag(covariance))
-
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
+        parts = {"faces": faces.target_from_face, "circles": faces.circles, "photographs": self.photographs}
+        counts = ", ".join(f"{len(content)} {name}" for name, content in parts.items())
+        frames = f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face"
         lines = [
-            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(faces.target_from_face)} faces, "
-            f"{len(faces.circles)} circles, {len(self.photographs)} photographs",
-            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
-            f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
+            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {counts}",
+            f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); {frames}",
         ]
         if not self.target.face_covariance:
             return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
@@ -135,17 +131,13 @@ def content_of(run: SavedRun, root: str) -> Content:
     views = {(each.image, each.group): Rigid(each.axes.T, each.position_mm) for each in report.scene.cameras}
     content = Content(root, run, target_in(run.faces), camera, views)
     names = [root, *(each.child for each in content.statics())]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(
-            "E-FRAME-NAME",
-            f"frames: {twice[0]} would be the name of two frames; rename a face or a circle of the target",
-        )
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        fault = f"frames: {twice[0]} would be the name of two frames"
+        raise InputError("E-FRAME-NAME", f"{fault}; rename a face or a circle of the target")
     return content
 
 
 def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
-    """Returns the colour of each face, by id."""
     return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target_design.faces)}
 
 
@@ -165,8 +157,8 @@ def table(content: Content) -> str:
         cells = [f"{v:.4g}" for v in (*(1e3 * shift), *(1e3 * np.degrees(turn)))]
         rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *(cells or [""] * 6)])
         for label in content.circles_of(face):
-            sigma = content.circle_sigma(label)
-            cells = [""] * 3 if sigma is None else [f"{1e3 * v:.4g}" for v in sigma]
+            covariance = content.target.circle_covariance.get(label)
+            cells = [""] * 3 if covariance is None else [f"{1e3 * v:.4g}" for v in np.sqrt(np.diag(covariance))]
             place = [*content.target.circles[label].tolist(), *turned, content.run.faces.radius_mm[label]]
             rows.append(["circle", face, label.circle, *place, *cells, "", "", ""])
     return csv_text(rows)
@@ -176,11 +168,8 @@ def opencv(content: Content) -> str:
     """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
     covariances of circles."""
     lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
-    lines += [
-        f"reference_face: {_quoted(content.run.faces.reference_face)}",
-        f"said: {_list(content.said())}",
-        "faces:",
-    ]
+    lines += [f"reference_face: {_quoted(content.run.faces.reference_face)}"]
+    lines += [f"said: {_list(content.said())}", "faces:"]
     target, radius = content.target, content.run.faces.radius_mm
     for face, pose in target.target_from_face.items():
         labels = content.circles_of(face)
@@ -213,8 +202,7 @@ MM_M = 1 / METRE_MM
 
 def urdf(content: Content) -> str:
     """Returns a ``robot`` of massless links: the target, the faces with visible circles, and the circles."""
-    root = quoteattr(content.root)
-    comments = [f"<!-- {line} -->" for line in _in_comments(content)]
+    root, comments = quoteattr(content.root), (f"<!-- {line} -->" for line in _in_comments(content))
     head = ['<?xml version="1.0"?>', *comments, f"<robot name={root}>", f"<link name={root}/>"]
     return "\n".join([*head, *_body(content, str), "</robot>\n"])
 
@@ -358,9 +346,9 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
         if face in target.face_covariance:
             extras["covariance_rad_mm"] = target.face_covariance[face].tolist()
-        below.append(scene.node(name=content.face_frame(face), **_placed(pose), children=circles, extras=extras))
-    if content.photographs:
-        below += _cameras(content, scene)
+        placed = {"translation": metres(pose), "rotation": xyzw(pose)}
+        below.append(scene.node(name=content.face_frame(face), **placed, children=circles, extras=extras))
+    below += _cameras(content, scene) if content.photographs else []
     extras = {"said": content.said(), "sigma_drawn_times": factor}
     up = scene.node(name="y_up", rotation=Y_UP, children=[scene.node(name=content.root, children=below, extras=extras)])
     materials = []
@@ -378,9 +366,8 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         "materials": materials,
         "accessors": scene.accessors,
         "bufferViews": scene.views,
+        **({"cameras": [_lens(content.camera)]} if content.photographs else {}),
     }
-    if content.photographs:
-        tree["cameras"] = [_lens(content.camera)]
     return tree, bytes(scene.data)
 
 
@@ -395,7 +382,8 @@ def _cameras(content: Content, scene: _Scene) -> list[int]:
     frustum = scene.mesh("image at depth", scene.shape(MM_M * shape @ GL_FROM_CV, lines), count + 1, LINES)
     nodes = []
     for (name, group), pose in content.photographs.items():
-        placed = _placed(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        turned = xyzw(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
+        placed = {"translation": metres(pose), "rotation": turned}
         extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
         nodes.append(scene.node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
     return nodes
@@ -437,10 +425,6 @@ def _exaggeration(content: Content) -> float:
     return 10.0 ** np.floor(np.log10(radius / sigma))
 
 
-def _placed(pose: Rigid) -> dict:
-    return {"translation": metres(pose), "rotation": xyzw(pose)}
-
-
 def _ball() -> tuple[np.ndarray, np.ndarray]:
     """Returns points of the unit sphere on a spiral, and triangles between them; both sides of these are drawn."""
     from scipy.spatial import ConvexHull
@@ -454,8 +438,6 @@ def _ball() -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A form of export."""
-
     suffix: str
     write: Callable[[Content], str | bytes]
     lost: str  # results among faces, circles, σ and cameras that the files do not hold
@@ -508,12 +490,10 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     """
     path = Path(out)
     suffixes = {known.suffix: each for each, known in FORMS.items()}
-    if not form and path.suffix.lower() not in suffixes:
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
-        )
-    form = form or suffixes[path.suffix.lower()]
+    form = form or suffixes.get(path.suffix.lower(), "")
+    if not form:
+        fault = f"{path}: suffix {path.suffix or 'missing'}"
+        raise InputError("E-OUTPUT-SUFFIX", f"{fault}; one of {', '.join(suffixes)} needed, or --form")
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
     require_new(path)
@@ -526,12 +506,10 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
 
 def export_text(written: ExportedRun) -> str:
     """Returns a text on the contents of the file, and on the results that it lacks."""
-    content = written.content
-    count, target = f"{len(content.target.circles)} circles", content.target
-    lines = [
-        f"{len(target.target_from_face)} faces and {count}, frame {content.root}, as {written.form}: {written.path}"
-    ]
-    if not content.target.face_covariance:
+    content, target = written.content, written.content.target
+    what = f"{len(target.target_from_face)} faces and {len(target.circles)} circles"
+    lines = [f"{what}, frame {content.root}, as {written.form}: {written.path}"]
+    if not target.face_covariance:
         lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
     if lost := FORMS[written.form].lost:
         lines.append(f"not in it: {lost}")

@@ -20,8 +20,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
-from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.faces_file import FacesFile
+from stcal.labels import DotLabel
 from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
 from stcal.sfm.mapping.database import pycolmap, write_database
 from stcal.sfm.mapping.models import open_model, require_keypoints, write_reconstruction
@@ -31,8 +30,6 @@ from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The database schema of a COLMAP version."""
-
     name: str
     user_version: int  # the stamp of the version's first release
     tables: dict[str, str]  # declaration by name
@@ -112,7 +109,6 @@ for _name, (_stamp, _new_tables, _new_indices) in _CHANGES.items():
 
 
 def find_schema(name: str) -> Schema:
-    """Returns the schema of that name."""
     if name not in SCHEMAS:
         raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
     return SCHEMAS[name]
@@ -123,9 +119,8 @@ def schema_of_version(version: str) -> Schema:
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
     if release is None or release[1] not in SCHEMAS:
         versions = ", ".join(SCHEMAS)
-        raise InputError(
-            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {versions}"
-        )
+        fault = f"COLMAP {version}: its database schema is not known"
+        raise InputError("E-COLMAP-VERSION", f"{fault}; use a release of {versions}")
     return SCHEMAS[release[1]]
 
 
@@ -181,10 +176,8 @@ def _complete(place: Path) -> Iterator[Path]:
 
 
 def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
-    """Writes a new database of a run's images and labels; returns the number of its pairs.
-
-    It is in rollback-journal mode, which is a single file that any program opens.
-    """
+    """Writes a new database of a run's images and labels; returns the number of its pairs. It is in rollback-journal
+    mode, which is a single file that any program opens."""
     own = path.with_name(f"own-{path.name}")
     pairs = image_graph(run.observations, run.board_design).pairs
     write_database(own, run.camera, run.observations, pairs, run.corrected_px)
@@ -198,30 +191,24 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
             copy.commit()
             copy.execute("ATTACH ? AS own", (str(own),))
             for table in wanted.tables:
-                theirs, ours = (
-                    [name for _, name, *_ in copy.execute(f"PRAGMA {database}.table_info({table})")]
-                    for database in ("main", "own")
-                )
-                columns = ", ".join(name for name in theirs if name in ours)
+                main, ours = (copy.execute(f"PRAGMA {name}.table_info({table})").fetchall() for name in ("main", "own"))
+                known = {name for _, name, *_ in ours}
+                columns = ", ".join(name for _, name, *_ in main if name in known)
                 copy.execute(f"INSERT INTO {table} ({columns}) SELECT {columns} FROM own.{table} ORDER BY rowid")
     except sqlite3.Error as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"{path}: cannot be written ({error}); check the folder's space and rights"
-        ) from error
+        fault = f"{path}: cannot be written ({error})"
+        raise InputError("E-OUTPUT-UNWRITABLE", f"{fault}; check the folder's space and rights") from error
     return len(pairs)
 
 
 def database_text(written: Exported) -> str:
     """Returns a text on the contents of the copied database, and how to open it."""
-    return (
-        f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
-        f"camera model {', '.join(written.camera_models)}\n"
-        f"open it with: colmap gui --database_path {written.path} --image_path IMAGES"
-    )
+    content = f"{written.images} images, {written.pairs} pairs, camera model {', '.join(written.camera_models)}"
+    how = f"colmap gui --database_path {written.path} --image_path IMAGES"
+    return f"schema {written.schema}, checked: {content}\nopen it with: {how}"
 
 
-FORMATS = ("colmap-bin", "colmap-txt")
-"""Formats of a model, which is a folder."""
+FORMATS = ("colmap-bin", "colmap-txt")  # formats of a model, which is a folder
 LABELS = "labels.csv"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
@@ -234,14 +221,6 @@ class ExportedModel:
     labels: Path
     images: int
     points: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Point:
-    id: int
-    group: str  # empty if several groups share it
-    label: Label
-    xyz: list[float]  # (3,), target frame, mm
 
 
 @require_arguments
@@ -273,24 +252,21 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
         raise InputError("E-OUTPUT-FOLDER", f"{out}: {existing} is a file; give another place")
     require_free(out, folder=True)
     saved = saved_run(run)
-    reconstruction, points = _labelled_points(saved)
+    reconstruction, rows = _labelled_points(saved)
     spaced = [image.name for image in saved.observations if " " in image.name]
     if spaced and form == "colmap-txt":
-        raise InputError(
-            "E-MODEL-NAMES",
-            f"format {form}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
-            "or rename the image and run again",
-        )
+        fault = f"format {form}: image {spaced[0]} has a space in its name, at which readers end it"
+        raise InputError("E-MODEL-NAMES", f"{fault}; use colmap-bin, or rename the image and run again")
     out.parent.mkdir(parents=True, exist_ok=True)
     with _complete(out) as folder:
         folder.mkdir()
-        (folder / LABELS).write_text(_labels_csv(points, saved.faces), encoding="utf-8")
+        (folder / LABELS).write_text(csv_text([LABEL_COLUMNS, *rows]), encoding="utf-8")
         write_reconstruction(reconstruction, folder, text=form == "colmap-txt")
-    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(points))
+    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(rows))
 
 
-def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
-    """Returns the run's model with coloured points, and the points by ascending id."""
+def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Sequence]]:
+    """Returns the run's model with coloured points, and the rows of ``labels.csv`` by the points' ascending ids."""
     path = run.folder / TARGET_MODEL
     if not path.is_dir():
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
@@ -305,8 +281,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
             raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
         image_of[image_id], corrected_px = observations[image.name]
         require_keypoints(path, image, image_of[image_id].labels, corrected_px)
-    rgb = colours(run)
-    points = []
+    rgb, covariance, rows = colours(run), run.faces.circle_covariance_mm2, []
     for point_id, point in sorted(reconstruction.points3D.items()):
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
@@ -317,26 +292,13 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
         point.color = np.array(colour, np.uint8)
-        group = groups.pop() if len(groups) == 1 else ""
-        points.append(_Point(point_id, group, label, point.xyz.tolist()))
-    return reconstruction, points
-
-
-def _labels_csv(points: Sequence[_Point], faces: FacesFile) -> str:
-    """Returns ``labels.csv``. Its first column is the point's id."""
-    covariance = faces.circle_covariance_mm2
-    rows: list[Sequence] = [LABEL_COLUMNS]
-    for point in points:
-        sigma = [""] * 3
-        if point.label in covariance:
-            sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
-        rows.append([point.id, point.group, point.label, *map(repr, point.xyz), *sigma])
-    return csv_text(rows)
+        sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[label]))] if label in covariance else [""] * 3
+        group = groups.pop() if len(groups) == 1 else ""  # empty if several groups share the point
+        rows.append([point_id, group, label, *map(repr, point.xyz.tolist()), *sigma])
+    return reconstruction, rows
 
 
 def model_text(written: ExportedModel) -> str:
     """Returns a text on the contents of the model."""
-    return (
-        f"{written.images} images and {written.points} points; mm, target frame: {written.path}\n"
-        f"labels: {written.labels}"
-    )
+    counts = f"{written.images} images and {written.points} points"
+    return f"{counts}; mm, target frame: {written.path}\nlabels: {written.labels}"

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.json import Named, ResultFile
 from stcal.labels import BOARD, CircleLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
@@ -104,29 +105,21 @@ def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
     return np.array([right, np.cross(towards, right), towards])
 
 
-def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
+def known_scene(joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
     """Returns the scene of a run, target frame: its calibrated faces and circles and its boards, without views."""
     circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
     groups, dots = {}, np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
-    for model in models:
+    for model in joint.models:
         seen = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
         pose = joint.model_from_board[model.group]
         groups[model.group] = Group(model.group, seen, _Stand.of(model).axes, pose, pose @ dots, ())
     faces = []
-    for face in setup.target.faces:
-        if face.id in setup.start.target_from_face:
-            keep = [i for i, label in enumerate(face.labels()) if label in circles]
-            ids = tuple(face.ids[i] for i in keep)
-            faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
-    return Scene(
-        target=replace(setup.target, faces=tuple(faces)),
-        board=setup.board,
-        camera=Camera.of(setup.camera, colmap_model),
-        target_from_face=setup.start.target_from_face,
-        circles_target=circles,
-        groups=groups,
-        seed=0,
-    )
+    for face in (face for face in setup.target.faces if face.id in setup.start.target_from_face):
+        keep = [i for i, label in enumerate(face.labels()) if label in circles]
+        ids = tuple(face.ids[i] for i in keep)
+        faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
+    target, camera = replace(setup.target, faces=tuple(faces)), Camera.of(setup.camera, colmap_model)
+    return Scene(target, setup.board, camera, setup.start.target_from_face, circles, groups, seed=0)
 
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
@@ -301,24 +294,24 @@ class KnownRun(Brief):
 
 def known_of(run: SavedRun) -> KnownRun:
     """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
-    again = adjusted_run(run)
-    joint = widened_result(again.state)
+    state, start = adjusted_run(run)
+    joint = widened_result(state)
     heights, rim_sigma_mm = run.rims_mm()
-    rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
+    rims = rim_covariance_mm2(joint, start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(
         target=run.target_design,
         board=run.board_design,
         camera=joint.camera,
-        start=again.start,
+        start=start,
         frame=run.faces.frame,
         flatness_mm=run.options.flatness_mm,
-        prior=again.prior,
+        prior=camera_prior(run.camera) if run.options.refine_camera else None,
         common=joint.board_common,
         sigma0=joint.sigma_scale,
         rims_mm2=rims,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
-    return KnownRun(joint.models, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
+    return KnownRun(joint.models, setup, noise, known_scene(joint, setup, run.camera.colmap_model))
 
 
 def doubts(run: SavedRun) -> str:
@@ -357,26 +350,20 @@ def advise(known: KnownRun | AnyRun, count: int = 5, progress: Progress | None =
     """
     if not isinstance(known, KnownRun):
         known = known_of(saved_run(known))
-    setup = known.setup
-    now = forecast(known.models, setup)
-    shares = variance_shares(now, known.models, setup)
+    models, setup = known.models, known.setup
+    now = forecast(models, setup)
     with kept_processes():
         if setup.board.rows:
-            jobs = [(known.scene, model, setup, known.noise) for model in known.models]
+            jobs = [(known.scene, model, setup, known.noise) for model in models]
             by_group = run_in_order(candidates, jobs, 1)
         else:
-            by_group = [body_views(model, setup, known.noise) for model in known.models]
+            by_group = [body_views(model, setup, known.noise) for model in models]
         views = [view for views_of_group in by_group for view in views_of_group]
         chosen = tuple(_greedy(known, views, now, count, progress or (lambda *_: None)))
-    return Advice(
-        now,
-        shares,
-        known.noise,
-        chosen,
-        tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))) if setup.board.rows else (),
-        forecast(known.models, setup.better_board(0.5), now.derivatives),
-        len(views),
-    )
+    new_groups = tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))) if setup.board.rows else ()
+    better = forecast(models, setup.better_board(0.5), now.derivatives)
+    shares = variance_shares(now, models, setup)
+    return Advice(now, shares, known.noise, chosen, new_groups, better, len(views))
 
 
 def _greedy(
@@ -427,8 +414,8 @@ def _new_model(known: KnownRun, pair: tuple[str, str], images: int) -> MetricMod
     options = SceneOptions(
         images_per_group=images, distance_mm=depth, spread_deg=NEW_GROUP_SPREAD_DEG, margin_mm=scene.margin_mm
     )
-    exact, parts = np.zeros((1, 3)), (scene.target, scene.board, scene.camera, scene.target_from_face)
-    group = made_group(pair, *parts, scene.circles_target, options, exact, rng)
+    parts = scene.target, scene.board, scene.camera, scene.target_from_face, scene.circles_target
+    group = made_group(pair, *parts, options, np.zeros((1, 3)), rng)
     alone = replace(scene, groups={group.name: group})
     (model,) = true_models(alone, observe(alone, 0.0, rng))
     new = replace(model, group=f"new {group.name}")  # a group of the run may have the name, and show other faces
@@ -455,10 +442,8 @@ def noise_of_run(run: AnyRun) -> CentreNoise:
 
 def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
     """Returns the σ to expect in good photographs; ``of_corners`` : of tags and squares, not of circles."""
-    of_circles = (
-        f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges blurred by "
-        f"{BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
-    )
+    light = f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale"
+    of_circles = f"{light}, edges blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
     return CentreNoise.expected(), "what corners of tags have in rendered photographs" if of_corners else of_circles
 
 
@@ -496,15 +481,10 @@ class AdviceFile(ResultFile):
 
     @classmethod
     def of_advice(cls, advice: Advice) -> "AdviceFile":
-        return cls(
-            format="stcal advice 1",
-            now=ForecastPart.of(advice.now, advice.shares),
-            choices=list(advice.choices),
-            new_groups=advice.new_groups,
-            board_dominates=advice.board_dominates,
-            half_board_sigma_um=MICRO * advice.better_board.worst()[1],
-            tried=advice.tried,
-        )
+        same: dict[str, Any] = {name: getattr(advice, name) for name in ("new_groups", "board_dominates", "tried")}
+        now, half_um = ForecastPart.of(advice.now, advice.shares), MICRO * advice.better_board.worst()[1]
+        choices = list(advice.choices)
+        return cls(format="stcal advice 1", now=now, choices=choices, half_board_sigma_um=half_um, **same)
 
 
 HOW_TO_GO = (
@@ -519,22 +499,19 @@ def advice_text(advice: Advice) -> str:
     now, better_um = ForecastPart.of(advice.now, advice.shares), MICRO * advice.better_board.worst()[1]
     lines = [*now.table(), f"worst is face {now.worst_face}, {now.worst_sigma_um:.2f} µm"]
     lines.append("by the mean noise of all centres; the σ of the report are by the noise of each centre")
+    shares = advice.shares[now.worst_face]
     if advice.board_dominates:
-        lines.append(
-            f"{100 * advice.shares[now.worst_face]['board']:.0f} % of its variance comes from the board: further views "
-            f"will help little; with a board of half the σ: {better_um:.2f} µm"
-        )
+        little = f"{100 * shares['board']:.0f} % of its variance comes from the board: further views will help little"
+        lines.append(f"{little}; with a board of half the σ: {better_um:.2f} µm")
     lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
     lines += text_table([["<group", "<from", "<go", "mm", "<sees", "<nearest", "<worst face, µm"], *_views(advice)])
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")
     lines.append(HOW_TO_GO)
-    has_board = "board" in advice.shares[now.worst_face]
-    ways = [(better_um, "a board of half the σ" if has_board else "print and size of half the σ")]
+    ways = [(better_um, "a board of half the σ" if "board" in shares else "print and size of half the σ")]
     if count := len(advice.choices):
-        ways.append(
-            (MICRO * advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view")
-        )
+        together = f"the {count} views together" if count > 1 else "the one view"
+        ways.append((MICRO * advice.choices[-1].sigma_mm, together))
     for pair in advice.new_groups:
         words = f"{pair.images} images of faces {join(pair.faces)} with the board next to them, a new group"
         ways.append((MICRO * pair.sigma_mm, words))

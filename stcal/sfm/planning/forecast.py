@@ -36,19 +36,15 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
         if missing := [face.id for face in target.faces if face.id not in rough]:
             *more, last = missing
             named = f"faces {', '.join(more)} and {last} are" if more else f"face {last} is"
-            raise InputError(
-                "E-TARGET-ROUGH-POSE",
-                f"target {target.name}: the design does not say where {named}; add approximate {ROUGH_KEYS} "
-                "to each [[face]] of the target file, or for `plan` give --faces, the faces.json of an earlier run",
-            )
+            unplaced = f"target {target.name}: the design does not say where {named}"
+            remedy = f"add approximate {ROUGH_KEYS} to each [[face]] of the target file"
+            alternative = "or for `plan` give --faces, the faces.json of an earlier run"
+            raise InputError("E-TARGET-ROUGH-POSE", f"{unplaced}; {remedy}, {alternative}")
         return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()
-    missing = [face.id for face in target.faces if face.id not in poses]
-    if missing:
-        raise InputError(
-            "E-TARGET-NO-FACE",
-            f"{faces}: no face {missing[0]} of target {target.name}; give a run that shows all of its faces",
-        )
+    if missing := [face.id for face in target.faces if face.id not in poses]:
+        fault = f"{faces}: no face {missing[0]} of target {target.name}"
+        raise InputError("E-TARGET-NO-FACE", f"{fault}; give a run that shows all of its faces")
     return {face.id: poses[face.id] for face in target.faces}
 
 
@@ -64,17 +60,11 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
             keep = circles.must_find & (rng.random(len(circles.labels)) >= missing)
             ideal = circle_image_offset(circles.xyz_camera[keep], circles.normal_camera[keep], circles.radius_mm[keep])
             centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(ideal), 2))
-            images.append(
-                ImageObservations(
-                    name=f"{name}/{i:04d}",
-                    group=name,
-                    labels=tuple(compress(circles.labels, keep.tolist())),
-                    centre_px=centre_px,
-                    centre=scene.camera.normalised_from_pixel(centre_px),
-                    shape=np.zeros((len(ideal), 2, 2)),
-                    covariance_px2=np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(ideal), 1, 1)),
-                )
-            )
+            centre = scene.camera.normalised_from_pixel(centre_px)
+            labels = tuple(compress(circles.labels, keep.tolist()))
+            covariance_px2 = np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(ideal), 1, 1))
+            shape, image = np.zeros((len(ideal), 2, 2)), f"{name}/{i:04d}"
+            images.append(ImageObservations(image, name, labels, centre_px, centre, shape, covariance_px2))
     return images
 
 
@@ -148,10 +138,10 @@ class CentreNoise:
         sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
         if not any(len(model.point_index) for model in sampled):
             return replace(cls.expected(), corner_px=corner_px)
-        rims = [_RimImages.of(model, camera, radius_mm) for model in sampled]
-        both = [rim.information @ model.covariance_px2 for rim, model in zip(rims, sampled, strict=True)]
-        ratio = np.trace(np.concatenate(both), axis1=1, axis2=2) / 2
-        narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
+        rims = (_rim_images(model, camera, radius_mm) for model in sampled)
+        information, minor_px = (np.concatenate(each) for each in zip(*rims, strict=True))
+        covariance_px2 = np.concatenate([model.covariance_px2 for model in sampled])
+        ratio, narrow = np.trace(information @ covariance_px2, axis1=1, axis2=2) / 2, minor_px**-2
         usual = ratio <= 4 * np.median(ratio)
         slope, level = np.polyfit(narrow[usual], ratio[usual], 1)
         if slope <= 0 or level <= 0:
@@ -163,9 +153,9 @@ class CentreNoise:
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """Returns the metric model with the covariances that this noise gives its observations."""
-        rims = _RimImages.of(model, camera, radius_mm)
-        size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
-        covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
+        information, minor_px = _rim_images(model, camera, radius_mm)
+        size = self.edge**2 * (1 + (self.narrow_px / minor_px) ** 2)
+        covariance = size[:, None, None] * np.linalg.inv(information) + self.floor_px**2 * np.eye(2)
         covariance[_is_corner(model, radius_mm)] = self.corner_px**2 * np.eye(2)
         return replace(model, covariance_px2=covariance)
 
@@ -175,25 +165,18 @@ def _is_corner(model: MetricModel, radius_mm: dict[Label, float]) -> np.ndarray:
     return np.array([radius_mm[label] <= POINT_RADIUS_MM for label in model.labels])[model.point_index]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _RimImages:
-    """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
-
-    information: np.ndarray
-    minor_px: np.ndarray
-
-    @classmethod
-    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_RimImages":
-        """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
-        radius = np.array([radius_mm[label] for label in model.labels])
-        in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
-        by_point = projection_jacobians(model, camera)[1]
-        shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
-        angle = 2 * np.pi * np.arange(STEPS) / STEPS
-        along = shape @ np.array([-np.sin(angle), np.cos(angle)])  # of each step along the rim
-        normal = along[:, ::-1] * np.array([[1.0], [-1.0]])
-        by_length = normal / np.linalg.norm(along, axis=1)[:, None] * (2 * np.pi / STEPS)
-        return cls(by_length @ np.swapaxes(normal, 1, 2), singular_values(shape)[1])
+def _rim_images(model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns ∮ n nᵀ ds (n, 2, 2) and minor semi-axes (n,), px, of rims as ellipses, to first order in radius over
+    distance. The error is negligible for a σ."""
+    radius = np.array([radius_mm[label] for label in model.labels])
+    in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
+    by_point = projection_jacobians(model, camera)[1]
+    shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
+    angle = 2 * np.pi * np.arange(STEPS) / STEPS
+    along = shape @ np.array([-np.sin(angle), np.cos(angle)])  # of each step along the rim
+    normal = along[:, ::-1] * np.array([[1.0], [-1.0]])
+    by_length = normal / np.linalg.norm(along, axis=1)[:, None] * (2 * np.pi / STEPS)
+    return by_length @ np.swapaxes(normal, 1, 2), singular_values(shape)[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,14 +247,11 @@ def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | N
     joint = setup.adjusted(models).result(1.0)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
-    reference = setup.start.reference_face
-    circles = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
-    return Forecast(
-        {face: c for face, c in used_derivatives.face_covariance(covariance).items() if face != reference},
-        dict(zip(joint.labels, circles.tolist(), strict=True)),
-        scale_sigma(joint.xyz_model, covariance),
-        used_derivatives,
-    )
+    circles_mm = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
+    circles = dict(zip(joint.labels, circles_mm.tolist(), strict=True))
+    faces = used_derivatives.face_covariance(covariance)
+    others = {face: faces[face] for face in faces if face != setup.start.reference_face}
+    return Forecast(others, circles, scale_sigma(joint.xyz_model, covariance), used_derivatives)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

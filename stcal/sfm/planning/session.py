@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -111,14 +111,12 @@ class PlanOptions(Brief):
     def __post_init__(self):
         require_fields(self, "plan", spread_deg=0, distance_mm=0, width=1, seed=0, margin_mm=0)
         if self.images < MIN_IMAGES:
-            raise InputError(
-                "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
-            )
+            fault = f"plan: {self.images} images in each group, {MIN_IMAGES} needed"
+            raise InputError("E-OPTION-RANGE", f"{fault}; plan for more")
         model = None if self.camera is None else camera_model(self.camera)
         if model is not None and not (model.width and model.height):
-            raise InputError(
-                "E-CAMERA-SIZE", f"plan: camera file {model.source} states no image size; add it to the file"
-            )
+            fault = f"plan: camera file {model.source} states no image size"
+            raise InputError("E-CAMERA-SIZE", f"{fault}; add it to the file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,11 +147,9 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
     if unknown := [name for name in names if name not in pair_of_name]:
-        raise InputError(
-            "E-OPTION-VALUE",
-            f"--groups: {unknown[0]!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: "
-            "ids of one character beside each other, longer ones with a hyphen",
-        )
+        remedy = f"use for example {', '.join(list(pair_of_name)[:3])}"
+        form = "ids of one character beside each other, longer ones with a hyphen"
+        raise InputError("E-OPTION-VALUE", f"--groups: {unknown[0]!r} is not a pair of faces; {remedy}: {form}")
     return tuple(pair_of_name[name] for name in names)
 
 
@@ -201,9 +197,8 @@ def plan(
     """
     printed = bool(target.with_faces(printed=True).faces)
     if printed and (unfit := [n for n, v in {"--groups": options.groups, "--board": board}.items() if v]):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
-        )
+        fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
+        raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
     poses = dict(nominal) if isinstance(nominal, Mapping) else nominal_poses(target, nominal)
     if printed:
         faces = (replace(face, rough_target_from_face=poses[face.id]) for face in target.faces)
@@ -287,30 +282,17 @@ def _beside_board(
 ) -> tuple[Scene, list[MetricModel], Setup]:
     """Returns the photographs of a plan with a board: scene with the nominal geometry, in which nothing is misplaced,
     models with their σ, input of a forecast."""
-    shape = SceneOptions(
-        seed=options.seed,
-        distance_mm=options.distance_mm,
-        spread_deg=options.spread_deg,
-        images_per_group=options.images,
-        groups=options.groups,
-        width=options.width,
-        height=round(options.width * 2 / 3),
-        margin_mm=options.margin_mm,
-        centre_sigma=0.0,
-        circle_sigma_mm=0.0,
-        face_shift_mm=0.0,
-        face_turn_deg=0.0,
-    )
+    same = ("seed", "distance_mm", "spread_deg", "groups", "width", "margin_mm")
+    given: dict[str, Any] = {name: getattr(options, name) for name in same}
+    given |= dict.fromkeys(("centre_sigma", "circle_sigma_mm", "face_shift_mm", "face_turn_deg"), 0.0)
+    shape = SceneOptions(images_per_group=options.images, height=round(options.width * 2 / 3), **given)
     scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
     run = options.run.adjustment(scene.target)
     kept = _kept_dots(board)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
-    start = CalibratedTarget(
-        run.reference_face,
-        {face: pose for face, pose in scene.target_from_face.items() if face in linked},
-        scene.circles_target,
-        dict.fromkeys(scene.groups, Rigid()),
-    )
+    poses = {face: pose for face, pose in scene.target_from_face.items() if face in linked}
+    groups = dict.fromkeys(scene.groups, Rigid())
+    start = CalibratedTarget(run.reference_face, poses, scene.circles_target, groups)
     setup = Setup(
         target=scene.target,
         board=board,
@@ -336,10 +318,8 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
         linked |= {face for pair in pairs if linked & set(pair) for face in pair}
     if len(linked) < 2 or planned - linked:
         unlinked = ", ".join(sorted(planned - linked)) or "any other face"
-        raise InputError(
-            "E-PLAN-UNLINKED",
-            f"plan: no group links face {unlinked} to reference face {reference}; add a group that shows one of each",
-        )
+        fault = f"plan: no group links face {unlinked} to reference face {reference}"
+        raise InputError("E-PLAN-UNLINKED", f"{fault}; add a group that shows one of each")
     return linked
 
 
@@ -355,10 +335,8 @@ def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[Bod
     model = assemble(MetricModel, TOP_GROUP, images, list(scene.camera_from_target), xyz)
     faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
     if unseen := [face.id for face in target.faces if face.id not in faces]:
-        raise InputError(
-            "E-PLAN-UNLINKED",
-            f"plan: {options.images} images of which fewer than two show face {unseen[0]}; plan more images",
-        )
+        fault = f"plan: {options.images} images of which fewer than two show face {unseen[0]}"
+        raise InputError("E-PLAN-UNLINKED", f"{fault}; plan more images")
     start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {TOP_GROUP: Rigid()})
     prior = camera_prior(unknown_lens(camera)) if file is None else None
     if file is not None and run.refine_camera:
@@ -408,19 +386,11 @@ class PlanFile(ResultFile):
 
     @classmethod
     def of_plan(cls, plan: Plan) -> "PlanFile":
-        return cls(
-            format="stcal plan 1",
-            images_per_group=plan.options.images,
-            groups=plan.groups,
-            spread_deg=plan.options.spread_deg,
-            distance_mm=plan.options.distance_mm,
-            reference_face=plan.setup.start.reference_face,
-            observations=plan.observations,
-            centre_sigma_px=plan.centre_sigma_px,
-            aperture_mm=plan.aperture_mm,
-            forecast=ForecastPart.of(plan.forecast, plan.shares),
-            remedies=plan.remedies,
-        )
+        same = ("groups", "observations", "centre_sigma_px", "aperture_mm", "remedies")
+        given: dict[str, Any] = {name: getattr(plan, name) for name in same}
+        given |= {name: getattr(plan.options, name) for name in ("spread_deg", "distance_mm")}
+        given |= {"images_per_group": plan.options.images, "reference_face": plan.setup.start.reference_face}
+        return cls(format="stcal plan 1", forecast=ForecastPart.of(plan.forecast, plan.shares), **given)
 
 
 USUAL_FOCAL_MM = 24.0  # focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide
@@ -449,10 +419,8 @@ def plan_text(plan: Plan, noise: str) -> str:
         "2.8 times as wide from twice as far; what it moves is corrected to about 15 %",
     ]
     if assumed := [face.id for face in plan.setup.target.faces if face.outline_mm is None]:
-        lines.append(
-            f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles "
-            "(--margin-mm, or outline_mm in target.toml)"
-        )
+        plates = f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles"
+        lines.append(f"{plates} (--margin-mm, or outline_mm in target.toml)")
     if board.rows:
         lines.append("the random places of board and cameras (--seed) change it by about ±3 %")
     else:
@@ -469,12 +437,8 @@ def _photographs_said(plan: Plan) -> str:
         prints = sorted({MICRO * (face.sigma_mm or 0.0) for face in faces})
         ends = " to ".join(dict.fromkeys(f"{each:g}" for each in (prints[0], prints[-1])))
         found = "found from them" if options.camera is None else "of the file"
-        return (
-            f"{options.images} images, {size}, of a body in random poses that show two or more of {len(faces)} faces; "
-            f"camera {found}, σ of print {ends} µm"
-        )
+        shown = f"of a body in random poses that show two or more of {len(faces)} faces"
+        return f"{options.images} images, {size}, {shown}; camera {found}, σ of print {ends} µm"
     boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
-    return (
-        f"groups {', '.join(plan.groups)}, {options.images} images each, {size}, spread ±{options.spread_deg:g}°; "
-        f"{boards}, σ {MICRO * board.sigma_mm:g} µm"
-    )
+    views = f"{options.images} images each, {size}, spread ±{options.spread_deg:g}°"
+    return f"groups {', '.join(plan.groups)}, {views}; {boards}, σ {MICRO * board.sigma_mm:g} µm"

@@ -17,6 +17,8 @@ CAUSE = "cause"  # key of the check that names what all images have in common an
 OF_WHOLE_SET = "Cause of the whole set: "  # how the title of that check begins, before the cause
 EVERY_SIGMA, DISTANCES = "every σ", "all distances and the size"
 PLACES, CENTRES = "the places of all faces", "all centres of circles"
+ODD_CENTRES = "the centres of the circles whose radius stands out"
+BENT_FACES = "the frames of the faces with circles off their plane"
 CHECKS: dict[str, tuple[str, tuple[str, ...]]] = {
     CAUSE: (OF_WHOLE_SET, (PLACES, DISTANCES, EVERY_SIGMA)),
     "camera": ("Intrinsics against the images", (PLACES, DISTANCES, EVERY_SIGMA)),
@@ -34,16 +36,10 @@ CHECKS: dict[str, tuple[str, tuple[str, ...]]] = {
     "board": ("Board against its stated σ", (DISTANCES, EVERY_SIGMA)),
     "board-lines": ("Scale of each row and column of the board against the rest", (DISTANCES, EVERY_SIGMA)),
     "pitch": ("Scale of the board against the target's design", (DISTANCES,)),
-    "radius": (
-        "Radius of each circle against others of its design radius",
-        ("the centres of the circles whose radius stands out", EVERY_SIGMA),
-    ),
+    "radius": ("Radius of each circle against others of its design radius", (ODD_CENTRES, EVERY_SIGMA)),
     "radius-design": ("Radii against the design", (CENTRES, PLACES)),
     "rim": ("Rim in front of the circles", ()),
-    "flatness": (
-        "Each point against the plane of its face",
-        ("the frames of the faces with circles off their plane", EVERY_SIGMA),
-    ),
+    "flatness": ("Each point against the plane of its face", (BENT_FACES, EVERY_SIGMA)),
     "control": ("Uncorrected control", (CENTRES, PLACES)),
     "scales": ("Scales against one another", (PLACES, DISTANCES, EVERY_SIGMA)),
 }
@@ -69,8 +65,7 @@ class TestedValue:
 
     def words(self) -> str:
         """Returns value and limit as text."""
-        value, limit = self.texts()
-        return value + (f", limit {limit}" if limit else "")
+        return ", limit ".join(filter(None, self.texts()))
 
     def texts(self) -> list[str]:
         """Returns the value with its unit, and the limit, to three digits, large ones without an exponent."""

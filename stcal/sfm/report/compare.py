@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -134,21 +134,19 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     for where, circles in ((run, answer.circles), (truth, known.circles)):
         for label, place in circles.items():
             if (far := max(map(abs, place))) > FARTHEST:  # its square would overflow
-                raise InputError(
-                    "E-VALUE-TOO-FAR",
-                    f"{where}: circles.{label}: a length of {far:.3g}, up to {FARTHEST:g} possible; correct it",
-                )
+                length = f"{where}: circles.{label}: a length of {far:.3g}"
+                raise InputError("E-VALUE-TOO-FAR", f"{length}, up to {FARTHEST:g} possible; correct it")
     if answer.reference_face != known.reference_face:
-        raise InputError(
-            "E-COMPARE-REFERENCE",
-            f"reference face {answer.reference_face} in the run, {known.reference_face} in the truth; "
-            f"run again with --reference-face {known.reference_face}",
-        )
+        fault = f"reference face {answer.reference_face} in the run, {known.reference_face} in the truth"
+        raise InputError("E-COMPARE-REFERENCE", f"{fault}; run again with --reference-face {known.reference_face}")
     if not known.target_from_face.keys() & answer.target_from_face.keys():
-        raise InputError(
-            "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
-        )
-    _require_one_unit(f"run {run}, truth {truth}", answer, known)
+        fault = f"run {run}, truth {truth}: no face in common"
+        raise InputError("E-COMPARE-NO-FACE", f"{fault}; give the truth of the same target")
+    origins = [{face: pose[:3, 3] for face, pose in side.target_from_face.items()} for side in (known, answer)]
+    for kind, (true, found) in {"circles": (known.circles, answer.circles), "faces": origins}.items():
+        common = [np.array([side[name] for name in true if name in found]).reshape(-1, 3) for side in (true, found)]
+        lengths = (float(np.linalg.norm(points - points.mean(axis=0))) if len(points) else 0.0 for points in common)
+        _require_same_unit(f"run {run}, truth {truth}", kind, *lengths, "run")
     faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None
     if run.is_dir() and known.groups:
@@ -156,12 +154,10 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         labels = _labels(own, known.circles, known.groups)
     errors = {name: [getattr(face, name) for face in faces.values()] for name in LargestErrors.model_fields}
     worst = {name: max((v for v in values if v is not None), default=None) for name, values in errors.items()}
+    missing = [face_id for face_id in known.target_from_face if face_id not in faces]
+    counted = {"labels": labels} if labels else {}
     return CompareFile(
-        reference_face=known.reference_face,
-        faces=faces,
-        missing=[face_id for face_id in known.target_from_face if face_id not in faces],
-        worst=LargestErrors(**worst),
-        **({"labels": labels} if labels else {}),
+        reference_face=known.reference_face, faces=faces, missing=missing, worst=LargestErrors(**worst), **counted
     )
 
 
@@ -198,19 +194,17 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
     unknown: list[str] = []
     distances: list[list[float]] = []
     for i, name in enumerate(table.text("image")):
-        same = [name] if name in true else by_file.get(Path(name).name, [])
-        if len(same) != 1:
-            unknown.append(name)
-            continue
-        pose = true[same[0]]
-        images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
-        distances.append([float(np.linalg.norm(p.translation)) for p in (pose, measured[i])])
+        match [name] if name in true else by_file.get(Path(name).name, []):
+            case [known_name]:
+                pose = true[known_name]
+                images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
+                distances.append([float(np.linalg.norm(p.translation)) for p in (pose, measured[i])])
+            case _:
+                unknown.append(name)
     if not images:
-        raise InputError(
-            "E-COMPARE-IMAGES",
-            f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
-            f"photographs{f', with names like {next(iter(true))}' if true else ''}",
-        )
+        fault = f"{poses}, truth {truth}: no image in common that the truth states one pose of"
+        names = f", with names like {next(iter(true))}" if true else ""
+        raise InputError("E-COMPARE-IMAGES", f"{fault}; give the truth of the same photographs{names}")
     true_mm, measured_mm = np.median(distances, axis=0).tolist()
     _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", true_mm, measured_mm, "poses")
     return ComparePosesFile(images=images, not_in_truth=unknown)
@@ -223,24 +217,8 @@ def _pose_errors(found: Rigid, true: Rigid, covariance: np.ndarray | None) -> Po
     if covariance is not None and np.linalg.eigvalsh(covariance)[0] > 0:
         error = np.concatenate([turn.log()[:3], shift])
         normalised = float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
-    return PoseErrors(
-        translation_um=1e3 * float(np.linalg.norm(shift)),
-        rotation_mdeg=1e3 * float(np.degrees(turn.angle_rad())),
-        normalised_error=normalised,
-    )
-
-
-def _require_one_unit(where: str, found: ComparedFaces, known: TruthFile) -> None:
-    """Refuses lengths if distances show that those of one side are in another unit than mm."""
-    labels = [label for label in known.circles if label in found.circles]
-    faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
-    sides = (known, found)
-    for kind, points in (
-        ("circles", [np.array([side.circles[label] for label in labels]) for side in sides]),
-        ("faces", [np.array([side.target_from_face[face_id][:3, 3] for face_id in faces]) for side in sides]),
-    ):
-        true, measured = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
-        _require_same_unit(where, kind, true, measured, "run")
+    um, mdeg = 1e3 * float(np.linalg.norm(shift)), 1e3 * float(np.degrees(turn.angle_rad()))
+    return PoseErrors(translation_um=um, rotation_mdeg=mdeg, normalised_error=normalised)
 
 
 def _require_same_unit(where: str, kind: str, true: float, measured: float, side: str) -> None:
@@ -248,11 +226,9 @@ def _require_same_unit(where: str, kind: str, true: float, measured: float, side
     for unit, factor in LENGTHS.items():
         for name, small, large in (("truth", true, measured), (side, measured, true)):
             if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
-                raise InputError(
-                    "E-COMPARE-UNITS",
-                    f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
-                    f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
-                )
+                times = f"{measured / true:.4g} times those of the truth, 1 ± {OF_A_UNIT:g} expected"
+                remedy = f"if the {name} is in {unit}, multiply its lengths by {factor:g}"
+                raise InputError("E-COMPARE-UNITS", f"{where}: distances between {kind} are {times}; {remedy}")
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
@@ -262,10 +238,9 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
         require_unchanged(path)
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:
-            measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))
-        for labels in measured.values():  # circles that the truth does not know are neither right nor wrong
-            for label in [x for x in labels if isinstance(x, CircleLabel) and x not in circles]:
-                del labels[label]
+            labels, label = measured.setdefault(row["image"], {}), parse_label(row["label"])
+            if label in circles or not isinstance(label, CircleLabel):  # else it is neither right nor wrong
+                labels[label] = (float(row["x_px"]), float(row["y_px"]))
         total = np.zeros(3, int)
         for group in groups.values():
             dots = group.board_circles_target
@@ -290,15 +265,14 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
 def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) -> tuple[int, int, int]:
     """Returns (wrong, found, visible) if the board's dots have the ``numbers``, (rows, columns)."""
     wrong = found = visible = 0
+    rows, columns = map(range, numbers.shape)
     for name in images.keys() & measured.keys():
         circles = images[name].circles
         visible += sum(c.must_find for c in circles.values())
         for label, centre in measured[name].items():
             key = label
-            if isinstance(label, DotLabel):
-                row, column = label.row, label.column
-                inside = 0 <= row < numbers.shape[0] and 0 <= column < numbers.shape[1]
-                key = f"{BOARD}:{numbers[row, column]}" if inside else label
+            if isinstance(label, DotLabel) and label.row in rows and label.column in columns:
+                key = f"{BOARD}:{numbers[label.row, label.column]}"
             near = key in circles and bool(np.linalg.norm(np.subtract(centre, circles[key].centre_px)) < NEAR_PX)
             wrong += not near
             found += near and circles[key].must_find
@@ -317,14 +291,9 @@ def _face(face_id: str, found: ComparedFaces, known: TruthFile) -> FaceErrors:
     if c is not None:
         turn, sigma = np.split(1e3 * np.sqrt(np.maximum(np.diag(c), 0)), 2)
         turn = np.degrees(turn)
-    return FaceErrors(
-        **_pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump(),
-        circles=len(labels),
-        circles_mean_um=mean,
-        circles_max_um=largest,
-        translation_sigma_um=sigma,
-        rotation_sigma_mdeg=turn,
-    )
+    of_pose = _pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump()
+    of_circles: dict[str, Any] = {"circles": len(labels), "circles_mean_um": mean, "circles_max_um": largest}
+    return FaceErrors(**of_pose, **of_circles, translation_sigma_um=sigma, rotation_sigma_mdeg=turn)
 
 
 def poses_table(comparison: ComparePosesFile) -> str:
@@ -345,7 +314,6 @@ def poses_table(comparison: ComparePosesFile) -> str:
 
 
 def comparison_table(comparison: CompareFile) -> str:
-    """Returns the comparison as a text table."""
     rows = [
         ["face", "position", "rotation", "circles", "worst", "of", "error / σ"],
         ["", "µm", "mdeg", "mean µm", "µm", "", ""],

@@ -19,10 +19,8 @@ TAIL = 2.0  # ratio of a face's σ to the median of the others above which this 
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0  # relative σ, in ppm, from which it is stated in %
-MORE = 4
-"""How many times the images the answer gives σ for."""
-FEW_IMAGES = 6
-"""Number of photographs below which more of them are the first thing to do."""
+MORE = 4  # how many times the images the answer gives σ for
+FEW_IMAGES = 6  # number of photographs below which more of them are the first thing to do
 QUESTIONS = {
     "use": "May I use it?",
     "quality": "How good is it?",
@@ -64,10 +62,8 @@ SOURCES = {
     "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that file"),
 }
 """Name and remedy of each source of σ beside the photographs."""
-MATTERS = 1.25
-"""Factor on σ from which a condition of the photographs is named."""
-HARMS = 3.0
-"""The same from which it is to be changed."""
+MATTERS = 1.25  # factor on σ from which a condition of the photographs is named
+HARMS = 3.0  # the same from which it is to be changed
 CONDITIONS = {
     "number": ("{:.0f} images in a group, 10 are usual", "take more photographs"),
     "distance": ("pictures are filled to {:.0f} %, 70 % is usual", "go nearer"),
@@ -148,12 +144,9 @@ def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
 
 
 def without_sigma(report: dict) -> dict:
-    """Returns the content of ``report.json`` without σ."""
-    return report | {
-        "faces": without_sigma_of(report["faces"]),
-        "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
-        "summary": report["summary"] | {"scale_sigma_ppm": None},
-    }
+    between = [row | {"distance_sigma_um": None} for row in report["between_faces"]]
+    summary = report["summary"] | {"scale_sigma_ppm": None}
+    return report | {"faces": without_sigma_of(report["faces"]), "between_faces": between, "summary": summary}
 
 
 def _faces(names: list[str]) -> str:
@@ -203,9 +196,8 @@ class _Run:
             return "no", "there is no face in it, only λ and residuals of the board"
         if self.control():
             return "no", "it was made for comparison, and its faces are biased by tens of µm"
-        failed, suspicious, passed = (
-            sum(c.verdict == v for c in self.checks) for v in ("failed", "suspicious", "passed")
-        )
+        verdicts = [check.verdict for check in self.checks]
+        failed, suspicious, passed = map(verdicts.count, ("failed", "suspicious", "passed"))
         cause, made, missing = self.cause, failed + suspicious + passed, len(self.open)
         if cause and cause.verdict == "failed":
             of = f"; that is the likely cause of {failed} of {made} checks that failed" if failed else ""
@@ -279,11 +271,11 @@ class _Run:
         premises = [] if self.options.get("refine_camera") else ["the intrinsics"]
         premises += [SIZES[source] for source in self.scale_from]
         are = "is" if len(premises) == 1 and self.scale_from != ["distances"] else "are"
-        return (
-            f"Faces are known against face {self.report['reference_face']} to {number(position[0], 1)} µm (face "
-            f"{position[1]}) and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an "
-            f"axis{scale}; that holds where {' and '.join(premises)} {are} as stated.{surface}"
-        )
+        um = f"{number(position[0], 1)} µm (face {position[1]})"
+        mdeg = f"{number(rotation[0], 2)} mdeg (face {rotation[1]})"
+        known = f"Faces are known against face {self.report['reference_face']} to {um} and {mdeg}"
+        holds = f"that holds where {' and '.join(premises)} {are} as stated.{surface}"
+        return f"{known} at worst, one σ along and about an axis{scale}; {holds}"
 
     def largest(self, key: str) -> tuple[float, str] | None:
         """Returns (largest value over the axes, face) of the worst face."""
@@ -307,15 +299,11 @@ class _Run:
     def control(self) -> Cause | None:
         """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
         if not self.faces:
-            return (
-                f"No face of the target was recognised in {self.summary['images']} images.",
-                "Look at the overlays; where a face is in view, give its design with --target.",
-            )
+            remedy = "Look at the overlays; where a face is in view, give its design with --target."
+            return f"No face of the target was recognised in {self.summary['images']} images.", remedy
         if self.options["solve"] == "paper":
-            return (
-                "The published method: contours with equal weights, without the eccentricity of circles.",
-                "Run it without --solve paper.",
-            )
+            method = "The published method: contours with equal weights, without the eccentricity of circles."
+            return method, "Run it without --solve paper."
         if not self.options["eccentricity"]:
             return "The eccentricity of circles is not corrected.", "Run it without --no-eccentricity."
         return None
@@ -338,20 +326,16 @@ class _Run:
     def _by_gaps(self) -> Cause | None:
         """Returns the cause where faces are missing that were to be there; None if all are."""
         if self.missing:
-            return (
-                f"Face {join(self.missing)} should have been photographed, and is not in the result.",
-                "Look at the overlays and at what was left out, in the photographs that show it.",
-            )
+            remedy = "Look at the overlays and at what was left out, in the photographs that show it."
+            return f"Face {join(self.missing)} should have been photographed, and is not in the result.", remedy
         n, of = len(self.faces), len(self.faces) + len(self.lacking)
         return (f"The photographs: they give {n} of the {of} faces of the design.", "") if n < of else None
 
     def _by_size(self) -> Cause | None:
         """Returns the cause where no size is known; None where one is."""
-        remedy = (
-            "Measure the distance of two points and state it with scale in target.toml, or photograph the board of "
-            "dots with it; if one is in view, give its file with --board."
-        )
-        return ("Its size: nothing of known size is in view.", remedy) if self.has_no_size else None
+        measure = "Measure the distance of two points and state it with scale in target.toml"
+        board = "or photograph the board of dots with it; if one is in view, give its file with --board."
+        return ("Its size: nothing of known size is in view.", f"{measure}, {board}") if self.has_no_size else None
 
     def _by_sigma(self) -> Cause:
         """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
@@ -376,28 +360,21 @@ class _Run:
                 source = "edges"
             few, (name, remedy) = "" if self.are_few else "More photographs help little: ", SOURCES[source]
             return f"{name}: {share} {of_all}.", sentence(f"{few}{remedy.format(distance=distance)}")
-        others = [
-            max(row["translation_sigma_um"])
-            for name, row in self.faces.items()
-            if name not in (worst, self.report["reference_face"]) and row["translation_sigma_um"] is not None
-        ]
+        rows = [row for name, row in self.faces.items() if name not in (worst, self.report["reference_face"])]
+        others = [max(row["translation_sigma_um"]) for row in rows if row["translation_sigma_um"] is not None]
         if others and sigma > TAIL * median(others):
             of_groups = "" if face["groups"] == [TOP_GROUP] else f", of group {join(face['groups'])}"
-            return (
-                f"Face {worst}: {number(sigma, 1)} µm along {'xyz'[axis]}, where the others have "
-                f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
-                f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
-            )
+            apart = f"{number(sigma, 1)} µm along {'xyz'[axis]}, where the others have {number(median(others), 1)} µm"
+            remedy = f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where."
+            return f"Face {worst}: {apart}; {face['images']} images show it{of_groups}.", remedy
         centre, advice = self.summary.get("circle_sigma_px"), "`stcal-sfm advise RUN` says how."
         if not photographs:
             return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
         fewer, share = math.sqrt(max(sigma**2 - photographs * (1 - 1 / MORE), 0.0)), 100 * photographs / sigma**2
         limit, remedy = self._by_conditions()
         centring = f"{limit}The centring of circles{'' if centre is None else f', σ {number(centre, 4)} px'}"
-        return (
-            f"{centring}: {number(share, 0)} {of_all}.",
-            f"{remedy} four times the images make {number(fewer, 1)} of {number(sigma, 1)} µm; {advice}",
-        )
+        more = f"four times the images make {number(fewer, 1)} of {number(sigma, 1)} µm; {advice}"
+        return f"{centring}: {number(share, 0)} {of_all}.", f"{remedy} {more}"
 
     def _by_conditions(self) -> tuple[str, str]:
         """Returns what of the photographs makes σ larger than usual, and the beginning of the remedy."""
@@ -419,9 +396,8 @@ class _Run:
             advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
         read = [face for face in self.lacking if self._seen(face)]
         if not self.cause and (unseen := [face for face in self.lacking if face not in read]):
-            advice.append(
-                f"Photograph {_faces(unseen)} together with one of the others: no image that was used shows it."
-            )
+            together = f"{_faces(unseen)} together with one of the others"
+            advice.append(f"Photograph {together}: no image that was used shows it.")
         if read:
             was = "was" if len(read) == 1 else "were"
             advice.append(f"Read why {_faces(read)} {was} left out, and take further photographs from other places.")

@@ -3,26 +3,12 @@
 import numpy as np
 
 from stcal.labels import dot_cells, parse_labels
+from stcal.report import svg
 from stcal.report.camera_figures import mean_residuals_figure
-from stcal.report.svg import (
-    AXIS,
-    COLOURS,
-    FAINT,
-    INK,
-    RED_BLUE,
-    SMALL,
-    Axes,
-    Drawing,
-    arrows,
-    limits,
-    mixed_names,
-    round_below,
-)
+from stcal.report.svg import Axes, Drawing
 
-CELLS = (12, 8)
-"""Number of cells of the image, in x and y, of which the mean residuals are drawn."""
-MOST, STEP = 4.0, 0.5
-"""Largest residual over its σ that the histogram shows, and the width of its bars."""
+CELLS = (12, 8)  # number of cells of the image, in x and y, of which the mean residuals are drawn
+MOST, STEP = 4.0, 0.5  # largest residual over its σ that the histogram shows, and the width of its bars
 
 
 def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:
@@ -31,25 +17,23 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     colour scale."""
     cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
-    per_cell = reach_um if reach_um > 0 else 1.0
-    height_um = height_um if height_um > 0 else 1.0
-    bar_um = round_below(per_cell)
-    drawing = Drawing(4.3, 3.5)
+    per_cell, height_um = (value if value > 0 else 1.0 for value in (reach_um, height_um))
+    bar_um, drawing = svg.round_below(per_cell), Drawing(4.3, 3.5)
     last = cells.max(0) if len(cells) else np.zeros(2)
     pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
     box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
     axes = Axes(drawing, box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
-    marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
-    rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
-    axes.frame("column", "row", "", columns, rows, SMALL)
+    marks = [range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12)))) for end in last]
+    rows, columns = ((values, [str(value) for value in values]) for values in marks)
+    axes.frame("column", "row", "", columns, rows, svg.SMALL)
     places = axes.at(cells[:, 1], cells[:, 0])
-    colours = mixed_names((1 + vectors[:, 2] / height_um) / 2, RED_BLUE)
+    colours = svg.mixed_names((1 + vectors[:, 2] / height_um) / 2, svg.RED_BLUE)
     drawing.discs(places, min(2.75, 0.25 * pitch), colours, "#777777")
-    drawing.lines(arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
+    drawing.lines(svg.arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
     bar = axes.at([0, bar_um / per_cell], last[0] + 1.45)
-    drawing.lines([bar], INK, 2.5)
-    drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", SMALL + 1, "start")
-    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), -height_um, height_um, "z, µm", RED_BLUE)
+    drawing.lines([bar], svg.INK, 2.5)
+    drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", svg.SMALL + 1, "start")
+    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), -height_um, height_um, "z, µm", svg.RED_BLUE)
     return drawing
 
 
@@ -65,14 +49,14 @@ def residual_field(residuals: np.ndarray, size_px: tuple[int, int]) -> Drawing:
 def by_photograph(rows: list[dict]) -> Drawing:
     """Draws the RMS of each photograph of ``residuals_by_image``, and names the largest."""
     rms, drawing = np.array([row["rms_px"] for row in rows]), Drawing(4.3, 2.6)
-    axes = Axes(drawing, drawing.panels(top=18)[0], (0, len(rms) + 1), limits(rms, 0.1, low=0))
+    axes = Axes(drawing, drawing.panels(top=18)[0], (0, len(rms) + 1), svg.limits(rms, 0.1, low=0))
     number, worst = 1 + np.arange(len(rms)), int(np.argmax(rms))
     axes.frame("photograph", "RMS, px", "y")
-    axes.lines([([n, n], [0, value]) for n, value in zip(number, rms, strict=True)], FAINT, 1.5)
-    axes.marks(number, rms, "dot", 4, INK)
-    axes.marks(number[[worst]], rms[[worst]], "dot", 5, COLOURS[1])
+    axes.lines([([n, n], [0, value]) for n, value in zip(number, rms, strict=True)], svg.FAINT, 1.5)
+    axes.marks(number, rms, "dot", 4, svg.INK)
+    axes.marks(number[[worst]], rms[[worst]], "dot", 5, svg.COLOURS[1])
     end = "end" if worst > len(rms) / 2 else "start"
-    axes.words(number[worst], rms[worst], rows[worst]["image"], (0, -8), anchor=end, colour=COLOURS[1])
+    axes.words(number[worst], rms[worst], rows[worst]["image"], (0, -8), anchor=end, colour=svg.COLOURS[1])
     return drawing
 
 
@@ -83,14 +67,14 @@ def normalised_residuals(values: np.ndarray) -> Drawing:
     x = np.linspace(-MOST, MOST, 121)
     normal = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     drawing = Drawing(4.3, 2.6)
-    axes = Axes(drawing, drawing.panels(top=18)[0], (-MOST, MOST), limits([*share, normal.max()], low=0))
+    axes = Axes(drawing, drawing.panels(top=18)[0], (-MOST, MOST), svg.limits([*share, normal.max()], low=0))
     corners = ([a, a, a + STEP, a + STEP] for a in edges[:-1])
-    axes.lines([(own, [0, h, h, 0]) for own, h in zip(corners, share, strict=True)], AXIS, 0.7, fill=FAINT)
-    axes.lines([(x, normal)], COLOURS[0], 1.5)
+    axes.lines([(own, [0, h, h, 0]) for own, h in zip(corners, share, strict=True)], svg.AXIS, 0.7, fill=svg.FAINT)
+    axes.lines([(x, normal)], svg.COLOURS[0], 1.5)
     axes.frame("residual over its σ", "share per σ")
     beyond = 100 * float((np.abs(values) > 3).mean())
     said = f"{len(values)} coordinates, {beyond:.2f} % beyond 3 σ; line: N(0, 1), 0.27 %"
-    drawing.words(((axes.box[0] + axes.box[2]) / 2, 9), said, SMALL)
+    drawing.words(((axes.box[0] + axes.box[2]) / 2, 9), said, svg.SMALL)
     return drawing
 
 
@@ -99,13 +83,15 @@ def halves(measured: list[dict]) -> Drawing:
     the check of this name."""
     rows = sorted(measured, key=lambda row: row["name"])
     drawing = Drawing(4.3, 0.75 + 0.22 * len(rows))
-    reach = limits([row[key] or 0.0 for row in rows for key in ("value", "limit")], 0.08, low=0)
+    reach = svg.limits([row[key] or 0.0 for row in rows for key in ("value", "limit")], 0.08, low=0)
     axes = Axes(drawing, drawing.panels(left=60, top=18)[0], reach, (len(rows) - 0.4, -0.6))
     at = np.arange(len(rows))
     axes.frame(f"apart, {rows[0]['unit']}", "", "x", None, (list(range(len(rows))), [row["name"][:12] for row in rows]))
     limit = [row["limit"] or 0.0 for row in rows]
-    axes.lines([([0, end], [k, k]) for k, end in enumerate(limit)], AXIS, 2)
-    axes.marks(limit, at, "bar", 9, AXIS)
-    axes.marks([row["value"] for row in rows], at, "dot", 5, COLOURS[0])
-    drawing.words(((axes.box[0] + axes.box[2]) / 2, 9), "dot: the two halves apart; whisker: limit of chance", SMALL)
+    axes.lines([([0, end], [k, k]) for k, end in enumerate(limit)], svg.AXIS, 2)
+    axes.marks(limit, at, "bar", 9, svg.AXIS)
+    axes.marks([row["value"] for row in rows], at, "dot", 5, svg.COLOURS[0])
+    drawing.words(
+        ((axes.box[0] + axes.box[2]) / 2, 9), "dot: the two halves apart; whisker: limit of chance", svg.SMALL
+    )
     return drawing

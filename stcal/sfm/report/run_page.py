@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
-from itertools import chain, compress, product
+from itertools import chain, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,12 +30,7 @@ from stcal.report.document import (
     tone_of,
     verdict_word,
 )
-from stcal.report.svg import (
-    AXIS_COLOURS,
-    COLOURS,
-    INK,
-    round_below,
-)
+from stcal.report.svg import AXIS_COLOURS, COLOURS, INK, round_below
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
@@ -55,11 +50,6 @@ SOLVES = {
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
-def has_board(report: dict) -> bool:
-    """Returns whether a board of dots gives the scale."""
-    return "board" in report["summary"].get("scale_from", ["board"])
-
-
 PUBLISHED = (
     "as published, for comparison: centres of contours with equal weights, without the eccentricity; faces are off by "
     "tens of µm, and no residual shows it"
@@ -77,7 +67,6 @@ def report_html(
     residuals: Mapping[str, Residuals] | None = None,  # centres and their residuals by image name, px; None: not drawn
     gone: int = 0,  # number of overlays that are no longer in the run's folder
 ) -> str:
-    """Returns the page."""
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)
@@ -85,11 +74,10 @@ def report_html(
     summary, options = report["summary"], report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
+    why = "their overlays were no longer in the run's folder when this page was made"
     pictures = [
         macro("photographs", shown, rest) if shown["each"] else "" if gone else "There are none",
-        f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
-        if gone
-        else "",
+        f"{gone} photographs are not shown: {why}" if gone else "",
     ]
     sections = [
         Section("Faces", _answer(report, colours)),
@@ -103,17 +91,12 @@ def report_html(
         Section("Settings", [Table(["<Setting", "<Value"], settings(report), css="text facts")]),
         Section("Overlays", pictures),
     ]
-    counts = (
-        f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
-        f"{summary['images_mapped']} mapped, {summary['faces']} faces"
-    )
-    warnings = {
-        ALONE: not report["faces"],
-        PUBLISHED: options["solve"] == "paper",
-        CONTROL: not options["eccentricity"],
-    }
-    warning = [text for text, applies in warnings.items() if applies][:1]
-    banner = [alarms(warning), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
+    groups = f"{summary['groups']} group{'' if summary['groups'] == 1 else 's'}"
+    mapped = f"{summary['images_mapped']} mapped, {summary['faces']} faces"
+    counts = f"{summary['images']} images in {groups}, {mapped}"
+    alone, published, control = not report["faces"], options["solve"] == "paper", not options["eccentricity"]
+    warnings = [ALONE] * alone + [PUBLISHED] * published + [CONTROL] * control
+    banner = [alarms(warnings[:1]), macro("answers", judgement.answers(), tone_of(judgement.verdict))]
     return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
@@ -132,7 +115,7 @@ def faces_table(faces: dict[str, dict], reference: str) -> Table:
 
 def _answer(report: dict, colours: dict[str, str]) -> list[Block]:
     """Returns the faces with σ, and the target in space."""
-    with_it = "boards and cameras" if has_board(report) else "cameras"
+    with_it = "boards and cameras" if "board" in report["summary"].get("scale_from", ["board"]) else "cameras"
     views = [("target", "Target"), ("all", f"With {with_it}")]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
@@ -161,20 +144,16 @@ def _faces_in_detail(report: dict) -> list[Block]:
         for row in report["between_faces"]
     ]
     ways = []
-    for face, chains in report["chains"].items():
-        for way in chains:
-            off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
-            ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
+    for face, way in ((face, way) for face, chains in report["chains"].items() for way in chains):
+        off = number(1e3 * way["translation_mm"], 1), number(1e3 * math.degrees(way["rotation_rad"]), 2)
+        ways.append([face, " → ".join(way["faces"]), " → ".join(way["groups"]), *off])
+    distances = Table(["<Faces", "Distance (mm)", "σ (µm)", "Angle (°)"], between)
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
     found = ["Points found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     return [
         Table(["<Face", *found], rests),
         columns(
-            [
-                subheading("Between faces"),
-                "Distance of the origins, angle of the normals",
-                Table(["<Faces", "Distance (mm)", "σ (µm)", "Angle (°)"], between),
-            ],
+            [subheading("Between faces"), "Distance of the origins, angle of the normals", distances],
             [
                 subheading("Chains"),
                 "Ways to each face through single groups, before these are adjusted together, and how far each is off "
@@ -205,15 +184,11 @@ def _scale(report: dict) -> list[Block]:
     residuals = [vector for scale in boards.values() for vector in scale["board_residuals_um"].values()]
     reach = max((math.hypot(*vector[:2]) for vector in residuals), default=0.0)
     height = max((abs(vector[2]) for vector in residuals), default=0.0)
-    pictures = [
-        plot(
-            partial(board_residuals, scale["board_residuals_um"], reach, height),
-            f"Residual vectors of the board, group {name}",
-            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
-            "",
-        )
-        for name, scale in boards.items()
-    ]
+    pictures = []
+    for name, scale in boards.items():
+        draw = partial(board_residuals, scale["board_residuals_um"], reach, height)
+        caption = f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm"
+        pictures.append(plot(draw, f"Residual vectors of the board, group {name}", caption, ""))
     of_boards = [
         subheading("Board residuals"),
         "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
@@ -243,9 +218,8 @@ def _residuals(report: dict, colours: dict[str, str], residuals: Mapping[str, Re
     for i, row in enumerate(report["residuals_by_image"], 1):
         coloured = swatch(row["group"], colours.get(row["group"], ""))
         images.append([i, row["image"], coloured, *cells(row, "observations rms_px:4 max_px:4 worst")])
-    worst = max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None)
     named = ""
-    if worst:
+    if worst := max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None):
         group = f" of group {worst['group']}" if worst["group"] else ""
         named = f". The worst label is {worst['label']}{group} with {worst['rms_px']:.4f} px RMS"
     table = Table(["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"], images)
@@ -301,7 +275,7 @@ def _left_out(report: dict) -> list[Block]:
 def trust(report: dict, judgement: Judgement) -> list[Block]:
     """Returns for what σ hold, and the worst value of each kind."""
     summary, options = report["summary"], report["options"]
-    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
+    scale_from = summary.get("scale_from", ["board"])
     if options["solve"] != "joint":
         scope = (
             "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
@@ -312,11 +286,11 @@ def trust(report: dict, judgement: Judgement) -> list[Block]:
     else:
         refined = options.get("refine_camera", False)
         absent = [] if refined else ["the camera calibration"]
-        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if has_board(report) else []
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if "board" in scale_from else []
+        size = " and ".join(SIZES[source] for source in scale_from)
         scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
-        scope += (
-            f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
-        )
+        if absent:
+            scope += f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it"
     factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
     larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
     of_groups = f"group by group, residuals are {larger} the centres' own σ"
@@ -338,6 +312,8 @@ def settings(report: dict) -> list[list[str]]:
     solve, frame = str(options["solve"]), str(options["frame"])
     round_ = not report["faces"] or not report["faces"].keys() <= set(summary.get("printed_faces", []))
     single = sum(row.get("gate") == "views" for row in left_out["circles"])
+    points = f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows"
+    source = "as given" if summary.get("camera_given", True) else "found from the photographs"
     eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
     rows = [
         ["Solve", SOLVES.get(solve, solve)],
@@ -349,16 +325,9 @@ def settings(report: dict) -> list[list[str]]:
         ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
         ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
-        [
-            "Left out",
-            f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
-            f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows",
-        ],
+        ["Left out", f"{len(left_out['files'])} files, {len(left_out['images'])} images, {points}"],
         ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
-        [
-            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
-            f"{camera['model']}, {sizes} px",
-        ],
+        [f"Camera, {source}", f"{camera['model']}, {sizes} px"],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
         ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
         ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
@@ -370,11 +339,9 @@ def settings(report: dict) -> list[list[str]]:
 def crosscheck_section(check: dict) -> list[Block]:
     """Returns the section on the cross-check with the native COLMAP."""
     mapping = check["mapping"]
-    names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
-    models = [
-        [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
-        for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
-    ]
+    names = {"native": f"COLMAP {check['native']}", "pycolmap": f"pycolmap {check['pycolmap']}", "run": "this result"}
+    images, rms_px = check["images"], check["residual_rms_px"]
+    models = [[name, images[key], number(rms_px[key], 4)] for key, name in names.items()]
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
         largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
@@ -400,40 +367,35 @@ def crosscheck_section(check: dict) -> list[Block]:
     ]
 
 
-FIRST_NAMES = 6
-"""Number of names that a row has room for."""
+FIRST_NAMES = 6  # number of names that a row has room for
 
 
 def checks_section(checks_of_report: list[dict]) -> list[Block]:
     """Returns the checks that did not pass; the others, and what all of them measured, folded."""
     checks = sorted(map(Check.read, checks_of_report), key=lambda check: ORDER.index(check.verdict))
     heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
-    is_open = [check.verdict in ("failed", "suspicious") for check in checks]
-    rows = []
+    of_values = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
+    open_: list[list] = []
+    others: list[list] = []
+    measured: list[list] = []
     for check in checks:
         surplus = len(check.names) - FIRST_NAMES
         names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
         value = check.measured[0].texts() if check.measured else [NONE, NONE]
-        rows.append([check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy])
-    open_, others = (list(compress(rows, of)) for of in (is_open, [not each for each in is_open]))
-    measured = [
-        [check.title, m.name, *m.texts(), NONE if m.probability is None else f"{m.probability:.1g}"]
-        for check in checks
-        for m in check.measured
-    ]
+        row = [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
+        (open_ if check.verdict in ("failed", "suspicious") else others).append(row)
+        for m in check.measured:
+            chance = NONE if m.probability is None else f"{m.probability:.1g}"
+            measured.append([check.title, m.name, *m.texts(), chance])
+    passed = f"{len(others)} checks that passed, were not possible or not applicable"
     halved = next((check for check in checks_of_report if check["key"] == "halves" and check["measured"]), None)
     return [
         f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
         "images or points it tested",
         Table(heads, open_, css="text"),
         plots(plot(partial(halves, halved["measured"]), halved["title"], css="")) if halved else "",
-        fold(
-            f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
-        ),
-        fold(
-            "What was measured",
-            Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
-        ),
+        fold(passed, Table(heads, others, css="text")),
+        fold("What was measured", Table(of_values, measured, css="text")),
     ]
 
 
@@ -469,8 +431,7 @@ def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
     return [*sides, at, at + 2.2 * depth * axes[2]]
 
 
-DIGITS = 2
-"""Number of decimals of coordinates in mm: far finer than a screen shows."""
+DIGITS = 2  # number of decimals of coordinates in mm: far finer than a screen shows
 AXIS = 0.2  # length of the faces' axes, as a share of the target's extent
 CAMERA = 0.07  # depth of a camera's pyramid, as a share of the scene's extent
 SHEET = "#7f93a8"

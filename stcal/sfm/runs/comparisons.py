@@ -61,8 +61,6 @@ class Comparison(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MethodResult:
-    """Result of one method."""
-
     target: CalibratedTarget
     models: tuple[WorldModel, ...]  # without unit, one per group
     scales: dict[str, Scale]  # by group
@@ -79,23 +77,17 @@ def compare_with_paper(result: "RunResult", published: MethodResult | StcalError
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
-    sigma = {
-        face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5)
-        for face, c in whole.face_covariance.items()
-        if face != whole.reference_face
-    }
-    filled = [row.model_dump() for row in rows]
-    return Comparison.model_validate({"with": "paper", "rows": filled, "sigma": sigma})
+    others = {face: c for face, c in whole.face_covariance.items() if face != whole.reference_face}
+    sigma = {face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5) for face, c in others.items()}
+    return Comparison(method="paper", rows=[ComparedRow(**row.model_dump()) for row in rows], sigma=sigma)
 
 
 def in_steps(result: "RunResult") -> dict[str, MethodResult | StcalError]:
     """Answers, or errors, from the run's own circles by the step added last, with λ by rows, three-point frames and
     single transforms, without the joint adjustment."""
     camera, designs = result.camera, (result.target_design, result.board_design)
-    weighted = [solution.model for solution in result.solutions]
-    equal = [
-        replace(m, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (len(m.measured_px), 1, 1))) for m in weighted
-    ]
+    weighted, one = [solution.model for solution in result.solutions], EQUAL_SIGMA_PX**2 * np.eye(2)
+    equal = [replace(model, covariance_px2=np.tile(one, (len(model.measured_px), 1, 1))) for model in weighted]
     # The models hold the corrections already; the calibration itself works without eccentricity.
     plain: dict[str, Any] = {"solve": "paper", "frame": "three-point", "eccentricity": False, "refine_camera": False}
     options = replace(result.options.adjustment(result.target_design), **plain)
@@ -115,15 +107,10 @@ def _row(name: str, found: MethodResult | StcalError, whole: CalibratedTarget, c
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
         return ComparedRow(method=name, missing=others, reason=str(found))
-    pairs = (
-        (face, pose, whole.target_from_face[face])
-        for face, pose in found.target.target_from_face.items()
-        if face in others
-    )
-    faces = {
-        face: _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
-        for face, pose, known in pairs
-    }
+    faces = {}
+    for face in (face for face in found.target.target_from_face if face in others):
+        pose, known = found.target.target_from_face[face], whole.target_from_face[face]
+        faces[face] = _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
     missing = [face for face in others if face not in faces]
     return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
 
@@ -136,11 +123,8 @@ def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, S
     """Returns the lengths of the board's residuals, and the RMS of the images' per coordinate."""
     board = MICRO * np.concatenate([np.linalg.norm(scale.residuals_mm, axis=1) for scale in scales.values()])
     residuals = np.concatenate([model.residuals_px(camera) for model in models])
-    return {
-        "board_mean_um": float(board.mean()),
-        "board_spread_um": float(board.std()),
-        "residual_rms_px": rms(residuals),
-    }
+    lengths = {"board_mean_um": float(board.mean()), "board_spread_um": float(board.std())}
+    return lengths | {"residual_rms_px": rms(residuals)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,21 +171,20 @@ class Tolerances:
     def __post_init__(self):
         for name, value in asdict(self).items():
             if isinstance(value, int | float) and not 0 <= value < np.inf:
-                raise InputError(
-                    "E-OPTION-RANGE", f"tolerance {name} {value:g}: a number of 0 or more needed; give another"
-                )
+                fault = f"tolerance {name} {value:g}: a number of 0 or more needed"
+                raise InputError("E-OPTION-RANGE", f"{fault}; give another")
         require_fields(self, "tolerances")
 
 
 def allowed_text(tolerances: Tolerances) -> str:
     """Returns the limits in force as text."""
     parts = [f"faces and circles {tolerances.mapped_sigma:g} σ between the programs, {tolerances.sigma:g} σ adjusted"]
-    for kind, values in (
-        ("faces", ((tolerances.face_um, "µm"), (tolerances.face_mdeg, "mdeg"))),
-        ("circles", ((tolerances.circle_um, "µm"),)),
-        ("cameras", ((tolerances.camera_um, "µm"), (tolerances.camera_mdeg, "mdeg"))),
+    for kind, um, mdeg in (
+        ("faces", tolerances.face_um, tolerances.face_mdeg),
+        ("circles", tolerances.circle_um, None),
+        ("cameras", tolerances.camera_um, tolerances.camera_mdeg),
     ):
-        given = [f"{value:g} {unit}" for value, unit in values if value is not None]
+        given = [f"{value:g} {unit}" for value, unit in ((um, "µm"), (mdeg, "mdeg")) if value is not None]
         parts += [f"{kind} {' and '.join(given)}"] if given else []
     return ", ".join(parts)
 
@@ -231,18 +214,12 @@ class CameraRow(Part):
     sigmas: float
 
 
-class FacesCompared(Part):
-    faces: dict[ByFace, FaceDifference | None]
-
-
-class ResultCompared(FacesCompared):
-    circles_um: dict[ByLabel, float] = Field(default={})
-    circles_sigmas: dict[ByLabel, float] = Field(default={})
-
-
-class MappingCompared(ResultCompared):
+class ResultsCompared(Part):
     """Differences of two results; the keys that were not given are not in the file."""
 
+    faces: dict[ByFace, FaceDifference | None]
+    circles_um: dict[ByLabel, float] = Field(default={})
+    circles_sigmas: dict[ByLabel, float] = Field(default={})
     cameras: list[CameraRow] = Field(default=[])
 
 
@@ -263,18 +240,18 @@ class Crosscheck(Part):
     residual_rms_px: ResidualRms = Field(
         description="per coordinate, of the `native` model, of `pycolmap`'s, and of the `run`'s final one"
     )
-    mapping: MappingCompared = Field(
+    mapping: ResultsCompared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
         "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
         "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
         "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
         "with that of the camera in its group, circles held together"
     )
-    result: ResultCompared = Field(
+    result: ResultsCompared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
         "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
-    plain: FacesCompared = Field(
+    plain: ResultsCompared = Field(
         description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
         "`sigmas`; no tolerance applies"
     )

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from stcal.sfm.data.group_model import GroupModel, ImageObservations
+from stcal.sfm.mapping.incremental import widest_angle_rad
 from stcal.sfm.runs.saved import RunResult
 
 IMAGE_NOISE = 0.01  # standard deviation of the grey values, as a fraction of full scale
@@ -13,12 +14,9 @@ BLUR_PX = 0.76  # blur of an edge, standard deviation: a lens of 0.7 px and the 
 PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
-IMAGES = 10
-"""Number of images of a group that docs/howto/photograph.md asks for."""
-FILLED = 0.7
-"""Share of a picture's diagonal that faces and board cover where they fill the picture."""
-APART_RAD = math.radians(80)
-"""Angle between the outermost cameras of a group as their middle point sees it: ±40°."""
+IMAGES = 10  # number of images of a group that docs/howto/photograph.md asks for
+FILLED = 0.7  # share of a picture's diagonal that faces and board cover where they fill the picture
+APART_RAD = math.radians(80)  # angle between the outermost cameras of a group as their middle point sees it: ±40°
 
 
 def conditions(run: RunResult) -> dict[str, tuple[float, float]]:
@@ -50,8 +48,7 @@ def _filled(model: GroupModel) -> float:
 
 def _apart_rad(model: GroupModel) -> float:
     rays = np.array([pose.inverse().translation for pose in model.camera_from_model]) - model.xyz_model.mean(axis=0)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return float(np.arccos(np.clip(rays @ rays.T, -1, 1)).max())
+    return widest_angle_rad(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _noise(image: ImageObservations, focal_px: float) -> np.ndarray:

@@ -18,21 +18,8 @@ from stcal.design import faces_of_known_shape, known_distances
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
+from stcal.io import files
 from stcal.io.cameras.read import save_camera
-from stcal.io.files import (
-    BOARD,
-    CAMERA,
-    DATABASE,
-    MODEL_BYTES,
-    MODELS,
-    REFINED_CAMERA,
-    REPORT_PDF,
-    TARGET,
-    TARGET_MODEL,
-    json_text,
-    read_bytes,
-    save,
-)
 from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
@@ -54,7 +41,7 @@ from stcal.report.document import (
 )
 from stcal.report.text import join, wrapped
 from stcal.sfm.adjust.faces_file import FacesFile
-from stcal.sfm.data.group_model import Note, detections_csv
+from stcal.sfm.data.group_model import ImageObservations, Note, detections_csv
 from stcal.sfm.detect.detect_files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
@@ -64,18 +51,11 @@ from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
-from stcal.sfm.report.run_page import (
-    CONTROL,
-    FIRST_IMAGES,
-    PUBLISHED,
-    faces_table,
-    report_html,
-    shown_overlays,
-)
+from stcal.sfm.report.run_page import CONTROL, FIRST_IMAGES, PUBLISHED, faces_table, report_html, shown_overlays
 from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
-from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun, folder_of, require_run, verify
+from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun
 from stcal.sfm.runs.stages import DetectedImages, Task
-from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, complete_interrupted
+from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, require_run, verify
 
 LONGEST_NAME, HASH_DIGITS = 200, 12
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -94,7 +74,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     common; not without ``page``.
     """
     stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
-    save(stage / "detections.csv", detections_csv(seen.observations))
+    files.save(stage / "detections.csv", detections_csv(seen.observations))
     pictures = {image.file.name: image for image in seen.detection.images}
     left_out: dict[str, frozenset[Label]] = {}
 
@@ -102,7 +82,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
         name, picture = image.observations.name, pictures[image.observations.name]
         small, crossed = (picture.thumbnail, picture.thumbnail_scale), left_out.get(name, frozenset())
         drawn = image.observations, face_ids, focal_px, len(image.notes), crossed
-        save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
+        files.save(overlay_path(stage, name), kept_overlay(task.folder.cache, picture.digest, *small, *drawn))
 
     try:
         with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
@@ -121,7 +101,7 @@ def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iter
     except StcalError as error:
         if page:
             found = found_in_all(seen.labelled)
-            save(stage / "report.html", _page_on_failure(task.target.name, error, found, seen))
+            files.save(stage / "report.html", _page_on_failure(task.target.name, error, found, seen))
             error.append(f"; {found}")
         raise
 
@@ -139,33 +119,32 @@ def overlay_path(out: Path, name: str) -> Path:
 def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     """Writes database, models, faces and report beside the overlays; returns the run as it was written."""
     observations, models = result.observations, {s.model.group: s.model for s in result.solutions}
-    ids, as_measured = image_ids(observations), {image.name: image.centre_px.copy() for image in observations}
+    ids, by_name = image_ids(observations), {image.name: image for image in observations}
+    keypoints = {name: image.centre_px for name, image in by_name.items()}
     for model in models.values():  # as the models of the groups correct them
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            as_measured[name][model.keypoint[rows]] = model.corrected_px()[rows]
-    corrected = list(as_measured.values())
-    (out / DATABASE).parent.mkdir()
-    write_database(out / DATABASE, result.camera, observations, result.graph.pairs, corrected)
-    save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
-    for name, model in models.items():
-        folder = out / MODELS / name  # "models/." where the images lie directly in their folder
-        write_model(folder, [model], observations, ids, result.camera)
+            keypoints[name] = model.keypoints_px(by_name[name], rows)
+    corrected = list(keypoints.values())
+    (out / files.DATABASE).parent.mkdir()
+    write_database(out / files.DATABASE, result.camera, observations, result.graph.pairs, corrected)
+    files.save(out / "labels.csv", labels_csv(observations, corrected, list(result.residuals_px().values())))
+    for name, model in models.items():  # "models/." where the images lie directly in their folder
+        write_model(out / files.MODELS / name, [model], observations, ids, result.camera)
     adjusted = Camera.of(result.calibration.camera, result.camera.colmap_model)
-    write_model(out / TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
-    save_camera(out / CAMERA, result.camera)
+    write_model(out / files.TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
+    save_camera(out / files.CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
-        save_camera(out / REFINED_CAMERA, refined)
-    save_target(out / TARGET, result.target_design)
+        save_camera(out / files.REFINED_CAMERA, refined)
+    save_target(out / files.TARGET, result.target_design)
     if result.board_design.rows:
-        save_board(out / BOARD, result.board_design)
-    report = with_judgement(report_of(result).content())
+        save_board(out / files.BOARD, result.board_design)
+    report, faces = with_judgement(report_of(result).content()), None
     judgement = Judgement.model_validate(report["judgement"])
-    faces = None
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
         faces = FacesFile.of(result.target, result.target_design, options, factor, rims, doubted)
-        save(out / "faces.json", json_text(faces.content()))
+        files.save(out / "faces.json", files.json_text(faces.content()))
         require_result_written(out / "faces.json", faces)
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
@@ -177,8 +156,8 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
 def write_report(out: Path, report: dict, run: Path) -> None:
     """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
     page, _ = _report_page(run, report)
-    save(out / "report.json", json_text(report))
-    save(out / "report.html", page)
+    files.save(out / "report.json", files.json_text(report))
+    files.save(out / "report.html", page)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,17 +198,14 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
     InputError
         Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
     """
-    run, out = folder_of(run), None if out is None else Path(out)
+    run, out = run.folder if isinstance(run, SavedRun) else Path(run), None if out is None else Path(out)
     require_run(run)
     if out is not None and out.suffix.lower() == ".pdf":
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}",
-        )
+        fault = f"--out {out}: the page is HTML"
+        raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {out.with_suffix('.html')}, and --pdf for {out.name}")
     if pdf:
         require_pdf()
-    complete_interrupted(run)
-    notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
+    notes = tuple(verify(run).notes(but=("report.html", files.REPORT_PDF)))
     with contextlib.nullcontext(run) if out else added_results(run) as stage:
         file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
         with as_written(run / "report.json"):
@@ -237,7 +213,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
             page, gone = _report_page(run, report)
         contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
         for place, content in contents.items():
-            save(place, content)
+            files.save(place, content)
     return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), gone, notes)
 
 
@@ -252,7 +228,7 @@ def _report_page(run: Path, report: dict) -> tuple[str, int]:
     free = 1 - unknown / (2 * max(report["summary"]["observations"], 1))
     factor = report["summary"]["sigma_factor"] * float(np.sqrt(max(free, 0.01)))
     with as_written(run / "labels.csv"):
-        for row in csv_rows(read_bytes(run / "labels.csv", MODEL_BYTES).decode()):
+        for row in csv_rows(files.read_bytes(run / "labels.csv", files.MODEL_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 rows[row["image"]].append([float(row[key]) for key in DRAWN])
     residuals = {name: _with_normalised(np.array(own).reshape(-1, len(DRAWN)), factor) for name, own in rows.items()}
@@ -279,18 +255,15 @@ def require_report(saved: SavedRun) -> None:
             overlay_path(saved.folder, name).stat()
         _report_page(saved.folder, report)
     if not os.access(saved.folder, os.W_OK):
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE",
-            f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it",
-        )
+        fault = f"run {saved.folder}: cannot be written to, and the comparison goes into its report"
+        raise InputError("E-OUTPUT-UNWRITABLE", f"{fault}; copy it")
 
 
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
     rows: list[list[Any]] = []
-    for each in seen.labelled:
-        image = each.observations
-        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+    for image in seen.observations:
+        dots = _count_dots(image)
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
     left_out = [f"{each.observations.name}: {note}" for each in seen.labelled for note in each.notes]
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
@@ -306,7 +279,6 @@ def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedIma
 
 
 def run_text(result: RunResult) -> str:
-    """Returns the result of a run for the terminal."""
     return "\n".join(part for line in document_of(result).text().splitlines() for part in wrapped(line))
 
 
@@ -342,9 +314,9 @@ def document_of(result: RunResult) -> Document:
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
     if (out := result.out) is not None:
-        files = [f"faces:  {out / 'faces.json'}"] if faces else []
-        files += [f"camera: {out / REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
-        blocks.append(Printed([*files, f"report: {out / 'report.html'}"]))
+        written = [f"faces:  {out / 'faces.json'}"] if faces else []
+        written += [f"camera: {out / files.REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
+        blocks.append(Printed([*written, f"report: {out / 'report.html'}"]))
     first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
     return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
@@ -355,7 +327,7 @@ def _remarks(result: RunResult) -> Iterator[str]:
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
     noted = {image.observations.name: image.notes for image in result.labelled if image.notes}
     outliers = sum(len(solution.outliers) for solution in result.solutions)
-    for lines in (_skipped(result.detection), unmapped):
+    for lines in (skipped_lines(result.detection), unmapped):
         yield from lines[:FIRST]
         if len(lines) > FIRST:
             yield f"and {len(lines) - FIRST} more, which the report names"
@@ -374,10 +346,8 @@ def _remarks(result: RunResult) -> Iterator[str]:
         source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
         yield f"rims: faces are those of the luminous surface, behind rims of {height:.3f}{source}"
     if of_dots:
-        yield (
-            f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated, and no face depends "
-            "on it"
-        )
+        before = f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated"
+        yield f"{before}, and no face depends on it"
     if result.options.solve == "paper" or not result.options.eccentricity:
         yield PUBLISHED if result.options.solve == "paper" else CONTROL
 
@@ -403,50 +373,41 @@ def _on_size(result: RunResult) -> Iterator[str]:
         yield f"scale: from {distances}"
     if "drawing" in sources:
         (drawn,) = known_distances(result.board_design)
-        yield (
-            f"scale: unknown, nothing of known size is in view; the unit is such that {drawn.first} and {drawn.second} "
-            f"are {drawn.mm:g} mm apart, as drawn"
-        )
+        apart = f"{drawn.first} and {drawn.second} are {drawn.mm:g} mm apart, as drawn"
+        yield f"scale: unknown, nothing of known size is in view; the unit is such that {apart}"
 
 
 def _on_camera(result: RunResult) -> Iterator[str]:
     """Yields how well a camera that was found from the photographs is determined, or that its stated σ is left out."""
     given, refined = result.camera.covariance, result.refined_camera
     if given is not None and not result.options.refine_camera:
-        yield (
-            f"the camera file states σ of its parameters ({np.sqrt(given[0, 0]):.2g} px of the focal length), and this "
-            "run takes them as exact: no σ below includes them; --refine-camera adjusts the intrinsics within them and "
-            "includes them in all σ"
-        )
+        stated = f"the camera file states σ of its parameters ({np.sqrt(given[0, 0]):.2g} px of the focal length)"
+        remedy = "--refine-camera adjusts the intrinsics within them and includes them in all σ"
+        yield f"{stated}, and this run takes them as exact: no σ below includes them; {remedy}"
     if result.camera_given or refined is None or refined.covariance is None:
         return
-    sigma, focal, centre = np.sqrt(np.diag(refined.covariance)), refined.focal, refined.centre
-    yield (
-        f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
-        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px from the centre of the "
-        "first pixel (in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more)"
-    )
+    sigma, focal = np.sqrt(np.diag(refined.covariance)), refined.focal
+    fx, fy, cx, cy = (f"{v:.2f} ± {s:.2f}" for v, s in zip((*focal, *refined.centre), sigma, strict=False))
+    corner = "in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more"
+    centre = f"principal point {cx}, {cy} px from the centre of the first pixel ({corner})"
+    yield f"camera: found from the photographs: f {fx}, {fy} px, {centre}"
     if sigma[0] > WEAK_FOCAL * focal[0]:
-        yield (
-            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from a shorter "
-            f"distance, and of faces tilted by 30° to 60°, or give a camera file"
-        )
+        views = "take views from a shorter distance, and of faces tilted by 30° to 60°, or give a camera file"
+        yield f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: {views}"
 
 
-def _skipped(detection: DetectionResult) -> list[str]:
+def skipped_lines(detection: DetectionResult) -> list[str]:
     return [f"skipped {file.name}: {file.reason}" for file in detection.skipped]
 
 
-def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
-    """Returns faces and dots of each image, and what was left out."""
-    return "\n".join([*found_lines(labelled), *_skipped(detection), found_in_all(labelled)])
+def _count_dots(image: ImageObservations) -> int:
+    return sum(isinstance(label, DotLabel) for label in image.labels)
 
 
 def found_in_all(labelled: Sequence[LabelledImage]) -> str:
     """Returns in how many images faces and board are, and what was left out in most of them."""
     images, count = [each.observations for each in labelled], len(labelled)
-    faces = sum(bool(image.face_ids()) for image in images)
-    dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
+    faces, dots = sum(bool(image.face_ids()) for image in images), sum(_count_dots(image) > 0 for image in images)
     alike: dict[str, list[str]] = {}
     for each in labelled:
         for kind, note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
@@ -461,7 +422,7 @@ def found_in_all(labelled: Sequence[LabelledImage]) -> str:
 
 def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
     """Yields faces and dots of each image, and what was left out in it and helps."""
-    counts = [sum(isinstance(label, DotLabel) for label in each.observations.labels) for each in labelled]
+    counts = [_count_dots(each.observations) for each in labelled]
     for each, dots in zip(labelled, counts, strict=True):
         image = each.observations
         faces = ", ".join(sorted(image.face_ids())) or "none"

@@ -17,7 +17,7 @@ from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, Note, lost_groups
 from stcal.sfm.detect.defocus import Focus
-from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
+from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD, widest_angle_rad
 from stcal.sfm.report.check import Check
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.comparisons import Comparison, Crosscheck
@@ -179,7 +179,6 @@ class ReportFile(ResultFile):
 
 
 def report_of(result: RunResult) -> ReportFile:
-    """Returns the report of a run."""
     models, options, camera = result.final_models(), result.options, result.calibration.camera
     residual = {name: model.residuals_px(camera) for name, model in models.items()}
     shown = ("solve", "frame", "eccentricity", "refine_camera")
@@ -252,8 +251,7 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
         "rim_sigma_mm": calibration.rim_sigma_mm if rims else None,
         "dot_rim_mm": result.board_design.rim_mm or None,
         "scale_from": sources,
-        "print_factor": of_print.print_factor if of_print else None,
-        "bend_factor": of_print.bend_factor if of_print else None,
+        **{key: getattr(of_print, key, None) for key in ("print_factor", "bend_factor")},
         "camera_given": result.camera_given,
         "circle_sigma_px": calibration.circle_sigma_px,
         "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
@@ -285,17 +283,14 @@ def face_row(result: RunResult, face_id: str) -> Row:
 
 
 def _between(result: RunResult) -> list[Row]:
-    sigma = result.target.distance_sigma_mm
-    return [
-        {
-            "a": a,
-            "b": b,
-            "distance_mm": float(np.linalg.norm(pose.translation - other.translation)),
-            "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
-            "angle_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[:, 2] @ other.rotation[:, 2], -1, 1)))),
-        }
-        for (a, pose), (b, other) in combinations(result.target.target_from_face.items(), 2)
-    ]
+    sigma, rows = result.target.distance_sigma_mm, []
+    for (a, pose), (b, other) in combinations(result.target.target_from_face.items(), 2):
+        distance_mm = float(np.linalg.norm(pose.translation - other.translation))
+        sigma_um = MICRO * sigma[a, b] if (a, b) in sigma else None
+        angle_deg = float(np.degrees(np.arccos(np.clip(pose.rotation[:, 2] @ other.rotation[:, 2], -1, 1))))
+        length = {"distance_mm": distance_mm, "distance_sigma_um": sigma_um}
+        rows.append({"a": a, "b": b} | length | {"angle_deg": angle_deg})
+    return rows
 
 
 def _group(result: RunResult, solution: GroupSolution) -> Row:
@@ -344,16 +339,11 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
         for k, r in zip(model.point_index, residual[name], strict=True):
             label = model.labels[k]
             gathered.setdefault((name if isinstance(label, DotLabel) else "", label), []).append(r)
-    return [
-        {
-            "label": str(label),
-            "group": group or None,
-            "observations": len(rows),
-            "rms_px": rms(np.array(rows)),
-            "max_px": float(np.linalg.norm(rows, axis=1).max()),
-        }
-        for (group, label), rows in sorted(gathered.items())
-    ]
+    rows = []
+    for (group, label), own in sorted(gathered.items()):
+        sizes = {"rms_px": rms(np.array(own)), "max_px": float(np.linalg.norm(own, axis=1).max())}
+        rows.append({"label": str(label), "group": group or None, "observations": len(own)} | sizes)
+    return rows
 
 
 def _left_out(result: RunResult) -> Row:
@@ -365,19 +355,11 @@ def _left_out(result: RunResult) -> Row:
             known = len(mapped & set(observed[name].observations.labels))
             gate, value = ("known_circles", known) if known < MIN_POINTS else ("fitting_circles", None)
             images.append({"name": name, "reason": reason, "gate": gate, "value": value, "limit": MIN_POINTS})
-        circles += [
-            {
-                "image": o.image,
-                "label": str(o.label),
-                "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the others; "
-                "look for glare, dirt, a part hidden, or something that moved",
-                "gate": "residual",
-                "value": o.residual_px,
-                "limit": o.limit_px,
-                "unit": "px",
-            }
-            for o in solution.outliers
-        ]
+        for o in solution.outliers:
+            residual = f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the others"
+            reason = f"{residual}; look for glare, dirt, a part hidden, or something that moved"
+            gate = {"gate": "residual", "value": o.residual_px, "limit": o.limit_px, "unit": "px"}
+            circles.append({"image": o.image, "label": str(o.label), "reason": reason} | gate)
         mapped_images = [observed[name].observations for name in solution.model.images]
         circles += _without_point(solution.model, mapped_images, {(o.image, o.label) for o in solution.outliers})
     return {
@@ -396,23 +378,20 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
     """Returns labelled circles of mapped images that are no points of the model: seen once, or from one direction."""
     rays: dict[str, list[tuple[str, np.ndarray]]] = {}
     for image, pose in zip(images, model.camera_from_model, strict=True):
-        for k in range(len(image)):
-            if image.labels[k] not in model.labels and (image.name, image.labels[k]) not in outliers:
-                ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
-                rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
-    circles = []
+        for label, centre in zip(image.labels, image.centre, strict=True):
+            if label not in model.labels and (image.name, label) not in outliers:
+                ray = pose.rotation.T @ np.append(centre, 1.0)
+                rays.setdefault(label, []).append((image.name, ray / np.linalg.norm(ray)))
+    circles, needed = [], float(np.degrees(MIN_RAY_ANGLE_RAD))
     for label, sightings in rays.items():
-        direction = np.array([ray for _, ray in sightings])
-        angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
-        needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
+        angle = float(np.degrees(widest_angle_rad(np.array([ray for _, ray in sightings]))))
         if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
             reason = "seen in one mapped image of its group only, 2 needed; photograph it from another place too"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
-            reason = (
-                f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
-            )
+            within = f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed"
+            reason = f"{within}; add views from further apart"
         circles += [{"image": name, "label": str(label), "reason": reason} | gate for name, _ in sightings]
     return circles
 
@@ -424,7 +403,6 @@ def _scene(result: RunResult) -> Row:
         for image, pose in zip(model.images, model.camera_from_model, strict=True):
             position_mm = pose.inverse().translation
             cameras.append({"image": image, "group": model.group, "position_mm": position_mm, "axes": pose.rotation})
-        dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
-        if dots:
+        if dots := [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]:
             boards[model.group] = model.xyz_model[dots]
     return {"cameras": cameras, "boards": boards, "circles": result.target.circles}

@@ -89,14 +89,10 @@ class RunOptions:
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """Returns the options of the adjustment, with every default decided. Raises InputError: no such choice."""
         eccentricity = self.eccentricity and self.solve != "paper"
-        return AdjustOptions(
-            target.face(self.reference_face or target.faces[0].id).id,
-            self.solve or ("joint" if eccentricity else "chain"),
-            self.frame or ("plane" if eccentricity else "three-point"),
-            eccentricity,
-            self.flatness_mm,
-            self.refine_camera,
-        )
+        reference = target.face(self.reference_face or target.faces[0].id).id
+        solve = self.solve or ("joint" if eccentricity else "chain")
+        frame = self.frame or ("plane" if eccentricity else "three-point")
+        return AdjustOptions(reference, solve, frame, eccentricity, self.flatness_mm, self.refine_camera)
 
     def settled(self, target: TargetDesign) -> "RunOptions":
         """Returns the same options with every default decided. Raises InputError: no such choice."""
@@ -104,11 +100,9 @@ class RunOptions:
             target.face(face)
         settled = replace(self, **asdict(self.adjustment(target)))
         if settled.solve != "joint" and (self.rim or any(target.rim_of().values())):
-            raise InputError(
-                "E-RIM-SOLVE",
-                f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}: only the joint "
-                "adjustment corrects rims; use --solve joint, or leave the rims out",
-            )
+            given = f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}"
+            fault = f"{given}: only the joint adjustment corrects rims"
+            raise InputError("E-RIM-SOLVE", f"{fault}; use --solve joint, or leave the rims out")
         return settled
 
     def for_run(self, camera: CameraModel | None, target: TargetDesign, board: BoardDesign) -> "RunOptions":
@@ -120,33 +114,22 @@ class RunOptions:
             options = replace(options, refine_camera=True)
             known = f"camera file {camera.source}: states its focal length to ±{focal_sigma_px(camera):.3g} px only"
             warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
-        of_circles = {
-            "--solve paper": options.solve == "paper",
-            "--compare paper": options.compare is not None,
-            "--board-only": options.board_only,
-        }
+        of_circles = {"--solve paper": options.solve == "paper", "--compare paper": options.compare is not None}
+        of_circles["--board-only"] = options.board_only
         for name in (name for name, is_given in of_circles.items() if printed and is_given):
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
-            )
+            fault = f"{name}: only for targets of circles, and faces of this one have boards or tags"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
         if camera is None and not (board.rows or printed):
-            raise InputError(
-                "E-CAMERA-NEEDED",
-                "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-                "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or "
-                "tags",
-            )
+            fault = "circles without a board of dots need a camera file, which `stcal-sfm calibrate-camera` makes"
+            remedy = "the camera is also found if a board is in view, or if faces have a board or tags"
+            raise InputError("E-CAMERA-NEEDED", f"missing option '--camera': {fault}; {remedy}")
         options = options.settled(target)
         if options.compare:
             require_dots(board, f"--compare {options.compare}")
             if options.solve != "joint" or not options.eccentricity:
-                raise InputError(
-                    "E-OPTION-CONFLICT",
-                    f"--compare paper: compares with the joint adjustment, but --solve is {options.solve}"
-                    f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity "
-                    "out",
-                )
+                given = f"--solve is {options.solve}{'' if options.eccentricity else ' without eccentricity'}"
+                fault = f"--compare paper: compares with the joint adjustment, but {given}"
+                raise InputError("E-OPTION-CONFLICT", f"{fault}; leave --solve and --no-eccentricity out")
         return options
 
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
@@ -173,6 +156,5 @@ def focal_sigma_px(camera: CameraModel) -> float:
 def require_dots(board: BoardDesign | None, option: str) -> None:
     """Refuses a board of corners for an option whose method finds dots."""
     if isinstance(board, CornerBoard):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
-        )
+        fault = f"{option}: finds boards of dots, and --board is one of squares or tags"
+        raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")

@@ -1,8 +1,9 @@
 """A run: what it was given and what it found, just made, or read back from its folder for every command that continues
-from it; and the comparison of its files with the hashes stored at its end."""
+from it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
@@ -16,21 +17,9 @@ from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, frozen, require_
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import CameraPrior, camera_prior
+from stcal.io import files
+from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
-from stcal.io.files import (
-    BOARD,
-    CAMERA,
-    DATABASE,
-    MODEL_BYTES,
-    RUN_MARKER,
-    TARGET,
-    TARGET_MODEL,
-    digest_of,
-    own_digest,
-    read_bytes,
-    require_unchanged,
-)
 from stcal.io.images import name_fault
 from stcal.io.json import Part, checked, read_json
 from stcal.io.table import csv_rows
@@ -55,15 +44,7 @@ from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.comparisons import Comparison
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import GroupSolution
-from stcal.sfm.runs.transaction import (
-    AGAIN,
-    RESULTS,
-    MarkerFile,
-    as_written,
-    complete_interrupted,
-    files_below,
-    read_marker,
-)
+from stcal.sfm.runs.transaction import AGAIN, MarkerFile, as_written, complete_interrupted, read_marker, require_run
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -150,7 +131,7 @@ class SavedRun(Brief):
     @property
     def database(self) -> Path:
         """Path of COLMAP's database."""
-        return self.folder / DATABASE
+        return self.folder / files.DATABASE
 
     @property
     def folder(self) -> Path:
@@ -199,11 +180,8 @@ class SavedRun(Brief):
 
 def no_faces(folder: Path) -> InputError:
     """Returns the error of a run without a result for faces."""
-    return InputError(
-        "E-RUN-NO-FACES",
-        f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
-        "that show them",
-    )
+    fault = f"run {folder}: no faces.json: of the board alone, or of another version"
+    return InputError("E-RUN-NO-FACES", f"{fault}; for faces, run it on photographs that show them")
 
 
 def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
@@ -213,27 +191,15 @@ def by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
 
 def target_in(faces: FacesFile) -> CalibratedTarget:
     """Returns the target in the content of ``faces.json``, which has no poses of groups."""
-    joint = faces.circles_joint_covariance_mm2
-    return CalibratedTarget(
-        faces.reference_face,
-        faces.poses(),
-        by_circle(faces.circles),
-        {},
-        dict(faces.target_from_face_covariance),
-        by_circle(faces.circle_covariance_mm2),
-        {},
-        None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
-        None if joint is None else joint.matrix(),
-    )
+    joint, ppm = faces.circles_joint_covariance_mm2, faces.scale_sigma_ppm
+    scale_sigma, whole = None if ppm is None else 1e-6 * ppm, None if joint is None else joint.matrix()
+    covariances = dict(faces.target_from_face_covariance), by_circle(faces.circle_covariance_mm2)
+    circles = by_circle(faces.circles)
+    return CalibratedTarget(faces.reference_face, faces.poses(), circles, {}, *covariances, {}, scale_sigma, whole)
 
 
 AnyRun = SavedRun | str | Path
 """A finished run: its folder, or what ``load_run`` or ``run`` returned."""
-
-
-def folder_of(run: AnyRun) -> Path:
-    """Returns the folder of a run; an error if no file of it was kept."""
-    return run.folder if isinstance(run, SavedRun) else Path(run)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
@@ -284,12 +250,8 @@ class RunResult(SavedRun):
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
         board, drawn = self.board_design, self.target_design.up_to_scale
-        known = {
-            "board": board.rows,
-            "faces": faces_of_known_shape(board),
-            "distances": known_distances(board) and not drawn,
-            "drawing": drawn,
-        }
+        known: dict[str, Any] = {"board": board.rows, "faces": faces_of_known_shape(board), "drawing": drawn}
+        known["distances"] = known_distances(board) and not drawn
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
@@ -323,9 +285,8 @@ class RunResult(SavedRun):
             of_images = zip(model.images, model.camera_from_model, scale**2 * alone, model.rows_by_image(), strict=True)
             for name, pose, covariance, rows in of_images:
                 labels = tuple(model.labels[k] for k in model.point_index[rows])
-                images.append(
-                    ImageResult(name, model.group, pose, covariance, labels, corrected[rows], residuals[rows])
-                )
+                measured = labels, corrected[rows], residuals[rows]
+                images.append(ImageResult(name, model.group, pose, covariance, *measured))
         return tuple(images)
 
     def final_models(self) -> dict[str, GroupModel]:
@@ -344,11 +305,8 @@ class RunResult(SavedRun):
 
     def unadjusted(self) -> dict[str, frozenset[Label]]:
         """Returns the labels of the keypoints that are not in the result, by image."""
-        residuals = self.residuals_px()
-        return {
-            image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residuals[image.name]).any(axis=1)))
-            for image in self.observations
-        }
+        without = {name: np.isnan(residual).any(axis=1) for name, residual in self.residuals_px().items()}
+        return {image.name: frozenset(compress(image.labels, without[image.name])) for image in self.observations}
 
     def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
         """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
@@ -369,9 +327,8 @@ class RunResult(SavedRun):
         try:
             from pandas import DataFrame
         except ImportError as error:
-            raise InputError(
-                "E-EXTRA-MISSING", "DataFrame: needs pandas; install stereo-target-calibration[pandas]"
-            ) from error
+            fault = "DataFrame: needs pandas"
+            raise InputError("E-EXTRA-MISSING", f"{fault}; install stereo-target-calibration[pandas]") from error
         target, table = self.target, []
         if rows == "faces":
             for face, pose in target.target_from_face.items():
@@ -461,14 +418,6 @@ def saved_run(run: AnyRun) -> SavedRun:
     return run
 
 
-def require_run(folder: Path) -> None:
-    """Refuses a folder that is not of a run."""
-    if not (folder / RUN_MARKER).is_file():
-        raise InputError(
-            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
-        )
-
-
 @require_arguments
 def load_run(folder: str | Path) -> SavedRun:
     """Reads a finished run.
@@ -491,24 +440,21 @@ def load_run(folder: str | Path) -> SavedRun:
     folder = Path(folder)
     require_run(folder)
     complete_interrupted(folder)
-    has_target = (folder / TARGET).is_file()
-    target = load_target(folder / TARGET) if has_target else None
-    without_board = target is not None and target.has_scale and not (folder / BOARD).exists()
-    inputs = (CAMERA, TARGET) if without_board else (CAMERA, TARGET, BOARD)
-    needed = (*inputs, "labels.csv", DATABASE, "report.json", "faces.json")
+    target = load_target(folder / files.TARGET) if (folder / files.TARGET).is_file() else None
+    has_board = target is None or not target.has_scale or (folder / files.BOARD).exists()
+    inputs = (files.CAMERA, files.TARGET, *[files.BOARD] * has_board)
+    needed = (*inputs, "labels.csv", files.DATABASE, "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing == ["faces.json"]:
         raise no_faces(folder)
     if missing:
-        raise InputError(
-            "E-RUN-UNFINISHED",
-            f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
-        )
+        fault = f"run {folder}: unfinished, or of another version: no {', '.join(missing)}"
+        raise InputError("E-RUN-UNFINISHED", f"{fault}; run it again")
     assert target is not None
-    marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
-    camera = read_camera(folder / CAMERA).calibrated(0, 0)
-    board = scale_reference(None if without_board else load_board(folder / BOARD), target)
-    with as_written(folder / RUN_MARKER):
+    marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (files.RUN_MARKER, "faces.json", "report.json"))
+    camera = read_camera(folder / files.CAMERA).calibrated(0, 0)
+    board = scale_reference(load_board(folder / files.BOARD) if has_board else None, target)
+    with as_written(folder / files.RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, photographs = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
     with as_written(folder / "report.json"):
@@ -519,9 +465,9 @@ def load_run(folder: str | Path) -> SavedRun:
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
         board = with_edge_sigma(board, observations)
-    for name in (RUN_MARKER, *needed):
-        if name != DATABASE:  # SQLite writes to it when it is read
-            require_unchanged(folder / name)
+    for name in (files.RUN_MARKER, *needed):
+        if name != files.DATABASE:  # SQLite writes to it when it is read
+            files.require_unchanged(folder / name)
     return SavedRun(folder, photographs, options, camera, target, board, observations, corrected, result, report)
 
 
@@ -534,7 +480,7 @@ def _options(stored: dict) -> RunOptions:
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
     """Observations and corrected centres from ``labels.csv``; ``names``: (name, group, circles) of the images."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
-    for row in csv_rows(read_bytes(path, MODEL_BYTES).decode()):
+    for row in csv_rows(files.read_bytes(path, files.MODEL_BYTES).decode()):
         if None in row.values():
             raise ValueError(f"image {row['image']}: keypoint {row['keypoint']}: its row is cut")
         rows[row["image"]].append(row)
@@ -550,8 +496,7 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         texts = [[row[column] for column in COLUMNS] for row in image_rows]
         values = frozen(np.array(texts, float).reshape(-1, len(COLUMNS)), (None, len(COLUMNS)), name)
         centre_px, covariance = values[:, :2], values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
-        fault = first_fault(covariance, OF_PIXEL, definite=True)
-        if fault is not None:
+        if (fault := first_fault(covariance, OF_PIXEL, definite=True)) is not None:
             raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
         centre, shape = camera.normalised_from_pixel(centre_px), np.zeros_like(covariance)
         observations.append(ImageObservations(name, group, labels, centre_px, centre, shape, covariance))
@@ -559,68 +504,15 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
     return tuple(observations), tuple(corrected)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustedRun:
-    """The final adjustment of a run."""
-
-    state: Adjusted  # groups in mm in the target frame, at the minimum, with σ as in the run
-    start: CalibratedTarget  # result of the run
-    prior: CameraPrior | None  # of the intrinsics if they were adjusted
-
-
-def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame."""
+def adjusted_run(run: SavedRun) -> tuple[Adjusted, CalibratedTarget]:
+    """Repeats the final adjustment of a run, which moves nothing, from its model in mm in the target frame; returns it
+    with σ as in the run, and the result of the run."""
     ids = image_ids(run.observations)
-    read = read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
+    read = read_model(run.folder / files.TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
     placed = {model.group: Rigid() for model in models}
     start = CalibratedTarget(run.faces.reference_face, run.faces.poses(), by_circle(run.faces.circles), placed)
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     state = with_scatter(state, start, run.target_design, run.faces.frame)
-    return AdjustedRun(replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start, prior)
-
-
-@dataclass(frozen=True, slots=True)
-class Verified:
-    """Differences of a run's folder from what the run of ``version`` wrote, as paths below the folder."""
-
-    version: str
-    missing: tuple[str, ...]  # files that are gone
-    changed: tuple[str, ...]
-    added: tuple[str, ...]  # files among the results that the run did not make
-
-    def notes(self, but: tuple[str, ...] = ()) -> list[str]:
-        """Returns one note on all files but some that differ, or none."""
-        kinds = {kind: [n for n in getattr(self, kind) if n not in but] for kind in ("missing", "changed", "added")}
-        clauses = [
-            f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names
-        ]
-        return [f"the run's folder is not as the run left it: {'; '.join(clauses)}"] if clauses else []
-
-
-def verify(run: AnyRun) -> Verified:
-    """Compares the files of a finished run with the hashes that were kept when it ended.
-
-    Raises InputError: not a run's folder, or one without hashes.
-    """
-    run = folder_of(run)
-    require_run(run)
-    complete_interrupted(run)
-    content = read_json(run / RUN_MARKER, "run", AGAIN)
-    with as_written(f"run {run / RUN_MARKER}"):
-        marker = checked(content, MarkerFile)
-    if marker.sha256 is None:
-        raise InputError(
-            "E-RUN-UNFINISHED",
-            f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of another version (stcal {marker.version}); "
-            "run it again",
-        )
-    present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
-    known = marker.sha256
-    now = {
-        name: own_digest(content) if name == RUN_MARKER else digest_of(run / name) for name in known.keys() & present
-    }
-    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - known.keys())
-    changed = (name for name, digest in now.items() if digest != known.get(name))
-    return Verified(marker.version, *(tuple(sorted(names)) for names in (known.keys() - present, changed, added)))
+    return replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start

@@ -42,14 +42,7 @@ from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ImageObservations, Note, 
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labelling import Detection, LabelledImage, is_board_alone, label_boards, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
-from stcal.sfm.mapping.body import (
-    LENS,
-    MIN_CORNERS,
-    map_body,
-    place_and_find_camera,
-    place_with_camera,
-    unknown_lens,
-)
+from stcal.sfm.mapping.body import LENS, MIN_CORNERS, map_body, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import Mapping, left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, image_graph, pair_of_model, rank_pairs
@@ -113,10 +106,8 @@ class DetectedImages(Brief):
     def images(self) -> dict[str, Detection]:
         """Labels, centres and covariances, px, by the name of the image."""
         return {
-            (seen := image.observations).name: Detection(
-                seen.labels, seen.centre_px, seen.covariance_px2, tuple(image.notes)
-            )
-            for image in self.labelled
+            seen.name: Detection(seen.labels, seen.centre_px, seen.covariance_px2, tuple(image.notes))
+            for image, seen in zip(self.labelled, self.observations, strict=True)
         }
 
 
@@ -236,7 +227,6 @@ class Groups:
 
     @property
     def observations(self) -> list[ImageObservations]:
-        """Labelled centres of all images."""
         return [image.observations for image in self.labelled]
 
     @property
@@ -252,15 +242,11 @@ class Groups:
         """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
         images = [image for image in self.labelled if image.observations.group == TOP_GROUP]
         lost = [i.observations.name for i in images if any(getattr(n, "code", "") == BOARD_LEFT_OUT for n in i.notes)]
-        remark = (
-            f"; the board of {len(lost)} of them ({_listed(lost)}) is elsewhere and was left out, so that they are "
-        )
-        note = (
-            f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
-            f"moved{f'{remark}more than one group' if lost else ''}; put the images of each setting of target and "
-            "board into a folder of its own, IMAGES/<group>/"
-        )
-        return [note] if images else []
+        one = f"{len(images)} images that lie in no folder of a group are one group, in which only the camera moved"
+        elsewhere = f"the board of {len(lost)} of them ({_listed(lost)}) is elsewhere and was left out"
+        remark = f"; {elsewhere}, so that they are more than one group" if lost else ""
+        remedy = "put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+        return [f"assumed: {one}{remark}; {remedy}"] if images else []
 
     def unseen_notes(self, target: TargetDesign) -> list[str]:
         """Returns notes on rows and columns of the board, and on circles or corners of the faces in the result, that no
@@ -271,10 +257,8 @@ class Groups:
         every = (label for face in target.faces if face.id in faces for label in face.labels())
         missing = [str(label) for label in every if label not in mapped]
         them = "it" if len(missing) == 1 else "them"
-        note = (
-            f"{_listed(missing)}: not in the result, as too few images show {them} as drawn; check their design in "
-            "target.toml, unless something hides it"
-        )
+        what = f"{_listed(missing)}: not in the result, as too few images show {them} as drawn"
+        note = f"{what}; check their design in target.toml, unless something hides it"
         return [*unseen_lines(dots, self.board.rows, self.board.columns), *([note] if missing else [])]
 
 
@@ -287,12 +271,10 @@ def groups_of(task: Task, seen: DetectedImages) -> Groups:
     board_alone = options.board_only or is_board_alone(seen.detection)
     if board_alone and options.solve == "joint":
         options = replace(options, solve="chain", refine_camera=False)
-    board, camera = (
-        with_edge_sigma(task.board, observations),
-        start_of(seen.camera, seen.detection.camera, task.options),
-    )
-    skipped, needs_board = seen.detection.skipped, not task.target.has_scale
-    usable, notes = usable_groups(by_group(observations), skipped, board_alone, needs_board)
+    board = with_edge_sigma(task.board, observations)
+    camera = start_of(seen.camera, seen.detection.camera, task.options)
+    needs_board = not task.target.has_scale
+    usable, notes = usable_groups(by_group(observations), seen.detection.skipped, board_alone, needs_board)
     task.progress("map", 0, len(usable))
     graph = image_graph(observations, board)
     return Groups(labelled, tuple(usable), graph, camera, board, options, board_alone, tuple(notes))
@@ -304,7 +286,7 @@ def start_of(model: CameraModel, sized: Camera, options: RunOptions) -> Camera:
     return refinable(camera) if options.refine_camera else camera
 
 
-def map_groups(task: Task, groups: Groups, names: Collection[str] | None = None) -> Groups:
+def map_groups(task: Task, groups: Groups, names: Collection[str] = ()) -> Groups:
     """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
     with groups.naming_cause():
         if faces_of_known_shape(groups.board) and not groups.board_alone:
@@ -350,17 +332,14 @@ def usable_groups(
             remedy = "add photographs from other places"
             raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
         if not board_alone and not any(image.face_ids() for image in group):
-            raise MappingError(
-                "E-GROUP-NO-FACE",
-                f"group {name}: no face of the target recognised in {len(group)} images; look at the overlays, check "
-                "target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
-            )
+            fault = f"group {name}: no face of the target recognised in {len(group)} images"
+            remedy = "look at the overlays, check target.toml (radii, polarity) and the exposure"
+            raise MappingError("E-GROUP-NO-FACE", f"{fault}; {remedy}; for the board alone, use --board-only")
         if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
-            raise MappingError(
-                "E-GROUP-NO-BOARD",
-                f"group {name}: no board recognised in {len(group)} images; keep the whole board in view, check "
-                "board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
-            )
+            keys = "rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags"
+            fault = f"group {name}: no board recognised in {len(group)} images"
+            remedy = f"keep the whole board in view, check board.toml ({keys})"
+            raise MappingError("E-GROUP-NO-BOARD", f"{fault}; {remedy}")
         return group
 
     try:
@@ -370,8 +349,8 @@ def usable_groups(
         raise
 
 
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    return ", ".join(names[:most]) + " …" * (len(names) > most)
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:6]) + " …" * (len(names) > 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -394,32 +373,22 @@ class _Group:
             hasher.update(f"{image.name}\0{image.labels}\0".encode())
             hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
         hasher.update(self.matched.astype("<i8").tobytes())
-        plain = [
-            CACHE_VERSION,
-            made_by(),
-            self.skeleton,
-            [self.camera.width, self.camera.height, self.camera.parameters()],
-            *map(asdict, (self.target.patterns_alone(), self.board, self.pair_options)),
-            self.eccentricity,
-        ]
+        camera = [self.camera.width, self.camera.height, self.camera.parameters()]
+        designs = map(asdict, (self.target.patterns_alone(), self.board, self.pair_options))
+        plain = [CACHE_VERSION, made_by(), self.skeleton, camera, *designs, self.eccentricity]
         hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
         return hasher.hexdigest()[:40]
 
 
 def solve_groups(
-    groups: Groups,
-    target: TargetDesign,
-    scratch: Path,  # a folder that is made and removed again
-    cache: Path,  # folder for what later runs take up
-    progress: Progress,
-    names: Collection[str] | None = None,  # groups to solve, all if None
+    groups: Groups, target: TargetDesign, scratch: Path, cache: Path, progress: Progress, names: Collection[str] = ()
 ) -> tuple[dict[str, GroupSolution], list[str]]:
-    """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
-    solution, the error of the first group is raised."""
+    """Maps and refines group by group, all if no ``names`` are given; returns the solutions, and the reasons why groups
+    have none; raises the error of the first group if there is no solution. ``scratch`` is made and removed again."""
     images, options = groups.observations, groups.options
     inputs = {}
     for name, of_group in by_group(images).items():
-        if names is None or name in names:
+        if not names or name in names:
             within = np.array([image.group == name for image in images])
             pairs = (np.cumsum(within) - 1)[groups.graph.pairs[within[groups.graph.pairs].all(1)]]
             skeleton = [images[i].name for i in groups.graph.skeleton[name]]
@@ -525,11 +494,9 @@ def refine_or_explain(
         return refine(model, camera, target, board, eccentricity)
     except (MappingError, ConvergenceError) as error:
         if (image := _odd_one_out(model, camera, target, board, eccentricity)) is not None:
-            raise MappingError(
-                error.code,
-                f"group {model.group}: {image} contradicts the others, which agree without it; leave it out, with "
-                f"--exclude {image}, or take it again",
-            ) from error
+            fault = f"group {model.group}: {image} contradicts the others, which agree without it"
+            remedy = f"leave it out, with --exclude {image}, or take it again"
+            raise MappingError(error.code, f"{fault}; {remedy}") from error
         if moved_apart(model, camera, target, board):
             agree = "the circles of the faces agree with one another, and the dots of the board do"
             error.append(f"{LIKELY}{MOVED}, as {agree}: {MOVED_REMEDY}")
@@ -539,15 +506,13 @@ def refine_or_explain(
 def _odd_one_out(model: WorldModel, *arguments) -> str | None:
     """Returns the one image without which a group can be refined; None if there is none, or more than one."""
     cures: list[str] = []
-    if not LEAST_WITHOUT < len(model.images) <= MOST_WITHOUT:
-        return None
-    for k, image in enumerate(model.images):
+    for k, image in enumerate(model.images if LEAST_WITHOUT < len(model.images) <= MOST_WITHOUT else ()):
         with suppress(MappingError, ConvergenceError, DegenerateError):
             refine(model.without(model.image_index == k), *arguments)
             cures.append(image)
         if len(cures) > 1:
-            return None
-    return cures[0] if cures else None
+            break
+    return cures[0] if len(cures) == 1 else None
 
 
 def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:
@@ -561,8 +526,7 @@ def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: Board
     square, square_of_file = (weighted_rms_px(each) ** 2 for each in (found, stated))
     if square > (1 - EXPLAINS) * square_of_file:
         return None
-    cause = cause_of_file(camera, found.camera, found.covariance, found.colmap_model)
-    if cause is None:
+    if (cause := cause_of_file(camera, found.camera, found.covariance, found.colmap_model)) is None:
         return None
     rms = f"{significant(square**0.5)} px RMS from where the board has them, {significant(square_of_file**0.5)} px"
     return replace(cause, reason=f"{cause.reason}; by the dots of the board alone, which are {rms} with the file")
@@ -575,6 +539,5 @@ def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardD
         yield
     except UNSOLVED as error:
         if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
-            name = cause.cause
-            error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
+            error.append(f"{LIKELY}{cause.cause} ({cause.reason}): {cause.remedy}")
         raise

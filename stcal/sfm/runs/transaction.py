@@ -15,19 +15,8 @@ from pydantic import Field
 
 import stcal
 from stcal.errors import InputError, StcalError
-from stcal.io.files import (
-    CACHE,
-    INTERNAL,
-    REPORT_PDF,
-    RUN_ENTRIES,
-    RUN_MARKER,
-    digest_of,
-    json_text,
-    own_digest,
-    real_place,
-    save,
-)
-from stcal.io.json import ResultFile, read_result
+from stcal.io import files
+from stcal.io.json import ResultFile, checked, read_json, read_result
 
 ByFile = Annotated[str, "file"]
 AGAIN = "run it again"
@@ -54,15 +43,15 @@ class MarkerFile(ResultFile):
 
     def sealed(self, digests: dict[str, str]) -> "MarkerFile":
         """Returns the marker of results with these hashes, which include its own."""
-        others = {name: value for name, value in digests.items() if name != RUN_MARKER}
+        others = {name: value for name, value in digests.items() if name != files.RUN_MARKER}
         content = self.model_copy(update={"sha256": others}).content()
-        return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
+        return self.model_copy(update={"sha256": {files.RUN_MARKER: files.own_digest(content), **others}})
 
 
-STAGE, READY = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready"
+STAGE, READY = f"{files.INTERNAL}/unfinished", f"{files.INTERNAL}/ready"
 """Results that are being written, and results that are complete."""
 GONE = "gone.txt"  # names of the earlier results that complete ones lack
-RESULTS = tuple(name for name in RUN_ENTRIES if name != INTERNAL)
+RESULTS = tuple(name for name in files.RUN_ENTRIES if name != files.INTERNAL)
 """Entries that new results replace, or remove if the new results lack them."""
 LOOKED_AT = ("detections.csv", "overlays", "report.html")
 """Results of a run that fails which help to see why, and claim nothing."""
@@ -85,29 +74,23 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     raises, earlier results stay; without them detections and overlays are left to be looked at. ``content``: the
     marker; ``inputs``: what the run reads, by the word for it; what is no path is ignored."""
     out = Path(out)
-    length = len(os.fsencode(Path(real_place(out)) / LONGEST_DATABASE))
+    length = len(os.fsencode(Path(files.real_place(out)) / LONGEST_DATABASE))
     if length > MOST_DATABASE_BYTES:
-        raise InputError(
-            "E-OUTPUT-LENGTH",
-            f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most; give a "
-            "shorter --out",
-        )
+        fault = f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most"
+        raise InputError("E-OUTPUT-LENGTH", f"{fault}; give a shorter --out")
     require_ours(out)
-    place, frames = real_place(out), real_place(frames_folder(out))  # the run itself has put frames there
+    place, frames = files.real_place(out), files.real_place(frames_folder(out))  # the run itself has put frames there
     for word, given in inputs.items():
-        read = real_place(given) if isinstance(given, str | Path) else frames
+        read = files.real_place(given) if isinstance(given, str | Path) else frames
         if read != frames and place in (read, *read.parents):
-            raise InputError(
-                "E-OUTPUT-IS-INPUT",
-                f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
-                "or give another --out",
-            )
+            fault = f"{word} {given}: lies in the output folder {out}, whose files this run replaces"
+            raise InputError("E-OUTPUT-IS-INPUT", f"{fault}; copy it elsewhere, or give another --out")
     with _staged(out) as stage:
-        if not (out / RUN_MARKER).exists():
-            save(out / RUN_MARKER, json_text(content.content()))
+        if not (out / files.RUN_MARKER).exists():
+            files.save(out / files.RUN_MARKER, files.json_text(content.content()))
         earlier = is_finished(out)
         try:
-            yield RunFolder(out, stage, out / CACHE)
+            yield RunFolder(out, stage, out / files.CACHE)
         except BaseException as error:
             if earlier and isinstance(error, StcalError) and any(stage.iterdir()):
                 error.append("; the earlier results stay")
@@ -126,7 +109,8 @@ def added_results(out: Path) -> Iterator[Path]:
     with _staged(out) as stage:
         yield stage
         marker = read_marker(out)
-        gone = [REPORT_PDF] if (stage / "report.html").exists() and not (stage / REPORT_PDF).exists() else []
+        page, pdf = (stage / name for name in ("report.html", files.REPORT_PDF))
+        gone = [files.REPORT_PDF] if page.exists() and not pdf.exists() else []
         if marker.sha256 is not None:
             kept = {name: digest for name, digest in marker.sha256.items() if name not in gone}
             marker = marker.sealed(kept | _digests(stage))
@@ -137,18 +121,16 @@ def added_results(out: Path) -> Iterator[Path]:
 def _staged(out: Path) -> Iterator[Path]:
     """Locks the folder against other commands until the block ends, and provides an empty folder for new results."""
     _require_no_link(out)
-    lock = filelock.FileLock(out / INTERNAL / "lock")  # the system releases it when the process ends
+    lock = filelock.FileLock(out / files.INTERNAL / "lock")  # the system releases it when the process ends
     try:
-        (out / CACHE).mkdir(parents=True, exist_ok=True)
+        (out / files.CACHE).mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
         _complete(out)
         remove(out / STAGE)
         (out / STAGE).mkdir()
     except filelock.Timeout as error:
-        raise InputError(
-            "E-OUTPUT-IN-USE",
-            f"output folder {out}: another process is writing a run there; wait for its end, or give another --out",
-        ) from error
+        fault = f"output folder {out}: another process is writing a run there"
+        raise InputError("E-OUTPUT-IN-USE", f"{fault}; wait for its end, or give another --out") from error
     except OSError as error:
         lock.release()
         raise _unwritable(out, error) from error
@@ -165,9 +147,8 @@ def as_written(file: Path | str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(
-            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
-        ) from error
+        fault = f"{error.filename}: {error.strerror or error}"
+        raise InputError("E-RUN-DAMAGED", f"{fault}; the run needs it, run it again") from error
     except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
@@ -182,18 +163,17 @@ def is_finished(out: Path) -> bool:
 
 
 def read_marker(out: Path) -> MarkerFile:
-    """Reads the marker of a run's folder."""
-    return read_result(out / RUN_MARKER, MarkerFile, "run", AGAIN)
+    return read_result(out / files.RUN_MARKER, MarkerFile, "run", AGAIN)
 
 
 def _digests(stage: Path) -> dict[str, str]:
-    return {name: digest_of(stage / name) for name in sorted(files_below(stage)) if name.split("/")[0] in RESULTS}
+    return {name: files.digest_of(stage / name) for name in sorted(files_below(stage)) if name.split("/")[0] in RESULTS}
 
 
 def _exchange(out: Path, marker: MarkerFile, gone: Sequence[str]) -> None:
     """Puts new results in place of earlier ones; ``gone`` : earlier results that the new ones lack."""
-    save(out / STAGE / Path(RUN_MARKER).name, json_text(marker))
-    save(out / STAGE / GONE, "\n".join(gone))
+    files.save(out / STAGE / Path(files.RUN_MARKER).name, files.json_text(marker))
+    files.save(out / STAGE / GONE, "\n".join(gone))
     try:
         os.replace(out / STAGE, out / READY)
         _complete(out)
@@ -212,7 +192,7 @@ def _complete(out: Path) -> None:
             if os.path.lexists(ready / name):
                 os.replace(ready / name, out / name)
         with suppress(FileNotFoundError):  # moved already
-            os.replace(ready / Path(RUN_MARKER).name, out / RUN_MARKER)
+            os.replace(ready / Path(files.RUN_MARKER).name, out / files.RUN_MARKER)
     remove(ready)
 
 
@@ -237,14 +217,14 @@ def remove(path: Path) -> None:
 
 def files_below(folder: Path) -> Iterator[str]:
     """Yields the paths of all files and links below a folder, with forward slashes; links are not followed."""
-    for place, folders, files in os.walk(folder):
-        for name in (*files, *(below for below in folders if os.path.islink(os.path.join(place, below)))):
+    for place, folders, names in os.walk(folder):
+        for name in (*names, *(below for below in folders if os.path.islink(os.path.join(place, below)))):
             yield (Path(place) / name).relative_to(folder).as_posix()
 
 
 def frames_folder(out: str | Path) -> Path:
     """Returns the folder of the frames of a video, in the folder of a run."""
-    return Path(out) / CACHE / "frames"
+    return Path(out) / files.CACHE / "frames"
 
 
 def require_ours(out: Path) -> None:
@@ -252,15 +232,59 @@ def require_ours(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
     _require_no_link(out)
-    if out.is_dir() and not (out / RUN_MARKER).exists() and any(path.name != INTERNAL for path in out.iterdir()):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: not empty and not of an earlier run; give a new folder with --out"
-        )
+    is_unmarked = out.is_dir() and not (out / files.RUN_MARKER).exists()
+    if is_unmarked and any(path.name != files.INTERNAL for path in out.iterdir()):
+        fault = f"output folder {out}: not empty and not of an earlier run"
+        raise InputError("E-OUTPUT-EXISTS", f"{fault}; give a new folder with --out")
 
 
 def _require_no_link(out: Path) -> None:
-    for name in (INTERNAL, CACHE, STAGE, READY):
+    for name in (files.INTERNAL, files.CACHE, STAGE, READY):
         if (out / name).is_symlink():
-            raise InputError(
-                "E-OUTPUT-LINK", f"output folder {out}: {name} in it is a link; remove it, a run writes through none"
-            )
+            link = f"output folder {out}: {name} in it is a link"
+            raise InputError("E-OUTPUT-LINK", f"{link}; remove it, a run writes through none")
+
+
+def require_run(folder: Path) -> None:
+    """Refuses a folder that is not of a run."""
+    if not (folder / files.RUN_MARKER).is_file():
+        fault = f"run {folder}: not a run's folder (no {files.RUN_MARKER})"
+        raise InputError("E-RUN-FOLDER", f"{fault}; give the --out of a finished run")
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """Differences of a run's folder from what the run of ``version`` wrote, as paths below the folder."""
+
+    version: str
+    missing: tuple[str, ...]  # files that are gone
+    changed: tuple[str, ...]
+    added: tuple[str, ...]  # files among the results that the run did not make
+
+    def notes(self, but: tuple[str, ...] = ()) -> list[str]:
+        """Returns one note on all files but some that differ, or none."""
+        kinds = {kind: [n for n in getattr(self, kind) if n not in but] for kind in ("missing", "changed", "added")}
+        clauses = [
+            f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names
+        ]
+        return [f"the run's folder is not as the run left it: {'; '.join(clauses)}"] if clauses else []
+
+
+def verify(run: Path) -> Verified:
+    """Compares the files of a finished run's folder with the hashes that were kept when it ended. Raises InputError:
+    not a run's folder, or one without hashes."""
+    require_run(run)
+    complete_interrupted(run)
+    content = read_json(run / files.RUN_MARKER, "run", AGAIN)
+    with as_written(f"run {run / files.RUN_MARKER}"):
+        marker = checked(content, MarkerFile)
+    if marker.sha256 is None:
+        fault = f"run {run}: no hashes in {files.RUN_MARKER}, it is unfinished or of another version"
+        raise InputError("E-RUN-UNFINISHED", f"{fault} (stcal {marker.version}); run it again")
+    present = {name for name in files_below(run) if name == files.RUN_MARKER or name.split("/")[0] in RESULTS}
+    known = marker.sha256
+    common = known.keys() & present
+    now = {name: files.digest_of(run / name) for name in common} | {files.RUN_MARKER: files.own_digest(content)}
+    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - known.keys())
+    changed = (name for name in common if now[name] != known[name])
+    return Verified(marker.version, *(tuple(sorted(names)) for names in (known.keys() - present, changed, added)))

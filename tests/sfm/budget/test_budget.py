@@ -29,8 +29,8 @@ from stcal.sfm.budget.budget_tables import as_exact
 from stcal.sfm.budget.certificate import REQUIRED, drawings
 from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, conditions_of, longest_of, statement_of
 from stcal.sfm.report.check import CHECKS
-from stcal.sfm.runs.saved import adjusted_run, verify
-from stcal.sfm.runs.transaction import MarkerFile
+from stcal.sfm.runs.saved import adjusted_run
+from stcal.sfm.runs.transaction import MarkerFile, verify
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 
@@ -74,8 +74,8 @@ def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
 
 
 def test_photographs_that_differ_are_what_is_counted(saved, plain, monkeypatch):
-    own = adjusted_run(saved)
-    monkeypatch.setattr(combine, "adjusted_run", lambda _: replace(own, state=replace(own.state, differ=3.0)))
+    state, start = adjusted_run(saved)
+    monkeypatch.setattr(combine, "adjusted_run", lambda _: (replace(state, differ=3.0), start))
     told, images = budget_of_run(saved), sum(len(model.images) for model in plain.joint.models)
     for before, after in zip(plain.rows, told.rows, strict=True):
         assert before.standard < after.standard <= 3 * before.standard
@@ -517,7 +517,7 @@ def test_what_a_certificate_never_says(certified):
 
 def test_an_angle_is_that_of_the_normals_and_its_uncertainty_what_draws_of_the_circles_say(saved, plain):
     """Faces moved by draws from the covariance of all of them together."""
-    own = derivatives(plain.joint, adjusted_run(saved).start, saved.target_design, saved.faces.frame)
+    own = derivatives(plain.joint, adjusted_run(saved)[1], saved.target_design, saved.faces.frame)
     variances, axes = np.linalg.eigh(plain.joint.covariance_mm2)
     draws = axes * np.sqrt(np.maximum(variances, 0)) @ np.random.default_rng(0).standard_normal((len(axes), 2000))
     for row in plain.of_kind("angle"):

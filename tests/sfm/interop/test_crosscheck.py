@@ -18,7 +18,7 @@ from stcal.cli.main import main_sfm
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop.crosscheck import find_colmap, mapper_options
 from stcal.sfm.mapping.incremental import pipeline_options
-from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.transaction import verify
 from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 from tests.shared import own_copy
 

@@ -166,7 +166,7 @@ def test_centre_noise_is_found_again(exact):
 def known_from(scene: Scene) -> KnownRun:
     setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
     joint = unmoved(models, setup.board, setup.camera).result(1.0)
-    return KnownRun(models, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
+    return KnownRun(models, setup, NOISE, known_scene(joint, setup, scene.camera.colmap_model))
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from stcal.report.document import with_code
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
 from stcal.sfm.runs.folder import run_text
-from stcal.sfm.runs.saved import verify
-from stcal.sfm.runs.transaction import added_results
+from stcal.sfm.runs.transaction import added_results, verify
 from tests.outcome import INPUT, assert_error
 
 

@@ -310,5 +310,5 @@ def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_pa
         return [[*row[:7], *(str(float(value) + 0.01) for value in row[7:9]), *row[9:]] for row in body]
 
     rows(shifted)(run / "labels.csv")
-    found, known = (adjusted_run(load_run(folder)).state.result() for folder in (run, small_run))
+    found, known = (adjusted_run(load_run(folder))[0].result() for folder in (run, small_run))
     assert np.array_equal(found.xyz_model, known.xyz_model)

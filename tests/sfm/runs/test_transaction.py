@@ -12,8 +12,7 @@ import pytest
 from stcal.errors import DetectionError
 from stcal.io.files import INTERNAL, RUN_MARKER
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.saved import verify
-from stcal.sfm.runs.transaction import READY, STAGE, MarkerFile, added_results, complete_interrupted, run_folder
+from stcal.sfm.runs.transaction import READY, STAGE, MarkerFile, added_results, complete_interrupted, run_folder, verify
 from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.shared import own_copy
 
