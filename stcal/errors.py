@@ -13,7 +13,9 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from typing import TypeVar
 
 COMMAND_LINE = "STCAL_COMMAND_LINE"
 """Environment variable that a program sets for itself and its processes: errors then speak of ``--options``."""
@@ -122,6 +124,19 @@ def named(where: str, instead: str = "") -> Iterator[None]:
     except StcalError as error:
         error.args = error.code, f"{where}: {error.args[1].removeprefix(f'{instead}: ')}"
         raise
+
+
+T = TypeVar("T")
+
+
+@contextmanager
+def held(variable: ContextVar[T], value: T) -> Iterator[None]:
+    """Gives a context variable a value within the context."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
 
 
 NO_MEMORY = "not enough memory"

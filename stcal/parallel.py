@@ -22,7 +22,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TypeVar
 
-from stcal.errors import InputNote
+from stcal.errors import InputNote, held
 
 R = TypeVar("R")
 Progress = Callable[[str, int, int], None]  # function that is called with (stage, done, total)
@@ -185,12 +185,8 @@ def kept_processes(workers: int | None = None) -> Iterator[None]:
     if _kept.get():
         yield
         return
-    with _Processes(_number_of_processes(workers)) as processes:
-        token = _kept.set(processes)
-        try:
-            yield
-        finally:
-            _kept.reset(token)
+    with _Processes(_number_of_processes(workers)) as processes, held(_kept, processes):
+        yield
 
 
 def _number_of_processes(workers: int | None) -> int:

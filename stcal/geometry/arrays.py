@@ -330,11 +330,9 @@ def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = Fal
 def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, definite: bool = False) -> None:
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
-        raise InputError(
-            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'one number'}, {size}×{size} needed"
-        )
-    fault = first_fault(matrix[None], rows, definite)
-    if fault is not None:
+        shape = "×".join(map(str, matrix.shape)) or "one number"
+        raise InputError("E-COVARIANCE-SHAPE", f"{shape}, {size}×{size} needed")
+    if fault := first_fault(matrix[None], rows, definite):
         raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 

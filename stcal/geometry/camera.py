@@ -88,12 +88,10 @@ class Camera(ByValue):
         if not self.colmap_model:
             object.__setattr__(self, "colmap_model", "THIN_PRISM_FISHEYE" if self.fisheye else "FULL_OPENCV")
         if self.colmap_model not in COLMAP_LAYOUT or (FISHEYE in self.colmap_model) != self.fisheye:
-            known = [model for model in COLMAP_MODELS if (FISHEYE in model) == self.fisheye]
-            raise InputError(
-                "E-CAMERA-MODEL",
-                f"camera: model {self.colmap_model} of {'an equidistant' if self.fisheye else 'a perspective'} camera; "
-                f"one of {', '.join(known)} needed",
-            )
+            known = ", ".join(model for model in COLMAP_MODELS if (FISHEYE in model) == self.fisheye)
+            kind = "an equidistant" if self.fisheye else "a perspective"
+            fault = f"camera: model {self.colmap_model} of {kind} camera"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; one of {known} needed")
         if self.covariance is not None:
             count = len(COLMAP_LAYOUT[self.colmap_model])
             freeze(self, "covariance", (count, count), "camera's covariance")
@@ -285,11 +283,9 @@ class Camera(ByValue):
             return self._perspective(np.stack([x, y], axis=-1), target)
         worst = np.unravel_index(np.argmin(good), good.shape)
         at = self.focal * target[worst] + self.centre
-        raise ConvergenceError(
-            "E-CAMERA-FOLDED",
-            f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f}); "
-            "the distortion coefficients fold the image over there, check them",
-        )
+        fault = f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f})"
+        remedy = "the distortion coefficients fold the image over there, check them"
+        raise ConvergenceError("E-CAMERA-FOLDED", f"{fault}; {remedy}")
 
     def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return ideal coordinates (..., 2) of undistorted ``xy``; ``target`` : distorted points, for messages."""
@@ -298,11 +294,9 @@ class Camera(ByValue):
         theta = np.hypot(xy[..., 0], xy[..., 1])
         if (theta >= WIDEST_RAD).any():
             at = self.focal * target[np.unravel_index(theta.argmax(), theta.shape)] + self.centre
-            raise ConvergenceError(
-                "E-CAMERA-FIELD",
-                f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis, less than "
-                f"{np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image",
-            )
+            fault = f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis"
+            needed = f"less than {np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image"
+            raise ConvergenceError("E-CAMERA-FIELD", f"{fault}, {needed}")
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 
     def pixel_from_normalised(self, xy: ArrayLike) -> np.ndarray:
@@ -353,11 +347,8 @@ def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> t
     if given[8:].any():
         raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
-            "(k1, k2, p1, p2, k3 …)",
-        )
+        possible = f"{', '.join(map(str, DISTORTION_COUNTS))} are possible (k1, k2, p1, p2, k3 …)"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients; {possible}")
     distortion[: min(len(given), 8)] = given[:8]
     return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
 
@@ -371,20 +362,20 @@ def require_lens(flat: np.ndarray, width: float | None, height: float | None) ->
     if (flat[:2] <= 0).any():
         raise InputError("E-CAMERA-FOCAL", f"focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
-            "times apart needed, pixels are nearly square",
-        )
+        needed = f"not more than {MAX_FOCAL_RATIO:g} times apart needed, pixels are nearly square"
+        raise InputError("E-CAMERA-FOCAL", f"focal lengths {flat[0]:g} and {flat[1]:g} px; {needed}")
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
             raise InputError("E-CAMERA-SIZE", f"image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed")
     if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
-            f"of {width:g}×{height:g} px; pixels needed; check that they are not mm, or shares of a side",
-        )
+        raise not_in_pixels(flat, width, height)
+
+
+def not_in_pixels(flat: np.ndarray, width: float | None, height: float | None) -> InputError:
+    """Return the error of parameters (16,) that are too small for pixels; sizes as of :func:`require_lens`."""
+    size = f" of an image of {width:g}×{height:g} px" if width and height else ""
+    fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
+    return InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:

@@ -346,8 +346,7 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     for sign in (1.0, -1.0):
         first, second = np.append(upper[:, 0], sign * low[0]), np.append(upper[:, 1], sign * low[1])
         turn = np.column_stack([first, second, np.cross(first, second)])
-        u, _, vt = np.linalg.svd(camera_from_sight @ turn)
-        poses.append(_placed(u @ vt, xy, xy_image))
+        poses.append(_placed(best_rotations(camera_from_sight @ turn)[0], xy, xy_image))
     return PlanePoses((poses[0], poses[1]), determinant, float(small / large))
 
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from stcal.errors import DetectionError, InputError
+from stcal.errors import DetectionError, InputError, held
 from stcal.io import decoding
 from stcal.io.decoding import ends_properly, is_png, patterns_seen, png_intact
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
@@ -472,16 +472,11 @@ R = TypeVar("R")
 _elsewhere: ContextVar[tuple[Executor, int, bool] | None] = ContextVar("executor of images", default=None)
 
 
-@contextlib.contextmanager
-def spread(executor: Executor, at_once: int, send_images: bool = False) -> Iterator[None]:
+def spread(executor: Executor, at_once: int, send_images: bool = False) -> contextlib.AbstractContextManager[None]:
     """Let an executor, which stays open, run the jobs on single images inside the ``with`` block; results are the
     same. ``at_once`` : number of images that are handed over at a time; ``send_images`` : whether by content, and
     not by their path on storage that all machines share."""
-    token = _elsewhere.set((executor, at_once, send_images))
-    try:
-        yield
-    finally:
-        _elsewhere.reset(token)
+    return held(_elsewhere, (executor, at_once, send_images))
 
 
 def run_on_images(

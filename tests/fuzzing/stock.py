@@ -12,7 +12,7 @@ from stcal.boards.target_file import target_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.read import read_camera, written
+from stcal.io.cameras.read import WRITERS, read_camera
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml
@@ -131,7 +131,7 @@ def _cameras(folder: Path) -> None:
     names = {"ros": "ros.yaml", "opencv": "opencv.yaml", "colmap-bin": "cameras.bin", "kalibr": "camchain.yaml"}
     names |= {"mrcal": "camera.cameramodel", "metashape": "metashape.xml", "matlab": "matlab.mat"}
     for form, name in names.items():
-        content = written(given, form, "cam0").content
+        content = WRITERS[form](given, "cam0")
         (forms / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 

@@ -20,6 +20,7 @@ from stcal.geometry.camera import (
     PARAMETER_NAMES,
     Camera,
     intrinsic_basis,
+    not_in_pixels,
     opencv_lens,
     require_lens,
 )
@@ -196,9 +197,7 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraMo
     require_lens(flat, width, height)
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
-        size = f" of an image of {width:g}×{height:g} px" if width and height else ""
-        fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
-        raise InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
+        raise not_in_pixels(flat, width, height)
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         fault = f"principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×{height:g} px"
         remedy = "pixels from the image's corner needed; check that they are not from its middle"

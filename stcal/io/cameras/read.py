@@ -8,8 +8,8 @@ import ast
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from stcal.errors import InputError
+from stcal.errors import InputError, held
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
 from stcal.io.cameras import foreign_lenses as foreign
@@ -153,15 +153,6 @@ MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPE
 MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
 """Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
 LEAST_CAMERA_BYTES = 48  # bytes of a camera of `cameras.bin` with three parameters
-SIGMA_FORMS = ("colmap", "metashape-cameras")  # the forms that have a place for σ and correlations
-
-
-@dataclass(frozen=True, slots=True)
-class Written:
-    """The ``content`` of a file, and ``lost`` : properties of the camera that the file has no place for."""
-
-    content: str | bytes
-    lost: tuple[str, ...]
 
 
 def from_mrcal(text: str, _: str) -> CameraModel | ForeignLens:
@@ -225,13 +216,6 @@ def name_to_write(name: str) -> str:
     """Return a name that every form can hold: ``Cam_B_35mm`` of ``Cam B (35mm)``, ``cam1`` of 1, ``cam0`` of none."""
     word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "cam0"
     return word if word[0].isalpha() else f"cam{word}"
-
-
-def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera in one of :data:`WRITERS`, named by a word; refuse a lens that it cannot hold."""
-    lost = ["σ and correlations of the parameters"] * (form not in SIGMA_FORMS)
-    lost += metashape.without_sigma(camera) if form == "metashape-cameras" else []
-    return Written(WRITERS[form](camera, name), tuple(lost) if camera.covariance is not None else ())
 
 
 def _colmap_binary(camera: Camera, _: str) -> bytes:
@@ -328,14 +312,9 @@ _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
 
 
-@contextmanager
-def camera_chosen(name: str) -> Iterator[None]:
+def camera_chosen(name: str) -> AbstractContextManager[None]:
     """Read the camera of this name from files of several; for a command's option, which applies to all it reads."""
-    token = _chosen.set(name)
-    try:
-        yield
-    finally:
-        _chosen.reset(token)
+    return held(_chosen, name)
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
@@ -475,10 +454,14 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
 
     Raises InputError: no form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
     """
-    converted = written(camera, form_of(path, form), name_to_write(name))
-    save(Path(path), converted.content)
+    kind = form_of(path, form)
+    save(Path(path), WRITERS[kind](camera, name_to_write(name)))
     require_camera_written(path, camera)
-    return converted.lost
+    if camera.covariance is None or kind == "colmap":
+        return ()
+    if kind == "metashape-cameras":
+        return tuple(metashape.without_sigma(camera))
+    return ("σ and correlations of the parameters",)
 
 
 def form_of(path: str | Path, form: str | None) -> CameraForm:
