@@ -397,12 +397,9 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
                 finding = f"faces {face.id} and {second.id} have the same pattern{size}"
             else:
                 finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
-            raise InputError(
-                "E-TARGET-LIKENESS",
-                f"{where}: {finding} ({deviation}); "
-                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
-                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
-            )
+            by = f"its place by more than {MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
+            remedy = f"change a circle on {'it' if few is many else 'one of them'}, {by}"
+            raise InputError("E-TARGET-LIKENESS", f"{where}: {finding} ({deviation}); {remedy}")
 
 
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:

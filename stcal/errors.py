@@ -140,15 +140,7 @@ def held(variable: ContextVar[T], value: T) -> Iterator[None]:
 
 
 NO_MEMORY = "not enough memory"
-USED_UP = (
-    "allocate",
-    "failed to map",
-    "start new thread",
-    "bad_alloc",
-    "out of memory",
-    "insufficient memory",
-    "errno 12",
-)
+USED_UP = re.compile("(?i)allocate|failed to map|start new thread|bad_alloc|out of memory|insufficient memory|errno 12")
 
 
 def lacks_memory(error: BaseException) -> bool:
@@ -156,7 +148,7 @@ def lacks_memory(error: BaseException) -> bool:
     chain: list[BaseException] = [error]
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)
-    return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)
+    return any(isinstance(e, MemoryError) or USED_UP.search(str(e)) for e in chain)
 
 
 OTHER = "stcal-*.dist-info"

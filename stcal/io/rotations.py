@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 from stcal.io.table import ANGLES, Table, refuse, require_unit
 
@@ -147,7 +146,7 @@ def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.nd
     """Return the rotations (m, 3, 3) of quaternions (m, 4), w first."""
     require_finite(wxyz, places, where)
     require_unit(wxyz, lambda i: f"{where}: {places[i]}", "correct it")
-    return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)
+    return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 
 
 def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
@@ -211,9 +210,6 @@ class Turned:
     words: str
     columns: tuple[str, ...]
     stated: bool = True
-
-    def __post_init__(self):
-        freeze(self, "rotation", (len(self.rotation), 3, 3), "rotations")
 
 
 def places_of(table: Table) -> tuple[str, ...]:

@@ -106,12 +106,8 @@ def _arguments(each: Static) -> list[str]:
 
 
 def _pose_words(pose: Rigid) -> list[str]:
-    return [*plain_numbers(metres(pose), METRE_DIGITS), *plain_numbers(xyzw(pose), QUATERNION_DIGITS)]
-
-
-def plain_numbers(values, digits: int) -> list[str]:
-    """Return the texts of numbers without exponents, and without a minus before zero."""
-    return [fixed(v, digits) for v in values]
+    place = [fixed(value, METRE_DIGITS) for value in metres(pose)]
+    return [*place, *(fixed(value, QUATERNION_DIGITS) for value in xyzw(pose))]
 
 
 METRE_MM = 1000.0  # millimetres per metre, the unit of ROS, URDF and Universal Robots

@@ -62,8 +62,7 @@ def test_fit_plane_finds_the_plane(pose):
         np.testing.assert_allclose(plane.normal, side * normal, atol=1e-12)
         assert plane.offset == pytest.approx(side * normal @ pose.translation, abs=1e-9)  # lengths of 1e3 mm
         assert plane.rms < 1e-10
-        np.testing.assert_allclose(plane.distance(xyz + 3 * normal), side * 3, atol=1e-9)
-        np.testing.assert_allclose(plane.project(xyz + 3 * normal), xyz, atol=1e-9)
+        np.testing.assert_allclose((xyz + 3 * normal) @ plane.normal - plane.offset, side * 3, atol=1e-9)
 
 
 def test_plane_rms_is_the_spread_about_it():
@@ -73,7 +72,7 @@ def test_plane_rms_is_the_spread_about_it():
     plane = fit_plane(xyz, towards=np.array([0, 0, 1.0]))
     # Standard error of a σ from 4000 values: 1.1 %; of the offset 0.1/√4000 = 0.0016 mm.
     assert plane.rms == pytest.approx(0.1, rel=0.05)
-    assert plane.rms == pytest.approx(np.sqrt((plane.distance(xyz) ** 2).mean()), rel=1e-9)
+    assert plane.rms == pytest.approx(np.sqrt(((xyz @ plane.normal - plane.offset) ** 2).mean()), rel=1e-9)
     assert plane.offset == pytest.approx(5, abs=0.008)
 
 
