@@ -225,16 +225,13 @@ def _colmap_binary(camera: Camera, _: str) -> bytes:
     return head + struct.pack(f"<{len(params)}d", *params)
 
 
-def _fisheye_four(camera: Camera, form: str) -> list[float]:
-    """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
+def _coefficients(camera: Camera, form: str) -> list[float]:
+    """Return k1 … k4 of an equidistant camera, and refuse one with others; else the first 5 or, if needed, 8."""
+    if not camera.fisheye:
+        return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
     if camera.distortion[2:4].any() or camera.distortion[8:].any():
         raise foreign.refused(camera, form, "p1, p2 and prisms")
     return camera.distortion[[0, 1, 4, 5]].tolist()
-
-
-def _coefficients(camera: Camera) -> list[float]:
-    """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
-    return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
 
 
 def _matrix(camera: Camera) -> list[float]:
@@ -243,7 +240,7 @@ def _matrix(camera: Camera) -> list[float]:
 
 
 def _opencv(camera: Camera, _: str) -> str:
-    values = _fisheye_four(camera, "opencv") if camera.fisheye else _coefficients(camera)
+    values = _coefficients(camera, "opencv")
     node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
     kind = "distortion_model: equidistant\n" if camera.fisheye else ""
     return (
@@ -254,7 +251,7 @@ def _opencv(camera: Camera, _: str) -> str:
 
 
 def _ros(camera: Camera, name: str) -> str:
-    values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
+    values = _coefficients(camera, "ros")
     kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
     k, eye = _matrix(camera), np.eye(3).ravel().tolist()
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
@@ -273,7 +270,7 @@ def _kalibr(camera: Camera, name: str) -> str:
     if not camera.fisheye and camera.distortion[4:].any():
         raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
     kind = "equidistant" if camera.fisheye else "radtan"
-    values = _fisheye_four(camera, "kalibr") if camera.fisheye else camera.distortion[:4].tolist()
+    values = _coefficients(camera, "kalibr")[:4]
     return (
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {camera.parameters()[:4].tolist()}\n"
         f"  distortion_model: {kind}\n  distortion_coeffs: {values}\n"
@@ -284,7 +281,7 @@ def _kalibr(camera: Camera, name: str) -> str:
 def _mrcal(camera: Camera, _: str) -> str:
     if camera.fisheye:
         raise foreign.refused(camera, "mrcal", "the equidistant projection")
-    values = _coefficients(camera) if camera.distortion.any() else []
+    values = _coefficients(camera, "mrcal") if camera.distortion.any() else []
     values = values[:4] if len(values) == 5 and not values[4] else values
     lens = next(name for name, count in MRCAL.items() if count == len(values))
     return (
