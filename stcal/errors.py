@@ -11,7 +11,7 @@ documents lists all codes with their sentences.
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -26,15 +26,22 @@ PYTHON_NAMES = {"flatness": "flatness_mm", "max_angle": "pairs.max_angle_rad"}
 
 
 @contextmanager
-def at_command_line() -> Iterator[None]:
-    """Lets errors speak of options of the command line, in this process and in those that it starts."""
-    before = os.environ.get(COMMAND_LINE)
-    os.environ[COMMAND_LINE] = "1"
+def environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Sets variables of the environment within the context, and leaves them as they were."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[COMMAND_LINE]
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def at_command_line() -> Iterator[None]:
+    """Lets errors speak of options of the command line, in this process and in those that it starts."""
+    with environment({COMMAND_LINE: "1"}):
+        yield
 
 
 def in_python(message: str) -> str:
