@@ -447,17 +447,15 @@ DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit wh
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
     """Returns the design with one drawn distance as the unit: the longest on the face that most images see whole."""
     views = [set(labels) for labels in images]
-    best: tuple[int, float, KnownDistance] | None = None
-    for face in target.faces:
-        labels = face.labels()
-        apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+
+    def longest(face: FaceDesign) -> tuple[int, float, tuple[CircleLabel, CircleLabel]]:
+        apart, labels = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2), face.labels()
         i, j = np.unravel_index(int(apart.argmax()), apart.shape)
-        mm = float(apart[i, j])
-        seen = sum(labels[i] in view and labels[j] in view for view in views)
-        if best is None or (seen, mm) > best[:2]:
-            best = seen, mm, KnownDistance(labels[i], labels[j], mm, DRAWN_SIGMA * mm, drawn=True)
-    assert best is not None, "a target has a face"
-    return replace(target, distances=(best[2],))
+        ends = labels[i], labels[j]
+        return sum(view.issuperset(ends) for view in views), float(apart[i, j]), ends
+
+    _, mm, ends = max(map(longest, target.faces), key=lambda each: each[:2])
+    return replace(target, distances=(KnownDistance(*ends, mm, DRAWN_SIGMA * mm, drawn=True),))
 
 
 def faces_of_known_shape(board: BoardDesign) -> tuple[FaceDesign, ...]:

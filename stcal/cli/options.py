@@ -278,15 +278,13 @@ def _grouped(command: Callable) -> Callable:
         for name, each in signature.parameters.items()
         if isinstance(each.annotation, type) and is_dataclass(each.annotation)
     }
-    if not groups:
-        return command
     every: list[inspect.Parameter] = []
     for name, each in signature.parameters.items():
-        if name not in groups:
+        if name in groups:
+            options = inspect.signature(groups[name], eval_str=True).parameters.values()
+            every += [option.replace(default=getattr(each.default, option.name, option.default)) for option in options]
+        else:
             every.append(each)
-            continue
-        options = inspect.signature(groups[name], eval_str=True).parameters.values()
-        every += [option.replace(default=getattr(each.default, option.name, option.default)) for option in options]
 
     @wraps(command)
     def together(**given):

@@ -191,15 +191,10 @@ Descend = Callable[[Poses, float], Minima]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneMinima:
-    """One or two distinct minima, the better one first, and the residuals' robust σ over the stated one, 1 or more."""
+    """One or two distinct minima, the better one first."""
 
     minima: Minima
-    robust_sigma: float
-
-    @property
-    def outlier_limit(self) -> float:
-        """Length, in stated σ, beyond which a residual is an outlier."""
-        return OUTLIER * self.robust_sigma
+    outlier_limit: float  # length, in stated σ, beyond which a residual is an outlier
 
 
 def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
@@ -244,7 +239,7 @@ def two_minima(
         again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
         minima = minima.rows([0]).plus(again).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
-    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
+    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma)
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:

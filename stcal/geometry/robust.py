@@ -39,9 +39,8 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
         freedom = float(np.exp(logarithm))
         return quantile(TAIL, freedom) / quantile(0.5, freedom) - ratio
 
-    ends = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
-    signs = off(ends[0]) > 0, off(ends[1]) > 0
-    logarithm = brentq(off, *ends) if signs == (True, False) else ends[int(signs[1])]
+    low, high = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
+    logarithm = high if off(high) > 0 else brentq(off, low, high) if off(low) > 0 else low
     freedom = float(np.exp(np.asarray(logarithm, float)))
     return max(quantile(beyond, freedom) * middle / quantile(0.5, freedom), length_limit(2, beyond))
 

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -480,21 +481,16 @@ POSE_MM = 1e-6
 """Largest difference of a written pose, mm at :data:`LEVER_MM`. Decimals of degrees and quaternions cause less."""
 
 
-def pose_values(poses: Poses | Mapping[str, Rigid]) -> np.ndarray:
+def pose_values(poses: Poses) -> np.ndarray:
     """Returns poses as lengths (m, 3, 4), mm: rotations at :data:`LEVER_MM`, and translations."""
-    matrices = [pose.matrix() for pose in poses.values()] if isinstance(poses, Mapping) else poses.matrix()
-    return np.reshape(matrices, (-1, 4, 4))[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
-
-
-def require_poses_written(path: str | Path, read: Callable[[], Poses | Mapping[str, Rigid]], poses) -> None:
-    """Read a written file again, and require that its poses are ``poses``, of the type that ``read`` returns."""
-    require_written(path, lambda: pose_values(read()), pose_values(poses), POSE_MM, "mm")
+    return poses.matrix()[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
 
 
 def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> None:
     """Read a written table again, and require that its poses are ``poses``, by the prefix of their columns."""
     for prefix, own in poses.items():
-        require_poses_written(path, lambda prefix=prefix: read_table(path, "poses").poses(prefix), own)
+        again = partial(lambda prefix: pose_values(read_table(path, "poses").poses(prefix)), prefix)
+        require_written(path, again, pose_values(own), POSE_MM, "mm")
 
 
 def refuse(
