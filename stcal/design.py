@@ -397,12 +397,9 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
                 finding = f"faces {face.id} and {second.id} have the same pattern{size}"
             else:
                 finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
-            raise InputError(
-                "E-TARGET-LIKENESS",
-                f"{where}: {finding} ({deviation}); "
-                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
-                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
-            )
+            by = f"its place by more than {MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
+            remedy = f"change a circle on {'it' if few is many else 'one of them'}, {by}"
+            raise InputError("E-TARGET-LIKENESS", f"{where}: {finding} ({deviation}); {remedy}")
 
 
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
@@ -450,17 +447,15 @@ DRAWN_SIGMA = 1e-7  # relative σ of the drawn distance that defines the unit wh
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
     """Returns the design with one drawn distance as the unit: the longest on the face that most images see whole."""
     views = [set(labels) for labels in images]
-    best: tuple[int, float, KnownDistance] | None = None
-    for face in target.faces:
-        labels = face.labels()
-        apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+
+    def longest(face: FaceDesign) -> tuple[int, float, tuple[CircleLabel, CircleLabel]]:
+        apart, labels = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2), face.labels()
         i, j = np.unravel_index(int(apart.argmax()), apart.shape)
-        mm = float(apart[i, j])
-        seen = sum(labels[i] in view and labels[j] in view for view in views)
-        if best is None or (seen, mm) > best[:2]:
-            best = seen, mm, KnownDistance(labels[i], labels[j], mm, DRAWN_SIGMA * mm, drawn=True)
-    assert best is not None, "a target has a face"
-    return replace(target, distances=(best[2],))
+        ends = labels[i], labels[j]
+        return sum(view.issuperset(ends) for view in views), float(apart[i, j]), ends
+
+    _, mm, ends = max(map(longest, target.faces), key=lambda each: each[:2])
+    return replace(target, distances=(KnownDistance(*ends, mm, DRAWN_SIGMA * mm, drawn=True),))
 
 
 def faces_of_known_shape(board: BoardDesign) -> tuple[FaceDesign, ...]:

@@ -11,9 +11,11 @@ documents lists all codes with their sentences.
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from typing import TypeVar
 
 COMMAND_LINE = "STCAL_COMMAND_LINE"
 """Environment variable that a program sets for itself and its processes: errors then speak of ``--options``."""
@@ -24,15 +26,22 @@ PYTHON_NAMES = {"flatness": "flatness_mm", "max_angle": "pairs.max_angle_rad"}
 
 
 @contextmanager
-def at_command_line() -> Iterator[None]:
-    """Lets errors speak of options of the command line, in this process and in those that it starts."""
-    before = os.environ.get(COMMAND_LINE)
-    os.environ[COMMAND_LINE] = "1"
+def environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Sets variables of the environment within the context, and leaves them as they were."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[COMMAND_LINE]
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def at_command_line() -> Iterator[None]:
+    """Lets errors speak of options of the command line, in this process and in those that it starts."""
+    with environment({COMMAND_LINE: "1"}):
+        yield
 
 
 def in_python(message: str) -> str:
@@ -124,16 +133,21 @@ def named(where: str, instead: str = "") -> Iterator[None]:
         raise
 
 
+T = TypeVar("T")
+
+
+@contextmanager
+def held(variable: ContextVar[T], value: T) -> Iterator[None]:
+    """Gives a context variable a value within the context."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
 NO_MEMORY = "not enough memory"
-USED_UP = (
-    "allocate",
-    "failed to map",
-    "start new thread",
-    "bad_alloc",
-    "out of memory",
-    "insufficient memory",
-    "errno 12",
-)
+USED_UP = re.compile("(?i)allocate|failed to map|start new thread|bad_alloc|out of memory|insufficient memory|errno 12")
 
 
 def lacks_memory(error: BaseException) -> bool:
@@ -141,7 +155,7 @@ def lacks_memory(error: BaseException) -> bool:
     chain: list[BaseException] = [error]
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)
-    return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)
+    return any(isinstance(e, MemoryError) or USED_UP.search(str(e)) for e in chain)
 
 
 OTHER = "stcal-*.dist-info"

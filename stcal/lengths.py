@@ -50,10 +50,8 @@ def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> 
     small = abs(wrong.value_mm) < wrong.least
     limit = f"at least {wrong.least:g} mm" if small else f"at most {wrong.most:g} mm"
     remedy = "if lengths are metres, multiply them by 1000" if small else "if lengths are in another unit, convert them"
-    raise InputError(
-        "E-LENGTH-UNIT",
-        f"{where}: {wrong.place} is {wrong.value_mm:g} mm, {limit} usual; {remedy}; if it is right, add `{KEY} = true`",
-    )
+    fault = f"{where}: {wrong.place} is {wrong.value_mm:g} mm, {limit} usual"
+    raise InputError("E-LENGTH-UNIT", f"{fault}; {remedy}; if it is right, add `{KEY} = true`")
 
 
 def stated_unusual(lengths: Iterable[Length]) -> list[str]:

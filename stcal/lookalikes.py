@@ -44,8 +44,7 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
     if not 2 <= n <= m <= MOST_CIRCLES:
         return None
     i, j = np.unravel_index(squareform(pdist(xy)).argmax(), (n, n))
-    p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
-    p, q = p[p != q], q[p != q]
+    q, p = np.nonzero(~np.eye(m, dtype=bool))
     factor = (other_centres[q] - other_centres[p]) / (centres[j] - centres[i])
     fits = alike(abs(factor) * radius[i], other_radius[p]) & alike(abs(factor) * radius[j], other_radius[q])
     tree, found = KDTree(np.column_stack([other_centres.real, other_centres.imag])), list[Likeness]()
@@ -104,9 +103,7 @@ def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
 def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray, np.ndarray]:
     """Returns masks and nearest circles (motions, n) of the motions by two circles that let enough coincide."""
     n, m = len(xy), len(other_xy)
-    k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
-    p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
-    k, near, p, q = k[k != near], near[k != near], p[p != q], q[p != q]
+    (near, k), (q, p) = (np.nonzero(~np.eye(count, dtype=bool)) for count in (n, m))
     step, other_step = xy[near] - xy[k], other_xy[q] - other_xy[p]
     length, other_length = np.linalg.norm(step, axis=1), np.linalg.norm(other_step, axis=1)
     slack = MAX_GAP * min(radius.min(), other_radius.min())

@@ -22,7 +22,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TypeVar
 
-from stcal.errors import InputNote
+from stcal.errors import InputNote, environment, held
 
 R = TypeVar("R")
 Progress = Callable[[str, int, int], None]  # function that is called with (stage, done, total)
@@ -185,12 +185,8 @@ def kept_processes(workers: int | None = None) -> Iterator[None]:
     if _kept.get():
         yield
         return
-    with _Processes(_number_of_processes(workers)) as processes:
-        token = _kept.set(processes)
-        try:
-            yield
-        finally:
-            _kept.reset(token)
+    with _Processes(_number_of_processes(workers)) as processes, held(_kept, processes):
+        yield
 
 
 def _number_of_processes(workers: int | None) -> int:
@@ -242,18 +238,14 @@ def _sockets() -> str:
 def _starting() -> Iterator[None]:
     """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was."""
     main = vars(sys.modules["__main__"])
-    with _one_starts, _deaf_to_interrupts():
+    with _one_starts, _deaf_to_interrupts(), environment(FOR_WORKERS):
         hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}
-        before = {name: os.environ.get(name) for name in FOR_WORKERS}
         undecided = multiprocessing.get_start_method(allow_none=True) is None
         main.update(dict.fromkeys(hidden))
-        os.environ.update(FOR_WORKERS)
         try:
             yield
         finally:
             main.update(hidden)
-            for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
             if undecided:  # the start of a process asks for the default method, which then could not be set any more
                 multiprocessing.set_start_method(None, force=True)
 

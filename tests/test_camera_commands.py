@@ -8,9 +8,8 @@ from typer.testing import CliRunner
 
 from stcal.cli.instruments import camera_app as app
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.camera_model import write_cameras_txt
 from stcal.io.cameras.difference import compare_cameras
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, save_camera
 from stcal.report.camera_figures import shown
 from tests.outcome import lines_of, refuses
 
@@ -20,7 +19,7 @@ CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2
 @pytest.fixture
 def folder(tmp_path):
     sigma = np.array([0.1, 0.1, 0.2, 0.2, 1e-4, 1e-3, 1e-5, 1e-5])
-    write_cameras_txt(tmp_path / "a.txt", Camera.of(CAMERA, "OPENCV", np.diag(sigma**2)))
+    save_camera(tmp_path / "a.txt", Camera.of(CAMERA, "OPENCV", np.diag(sigma**2)))
     return tmp_path
 
 
@@ -105,7 +104,7 @@ def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
 def test_what_is_shown_is_the_cameras(folder):
     """Field of view of a lens without distortion: 2 atan(640 / 900) across."""
     plain = Camera(1280, 960, [900.0, 900.0], [639.5, 479.5], np.zeros(8))
-    write_cameras_txt(folder / "p.txt", Camera.of(plain, "PINHOLE"))
+    save_camera(folder / "p.txt", Camera.of(plain, "PINHOLE"))
     said = call("show", folder / "p.txt", "--plot", folder / "p.svg")
     assert f"field of view: {2 * np.degrees(np.arctan(640 / 900)):.2f}° across" in said
     assert "moves points by up to 0.00 px" in said
@@ -126,7 +125,7 @@ def test_a_principal_point_is_mostly_a_turn_and_a_focal_length_is_not():
 
 
 def test_cameras_of_two_sizes_are_refused(folder):
-    write_cameras_txt(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
+    save_camera(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
     refuses("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480", call, "compare", folder / "a.txt", folder / "b.txt")
 
 

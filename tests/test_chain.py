@@ -15,7 +15,7 @@ from scipy.special import chdtrc
 from stcal.cli.main import main, main_sfm
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import write_cameras_txt
+from stcal.io.cameras.read import save_camera
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml
 from stcal.robot.kinematics.forward import forward
@@ -162,7 +162,7 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
     camera = Camera(own.width, own.height, own.focal, own.centre, np.zeros(8))  # the same, its images undistorted
     seen = tilted(25, 700)
     cv2.imwrite(str(root / "scene.png"), photo(seen, camera=camera))
-    write_cameras_txt(root / "tags-camera.txt", Camera.of(camera, "PINHOLE"))
+    save_camera(root / "tags-camera.txt", Camera.of(camera, "PINHOLE"))
     (root / "layout.toml").write_text(layout_toml(LAYOUT))
     truth = identified.world_from_base.inverse() @ seen
     for option, file in (("--hand-eye", "handeye.json"), ("--registration", "register.json")):

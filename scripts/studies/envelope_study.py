@@ -31,7 +31,7 @@ from scripts.runner import SAMPLE, face_errors, normalised, script
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import write_cameras_txt
+from stcal.io.cameras.read import save_camera
 from stcal.labels import BOARD
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions
@@ -391,7 +391,7 @@ def write_case(kind: Kind, case: Case, folder: Path) -> dict[str, Picture]:
         picture.pixels = b""
         pictures[photo.name.rpartition(".")[0]] = picture
     camera = kind.camera(case) if kind.camera else case.data.camera
-    write_cameras_txt(folder / "cameras.txt", Camera.of(camera, case.data.camera.colmap_model))
+    save_camera(folder / "cameras.txt", Camera.of(camera, case.data.camera.colmap_model))
     return pictures
 
 

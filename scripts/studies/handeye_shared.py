@@ -19,8 +19,7 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import outcome_report
-from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, save_camera
 from stcal.workflows.handeye_inputs import read_handeye
 from stcal.workflows.handeye_run import ALL, calibrate_handeye
 
@@ -58,7 +57,7 @@ def dots(data: Path, scratch: Path, splits: dict = DEFAULT) -> tuple[dict, str]:
 
 def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
     scratch.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(scratch / "cameras.txt", Camera.of(camera, "OPENCV", covariance))
+    save_camera(scratch / "cameras.txt", Camera.of(camera, "OPENCV", covariance))
     return scratch / "cameras.txt"
 
 

@@ -113,12 +113,9 @@ class Commands(TyperGroup):
 
     def format_commands(self, ctx, formatter) -> None:
         """Writes the name and help of each command."""
-        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = {
-            name: (name, " ".join((command.help or "").split()))
-            for name, command in commands
-            if command and not command.hidden
-        }
+        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        shown = {name: command for name, command in commands.items() if command and not command.hidden}
+        rows = {name: (name, " ".join((command.help or "").split())) for name, command in shown.items()}
         groups = GROUPS.get(words_of(ctx.command_path) or "stcal", {"Commands": tuple(rows)})
         for title, names in groups.items():
             with formatter.section(title):

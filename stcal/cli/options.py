@@ -20,7 +20,7 @@ import typer
 
 from stcal.cli.help import Command, panel_of
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say, warn_if_quiet
-from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
+from stcal.errors import ChecksFailed, InputError, InputNote, StcalError, held
 from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
@@ -291,15 +291,13 @@ def _grouped(command: Callable) -> Callable:
         for name, each in signature.parameters.items()
         if isinstance(each.annotation, type) and is_dataclass(each.annotation)
     }
-    if not groups:
-        return command
     every: list[inspect.Parameter] = []
     for name, each in signature.parameters.items():
-        if name not in groups:
+        if name in groups:
+            options = inspect.signature(groups[name], eval_str=True).parameters.values()
+            every += [option.replace(default=getattr(each.default, option.name, option.default)) for option in options]
+        else:
             every.append(each)
-            continue
-        options = inspect.signature(groups[name], eval_str=True).parameters.values()
-        every += [option.replace(default=getattr(each.default, option.name, option.default)) for option in options]
 
     @wraps(command)
     def together(**given):
@@ -342,19 +340,16 @@ def _protected(command: Callable) -> Callable:
                 fault = f"--report {path}: a page of HTML"
                 raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {path.with_suffix('.html')}{also}")
         keep_apart(written, read)
-        token = _replacing.set(overwrite)
-        try:
+        choice: AbstractContextManager[None] = nullcontext()
+        if camera_name:
+            from stcal.io.cameras.read import camera_chosen
+
+            choice = camera_chosen(camera_name)
+        with held(_replacing, overwrite):
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            choice: AbstractContextManager[None] = nullcontext()
-            if camera_name:
-                from stcal.io.cameras.read import camera_chosen
-
-                choice = camera_chosen(camera_name)
             with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes(), choice:
                 return command(**given)
-        finally:
-            _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
     further: dict[str, tuple[Any, Any]] = {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}

@@ -19,7 +19,7 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from stcal.errors import InputError
+from stcal.errors import InputError, held
 from stcal.io import files
 
 if TYPE_CHECKING:
@@ -39,15 +39,13 @@ _beating: ContextVar["_Beat | None"] = ContextVar("_beating", default=None)
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
     """Sets the verbosity within the context: warnings and errors only, or more than usual."""
     beat = _Beat()
-    tokens = _quiet.set(quiet), _verbose.set(verbose), _beating.set(beat)
     if not quiet:
         beat.start()
     try:
-        yield
+        with held(_quiet, quiet), held(_verbose, verbose), held(_beating, beat):
+            yield
     finally:
         beat.over.set()
-        for token in tokens:
-            token.var.reset(token)  # type: ignore[arg-type]
 
 
 def wait_for_others() -> None:
@@ -157,12 +155,8 @@ def say(*values: object, sep: str = " ", end: str = "\n") -> None:
 @contextmanager
 def said_apart() -> Iterator[None]:
     """Reserves standard output for a file. All other output goes to standard error within the context."""
-    token = _taker.set(sys.stdout)
-    try:
-        with redirect_stdout(sys.stderr):
-            yield
-    finally:
-        _taker.reset(token)
+    with held(_taker, sys.stdout), redirect_stdout(sys.stderr):
+        yield
 
 
 @contextmanager

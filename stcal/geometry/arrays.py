@@ -207,8 +207,7 @@ def frozen(
         and (array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)))
     ):
         raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
-    # three times as fast as all() on few numbers
-    if finite and array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():
+    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array
@@ -329,11 +328,9 @@ def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = Fal
 def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, definite: bool = False) -> None:
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
-        raise InputError(
-            "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'one number'}, {size}×{size} needed"
-        )
-    fault = first_fault(matrix[None], rows, definite)
-    if fault is not None:
+        shape = "×".join(map(str, matrix.shape)) or "one number"
+        raise InputError("E-COVARIANCE-SHAPE", f"{shape}, {size}×{size} needed")
+    if fault := first_fault(matrix[None], rows, definite):
         raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 

@@ -1,6 +1,6 @@
 """The camera: projection with lens distortion and its exact inverse. Pixel centres are integers (OpenCV)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,18 +19,18 @@ COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
 DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)  # numbers of distortion coefficients that OpenCV knows
 COLMAP_LAYOUT = {
-    "SIMPLE_PINHOLE": [(0, 1), 2, 3],
-    "PINHOLE": [0, 1, 2, 3],
-    "SIMPLE_RADIAL": [(0, 1), 2, 3, 4],
-    "RADIAL": [(0, 1), 2, 3, 4, 5],
-    "OPENCV": list(range(8)),
-    "FULL_OPENCV": list(range(12)),
-    "SIMPLE_RADIAL_FISHEYE": [(0, 1), 2, 3, 4],
-    "RADIAL_FISHEYE": [(0, 1), 2, 3, 4, 5],
-    "OPENCV_FISHEYE": [0, 1, 2, 3, 4, 5, 8, 9],
-    "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3",
 }
-"""Indices of COLMAP's parameters in :data:`PARAMETER_NAMES`, by camera model."""
+"""COLMAP's parameters in its order, by camera model: names of :data:`PARAMETER_NAMES`, or f for fx and fy."""
 COLMAP_MODELS = tuple(COLMAP_LAYOUT)  # camera models that stcal supports
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 FISHEYE = "FISHEYE"  # part of the names of COLMAP's equidistant models
@@ -88,14 +88,12 @@ class Camera(ByValue):
         if not self.colmap_model:
             object.__setattr__(self, "colmap_model", "THIN_PRISM_FISHEYE" if self.fisheye else "FULL_OPENCV")
         if self.colmap_model not in COLMAP_LAYOUT or (FISHEYE in self.colmap_model) != self.fisheye:
-            known = [model for model in COLMAP_MODELS if (FISHEYE in model) == self.fisheye]
-            raise InputError(
-                "E-CAMERA-MODEL",
-                f"camera: model {self.colmap_model} of {'an equidistant' if self.fisheye else 'a perspective'} camera; "
-                f"one of {', '.join(known)} needed",
-            )
+            known = ", ".join(model for model in COLMAP_MODELS if (FISHEYE in model) == self.fisheye)
+            kind = "an equidistant" if self.fisheye else "a perspective"
+            fault = f"camera: model {self.colmap_model} of {kind} camera"
+            raise InputError("E-CAMERA-MODEL", f"{fault}; one of {known} needed")
         if self.covariance is not None:
-            count = len(COLMAP_LAYOUT[self.colmap_model])
+            count = len(parameter_names(self.colmap_model))
             freeze(self, "covariance", (count, count), "camera's covariance")
         with named("camera"):
             require_lens(self.parameters(), self.width, self.height)
@@ -103,8 +101,7 @@ class Camera(ByValue):
     @classmethod
     def of(cls, camera: "Camera", colmap_model: str, covariance: np.ndarray | None = None) -> "Camera":
         """Return ``camera`` as one of a COLMAP model, with the covariance of its parameters."""
-        lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
-        return cls(camera.width, camera.height, *lens, colmap_model, covariance)
+        return replace(camera, fisheye=FISHEYE in colmap_model, colmap_model=colmap_model, covariance=covariance)
 
     @classmethod
     @require_arguments
@@ -147,7 +144,7 @@ class Camera(ByValue):
         """Return the parameters in COLMAP's order and pixel origin."""
         flat = self.parameters()
         flat[2:4] += COLMAP_PIXEL_ORIGIN
-        return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in COLMAP_LAYOUT[self.colmap_model]]
+        return flat[intrinsic_basis(self.colmap_model).argmax(axis=0)].tolist()
 
     def same_as(self, other: "Camera") -> bool:
         """Return True if size, projection and all parameters are equal."""
@@ -173,9 +170,8 @@ class Camera(ByValue):
         jacobian[:, [0, 1], [2, 3]] = 1
         if self.fisheye:
             xy = _equidistant(xy)
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        top, bottom = self._radial(r2)
+        x, y = xy.T
+        *_, r2, top, bottom = self._distorted(x, y)
         powers = np.stack([r2, r2**2, r2**3], axis=1)
         jacobian[:, :, [4, 5, 8]] = xy[:, :, None] * (powers / bottom[:, None])[:, None]
         if self.fisheye:
@@ -195,19 +191,15 @@ class Camera(ByValue):
         xy = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(xy)
-        x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        top, bottom = self._radial(r2)
-        return np.stack(self._moved(x, y, r2, top / bottom), axis=-1)
+        return np.stack(self._distorted(xy[..., 0], xy[..., 1])[:2], axis=-1)
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return :meth:`distort` of ideal coordinates (..., 2), and its derivative (..., 2, 2)."""
         xy = ideal = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(ideal)
-        distorted, jacobian = np.empty(xy.shape), np.empty((*xy.shape, 2))
-        distorted[..., 0], distorted[..., 1], *derivatives = self._distorted_parts(xy[..., 0], xy[..., 1])
-        jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 0], jacobian[..., 1, 1] = derivatives
+        x, y, *derivatives = self._distorted_parts(xy[..., 0], xy[..., 1])
+        distorted, jacobian = np.stack([x, y], axis=-1), np.stack(derivatives, axis=-1).reshape(*xy.shape, 2)
         return distorted, jacobian @ _equidistant_jacobian(ideal) if self.fisheye else jacobian
 
     def pixel_jacobian(self, xy: np.ndarray) -> np.ndarray:
@@ -223,8 +215,7 @@ class Camera(ByValue):
     def _distorted_parts(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return distorted x and y, and derivatives x by x, x by y, y by x, y by y; after :func:`_equidistant`."""
         k1, k2, p1, p2, k3, k4, k5, k6, *prisms = self.distortion.tolist()
-        r2 = x * x + y * y
-        top, bottom = self._radial(r2)
+        moved_x, moved_y, r2, top, bottom = self._distorted(x, y)
         radial = top / bottom
         if self.fisheye:
             by_r2 = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))
@@ -239,25 +230,22 @@ class Camera(ByValue):
             in_x, in_y = 2 * s1 + 4 * s2 * r2, 2 * s3 + 4 * s4 * r2
             x_by_x, x_by_y = x_by_x + in_x * x, cross + in_x * y
             y_by_x, y_by_y = cross + in_y * x, y_by_y + in_y * y
-        return *self._moved(x, y, r2, radial), x_by_x, x_by_y, y_by_x, y_by_y
+        return moved_x, moved_y, x_by_x, x_by_y, y_by_x, y_by_y
 
-    def _radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return numerator and denominator, (...), of the radial distortion factor at squared radii ``r2`` (...)."""
-        k1, k2, _, _, k3, k4, k5, k6 = self.distortion[:8].tolist()
+    def _distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return distorted x and y, the squared radius, and numerator and denominator of the radial factor, (...)."""
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self.distortion.tolist()
+        r2 = x * x + y * y
         if self.fisheye:
-            return 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))), np.ones_like(r2)
-        return 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-
-    def _moved(self, x, y, r2, radial) -> tuple[np.ndarray, np.ndarray]:
-        """Return distorted x and y, (...), by radial factor, tangential terms and prisms."""
-        p1, p2 = self.distortion[2:4].tolist()
-        prisms = self.distortion[8:].tolist()
+            top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))), np.ones_like(r2)
+        else:
+            top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = top / bottom
         moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         moved_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        if any(prisms):
-            s1, s2, s3, s4 = prisms
+        if s1 or s2 or s3 or s4:
             moved_x, moved_y = moved_x + r2 * (s1 + r2 * s2), moved_y + r2 * (s3 + r2 * s4)
-        return moved_x, moved_y
+        return moved_x, moved_y, r2, top, bottom
 
     def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
         """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the image is folded over."""
@@ -285,11 +273,9 @@ class Camera(ByValue):
             return self._perspective(np.stack([x, y], axis=-1), target)
         worst = np.unravel_index(np.argmin(good), good.shape)
         at = self.focal * target[worst] + self.centre
-        raise ConvergenceError(
-            "E-CAMERA-FOLDED",
-            f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f}); "
-            "the distortion coefficients fold the image over there, check them",
-        )
+        fault = f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f})"
+        remedy = "the distortion coefficients fold the image over there, check them"
+        raise ConvergenceError("E-CAMERA-FOLDED", f"{fault}; {remedy}")
 
     def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return ideal coordinates (..., 2) of undistorted ``xy``; ``target`` : distorted points, for messages."""
@@ -298,11 +284,9 @@ class Camera(ByValue):
         theta = np.hypot(xy[..., 0], xy[..., 1])
         if (theta >= WIDEST_RAD).any():
             at = self.focal * target[np.unravel_index(theta.argmax(), theta.shape)] + self.centre
-            raise ConvergenceError(
-                "E-CAMERA-FIELD",
-                f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis, less than "
-                f"{np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image",
-            )
+            fault = f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis"
+            needed = f"less than {np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image"
+            raise ConvergenceError("E-CAMERA-FIELD", f"{fault}, {needed}")
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 
     def pixel_from_normalised(self, xy: ArrayLike) -> np.ndarray:
@@ -353,11 +337,8 @@ def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> t
     if given[8:].any():
         raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
-            "(k1, k2, p1, p2, k3 …)",
-        )
+        possible = f"{', '.join(map(str, DISTORTION_COUNTS))} are possible (k1, k2, p1, p2, k3 …)"
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients; {possible}")
     distortion[: min(len(given), 8)] = given[:8]
     return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
 
@@ -371,32 +352,28 @@ def require_lens(flat: np.ndarray, width: float | None, height: float | None) ->
     if (flat[:2] <= 0).any():
         raise InputError("E-CAMERA-FOCAL", f"focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
-            "times apart needed, pixels are nearly square",
-        )
+        needed = f"not more than {MAX_FOCAL_RATIO:g} times apart needed, pixels are nearly square"
+        raise InputError("E-CAMERA-FOCAL", f"focal lengths {flat[0]:g} and {flat[1]:g} px; {needed}")
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
             raise InputError("E-CAMERA-SIZE", f"image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed")
     if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
-            f"of {width:g}×{height:g} px; pixels needed; check that they are not mm, or shares of a side",
-        )
+        raise not_in_pixels(flat, width, height)
+
+
+def not_in_pixels(flat: np.ndarray, width: float | None, height: float | None) -> InputError:
+    """Return the error of parameters (16,) that are too small for pixels; sizes as of :func:`require_lens`."""
+    size = f" of an image of {width:g}×{height:g} px" if width and height else ""
+    fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
+    return InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
     """Return the derivative (16, q) of :data:`PARAMETER_NAMES` by the q parameters of a COLMAP model."""
-    layout = COLMAP_LAYOUT[colmap_model]
-    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
-    for column, place in enumerate(layout):
-        basis[list(place) if isinstance(place, tuple) else place, column] = 1
-    return basis
+    names = parameter_names(colmap_model)
+    return np.array([[float(name in (own, own[0])) for name in names] for own in PARAMETER_NAMES])
 
 
 def parameter_names(colmap_model: str) -> list[str]:
     """Return the names of the parameters of a COLMAP model, in its order."""
-    layout = COLMAP_LAYOUT[colmap_model]
-    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
+    return COLMAP_LAYOUT[colmap_model].split()

@@ -86,9 +86,8 @@ def blocks_of(
     order = np.argsort(index, kind="stable")
     ends = np.searchsorted(index, np.arange(count + 1), sorter=order)
     # A product with a sparse matrix takes a fifth of the time of numpy.add.at.
-    sums = (csr_array((np.ones(n), order, ends), shape=(count, n)) @ products.reshape(n, k * (k + 1))).reshape(
-        count, k, k + 1
-    )
+    by_block = csr_array((np.ones(n), order, ends), shape=(count, n))
+    sums = (by_block @ products.reshape(n, k * (k + 1))).reshape(count, k, k + 1)
     return sums[:, :, :k].copy(), sums[:, :, k].copy()
 
 

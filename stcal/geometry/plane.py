@@ -3,11 +3,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.least_squares import Minima, NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, best_rotations, by_pose, perspective, skew
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
@@ -39,30 +39,29 @@ def shape_of_square(square: np.ndarray) -> np.ndarray:
     return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
-    """The plane ``normal · xyz = offset``."""
+class Plane(NamedTuple):
+    """The plane ``normal · xyz = offset``, or one for each of a stack of sets of points."""
 
-    normal: Array  # (3,) of unit length
-    offset: float
-    rms: float  # spread of the fitted points
-
-    def __post_init__(self):
-        freeze(self, "normal", (3,), "plane normal")
-
-    def distance(self, xyz: np.ndarray) -> np.ndarray:
-        """Return the signed distances, (n,), of points (n, 3)."""
-        return np.asarray(xyz, float) @ self.normal - self.offset
-
-    def project(self, xyz: np.ndarray) -> np.ndarray:
-        """Return the foot points on the plane, same shape as ``xyz``."""
-        return xyz - np.multiply.outer(self.distance(xyz), self.normal)
+    normal: np.ndarray  # (..., 3) of unit length
+    offset: np.ndarray  # (...,)
+    rms: np.ndarray  # (...,) spread of the fitted points
 
 
 def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
-    """Return the total-least-squares plane of n ≥ 3 points (n, 3) off a line, its normal on the side of ``towards``."""
-    normal, offset, rms = fit_planes(np.asarray(xyz, float)[None], towards)
-    return Plane(normal[0], float(offset[0]), float(rms[0]))
+    """Return the total-least-squares plane of n ≥ 3 points (..., n, 3) off a line, its normal on the side of
+    ``towards``."""
+    xyz = np.asarray(xyz, float)
+    n = xyz.shape[-2]
+    if n < 3:
+        raise DegenerateError("E-POINTS-FEW", f"plane: {n} points, 3 needed")
+    mean = xyz.mean(-2)
+    _, s, vt = np.linalg.svd(xyz - mean[..., None, :], full_matrices=False)
+    if (s[..., 1] <= 1e-9 * s[..., 0]).any():
+        raise DegenerateError("E-POINTS-COLLINEAR", "plane: the points are collinear; points off the line are needed")
+    normal = vt[..., 2, :]
+    if towards is not None:
+        normal = np.where((normal @ towards < 0)[..., None], -normal, normal)
+    return Plane(normal, (normal * mean).sum(-1), s[..., 2] / np.sqrt(n))
 
 
 def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -71,21 +70,6 @@ def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     det = np.abs(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
     root = np.sqrt(np.maximum(half_trace**2 - det**2, 0))
     return np.sqrt(half_trace + root), np.sqrt(np.maximum(half_trace - root, 0))
-
-
-def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return normals (k, 3), offsets (k,) and RMS distances (k,) of the planes of k sets of points, (k, n, 3)."""
-    n = xyz.shape[1]
-    if n < 3:
-        raise DegenerateError("E-POINTS-FEW", f"plane: {n} points, 3 needed")
-    mean = xyz.mean(1)
-    _, s, vt = np.linalg.svd(xyz - mean[:, None], full_matrices=False)
-    if (s[:, 1] <= 1e-9 * s[:, 0]).any():
-        raise DegenerateError("E-POINTS-COLLINEAR", "plane: the points are collinear; points off the line are needed")
-    normal = vt[:, 2]
-    if towards is not None:
-        normal = np.where((normal @ towards < 0)[:, None], -normal, normal)
-    return normal, (normal * mean).sum(1), s[:, 2] / np.sqrt(n)
 
 
 def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
@@ -138,15 +122,14 @@ def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
 
 
 def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    constant = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
-    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + constant
+    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + a_from_b[..., None, :, 2]
 
 
 def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
     """Return the Jacobians (..., 2, 2) of :func:`apply_homography` at points (..., 2); also for k homographies."""
     mapped = _mapped(a_from_b, xy_b)
     w = mapped[..., 2, None, None]
-    homography = a_from_b if a_from_b.ndim == 2 else a_from_b[:, None]
+    homography = a_from_b[..., None, :, :]
     return (homography[..., :2, :2] - mapped[..., :2, None] / w * homography[..., 2:, :2]) / w
 
 
@@ -208,15 +191,10 @@ Descend = Callable[[Poses, float], Minima]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneMinima:
-    """One or two distinct minima, the better one first, and the residuals' robust σ over the stated one, 1 or more."""
+    """One or two distinct minima, the better one first."""
 
     minima: Minima
-    robust_sigma: float
-
-    @property
-    def outlier_limit(self) -> float:
-        """Length, in stated σ, beyond which a residual is an outlier."""
-        return OUTLIER * self.robust_sigma
+    outlier_limit: float  # length, in stated σ, beyond which a residual is an outlier
 
 
 def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
@@ -261,7 +239,7 @@ def two_minima(
         again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
         minima = minima.rows([0]).plus(again).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
-    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
+    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma)
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:
@@ -329,9 +307,8 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     jacobian = homography_jacobian(homography, np.zeros((1, 2)))[0]
     determinant = float(np.linalg.det(jacobian))
     if determinant <= 0:
-        raise DegenerateError(
-            "E-POINTS-MIRRORED", "plane: its points appear mirrored: they are seen from behind, or numbered wrongly"
-        )
+        mirrored = "plane: its points appear mirrored: they are seen from behind, or numbered wrongly"
+        raise DegenerateError("E-POINTS-MIRRORED", mirrored)
     sight_point = homography[:2, 2] / homography[2, 2]
     x, y, z = np.append(sight_point, 1.0) / np.hypot(1.0, np.linalg.norm(sight_point))
     cross = skew(np.array([-y, x, 0.0]))
@@ -346,8 +323,7 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     for sign in (1.0, -1.0):
         first, second = np.append(upper[:, 0], sign * low[0]), np.append(upper[:, 1], sign * low[1])
         turn = np.column_stack([first, second, np.cross(first, second)])
-        u, _, vt = np.linalg.svd(camera_from_sight @ turn)
-        poses.append(_placed(u @ vt, xy, xy_image))
+        poses.append(_placed(best_rotations(camera_from_sight @ turn)[0], xy, xy_image))
     return PlanePoses((poses[0], poses[1]), determinant, float(small / large))
 
 

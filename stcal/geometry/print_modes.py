@@ -62,27 +62,21 @@ class PrintModes:
         relative = self.modes[:, :2].T @ off_mm.ravel() * PRINT_SHARE / self.spread_mm[:2]  # to the half extent
         return 2 * float(relative[0]), 2 * float(relative[1])
 
-    def variances(self, sigma_mm: float) -> np.ndarray:
-        """Return the variances (m,) of the modes' coordinates, where each point also has its own ``sigma_mm``."""
-        return sigma_mm**2 + (self.amplitude * self.spread_mm) ** 2
-
     def weight(self, sigma_mm: float) -> np.ndarray:
-        """Return the inverse covariance (3n, 3n) of the points' places."""
-        less = 1 / sigma_mm**2 - 1 / self.variances(sigma_mm)
+        """Return the inverse covariance (3n, 3n) of the points' places, each of which also has its own ``sigma_mm``."""
+        less = 1 / sigma_mm**2 - 1 / (sigma_mm**2 + (self.amplitude * self.spread_mm) ** 2)
         return np.eye(len(self.modes)) / sigma_mm**2 - (self.modes * less) @ self.modes.T
 
-    def costs(self, off_mm: np.ndarray, sigma_mm: float) -> tuple[float, float]:
-        """Return the χ² of deviations (n, 3) from the drawing: of the points by themselves, and of the modes."""
+    def cost(self, off_mm: np.ndarray, sigma_mm: float) -> float:
+        """Return the χ² of deviations (n, 3) from the drawing: of the points by themselves, without the modes."""
         flat = off_mm.ravel()
         along = self.modes.T @ flat
-        of_modes = float((along**2 / self.variances(sigma_mm)).sum())
-        return float(flat @ flat - along @ along) / sigma_mm**2, of_modes
+        return float(flat @ flat - along @ along) / sigma_mm**2
 
     def as_found(self, off_mm: np.ndarray, covariance: np.ndarray, sigma_mm: float) -> "PrintModes":
         """Return the modes with the amplitude that explains deviations (n, 3), adjusted with this one, best;
         ``covariance`` : (m, m) of the modes' coordinates after the adjustment."""
-        own = np.full(len(self.spread_mm), sigma_mm**2)
-        told = Told(self.modes.T @ off_mm.ravel(), covariance, own, self.spread_mm)
+        told = Told(self.modes.T @ off_mm.ravel(), covariance, sigma_mm**2, self.spread_mm)
         return replace(self, amplitude=found_amplitude([told], self.amplitude))
 
 
@@ -104,7 +98,7 @@ class Told:
 
     mean: np.ndarray  # (m,)
     covariance: np.ndarray  # (m, m)
-    own: np.ndarray  # (m,) variance that they have anyway
+    own: np.ndarray | float  # (m,) variance that they have anyway
     spread: np.ndarray  # (m,) at an amplitude of 1
 
     def prior(self, amplitude: float) -> np.ndarray:

@@ -50,14 +50,12 @@ def perspective(xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return xyz_camera[..., :2] / depth, by_point
 
 
-def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
-    """Return the largest |R Rᵀ − 1| of rows, infinite if left-handed; numpy takes ten times as long for so few."""
-    (a, b, c), (d, e, f), (g, h, i) = x, y, z
-    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
-        return math.inf
-    own = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
-    across = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    return max(*(abs(square - 1) for square in own), *map(abs, across))
+def _off_proper(rotation: np.ndarray, what: str) -> float:
+    """Return the largest |R Rᵀ − 1| of matrices (..., 3, 3); refuse left-handed ones, and more than 1e-6."""
+    off = float(np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0))
+    if off > 1e-6 or (np.linalg.det(rotation) < 0).any():
+        raise InputError("E-ROTATION-IMPROPER", f"{what}: improper; orthogonal with determinant +1 needed")
+    return off
 
 
 if TYPE_CHECKING:
@@ -101,6 +99,10 @@ class _Frames:
         translation = (self.rotation @ other.translation[..., None])[..., 0]
         return self.rotation @ other.rotation, translation + self.translation
 
+    def as_scipy(self) -> Rotation:
+        """Return the rotation as SciPy's, of which quaternions, Euler angles and rotation vectors can be taken."""
+        return Rotation.from_matrix(np.array(self.rotation))
+
     def moved(self, step: np.ndarray) -> Self:
         """Return the transform after a left perturbation (..., 6), rad and mm: exp(w) R, t + dt."""
         turn = Rotation.from_rotvec(step[..., :3]).as_matrix()
@@ -132,12 +134,8 @@ class Rigid(ByValue, _Frames):
             object.__setattr__(self, "rotation", self.rotation.as_matrix())
         freeze(self, "rotation", (3, 3), "rotation")
         freeze(self, "translation", (3,), "translation")
-        deviation = _off_proper(*self.rotation.tolist())
-        if deviation > 1e-6:
-            raise InputError("E-ROTATION-IMPROPER", "rotation: improper; orthogonal with determinant +1 needed")
-        if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could fail the check above
-            u, _, vt = np.linalg.svd(self.rotation)
-            object.__setattr__(self, "rotation", frozen(u @ vt))
+        if _off_proper(self.rotation, "rotation") > 1e-12:  # or a product of accepted rotations could be refused
+            object.__setattr__(self, "rotation", frozen(best_rotations(self.rotation)[0]))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> "Rigid":
@@ -152,10 +150,6 @@ class Rigid(ByValue, _Frames):
         if np.linalg.det(m[:3, :3]) <= 0 or np.abs(s - 1).max() > 1e-3:
             raise InputError("E-ROTATION-IMPROPER", "rigid transform: 3×3 part is no rotation (left-handed or scaled)")
         return cls(u @ vt, m[:3, 3])
-
-    def as_scipy(self) -> Rotation:
-        """Return the rotation as SciPy's, of which quaternions, Euler angles and rotation vectors can be taken."""
-        return Rotation.from_matrix(np.array(self.rotation))
 
     @classmethod
     def exp(cls, twist: ArrayLike) -> "Rigid":
@@ -255,9 +249,7 @@ class Poses(Brief, _Frames):
     def __post_init__(self):
         freeze(self, "translation", (None, 3), "translations")
         freeze(self, "rotation", (len(self.translation), 3, 3), "rotations")
-        r = self.rotation
-        if len(r) and ((np.linalg.det(r) < 0).any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
-            raise InputError("E-ROTATION-IMPROPER", "rotations: improper; orthogonal with determinant +1 needed")
+        _off_proper(self.rotation, "rotations")
 
     @classmethod
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
@@ -284,15 +276,13 @@ class Poses(Brief, _Frames):
         wxyz = frozen(wxyz, (None, 4), "quaternions")
         off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
         if len(off) and off.max() > UNIT_WITHIN:
-            raise InputError(
-                "E-QUATERNION-LENGTH",
-                f"quaternion {off.argmax() + 1}: length off by {off.max():.3g}, {UNIT_WITHIN} allowed",
-            )
+            fault = f"quaternion {off.argmax() + 1}: length off by {off.max():.3g}"
+            raise InputError("E-QUATERNION-LENGTH", f"{fault}, {UNIT_WITHIN} allowed")
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
     def quaternions(self) -> np.ndarray:
         """Return the quaternions (m, 4), w first and not negative."""
-        return Rotation.from_matrix(np.array(self.rotation)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        return self.as_scipy().as_quat(canonical=True)[:, [3, 0, 1, 2]]
 
     @property
     def dim(self) -> int:

@@ -39,9 +39,8 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
         freedom = float(np.exp(logarithm))
         return quantile(TAIL, freedom) / quantile(0.5, freedom) - ratio
 
-    ends = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
-    signs = off(ends[0]) > 0, off(ends[1]) > 0
-    logarithm = brentq(off, *ends) if signs == (True, False) else ends[int(signs[1])]
+    low, high = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
+    logarithm = high if off(high) > 0 else brentq(off, low, high) if off(low) > 0 else low
     freedom = float(np.exp(np.asarray(logarithm, float)))
     return max(quantile(beyond, freedom) * middle / quantile(0.5, freedom), length_limit(2, beyond))
 
@@ -70,14 +69,7 @@ def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
 def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
     """Return σ of one coordinate from the median of lengths (n,) over ``coordinates``, up to half of them outliers.
     ``redundancy`` : per observation; residuals are shorter than errors by its square root."""
-    n = len(length)
-    if n < 2:
-        median = float(np.median(length))
-    else:  # five times as fast as np.median for some hundred numbers
-        part = np.partition(length, (n // 2 - 1, n // 2, n - 1))
-        middle = part[n // 2] if n % 2 else (part[n // 2 - 1] + part[n // 2]) / 2
-        median = float(part[-1] if np.isnan(part[-1]) else middle)  # NaN is sorted last
-    return median / (median_length(coordinates) * np.sqrt(redundancy))
+    return float(np.median(length)) / (median_length(coordinates) * np.sqrt(redundancy))
 
 
 def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:

@@ -20,11 +20,11 @@ from stcal.handeye.remarks import Observability, Verdict
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 from stcal.io.json import Finite, Matrix6, Named, NamedReason, Part, Pose, ResultFile, Vector3
+from stcal.io.rotations import fixed
 from stcal.io.static_transforms import (
     Static,
     fixed_joint,
     metres,
-    plain_numbers,
     require_form,
     ros1_launch,
     ros2_commands,
@@ -289,7 +289,7 @@ def easy_handeye(result: HandEye, transforms: list[Static], name: str, second: b
         content = {"parameters": {"eye_on_hand": in_hand, **MOVE_GROUP, "namespace": f"/{name}/", **named}}
         content["transformation"] = {f"q{axis}": value for axis, value in turn.items()} | place
     for each in others:
-        words = " ".join(plain_numbers(xyzw(each.pose), 3))
+        words = " ".join(fixed(value, 3) for value in xyzw(each.pose))
         lines.append(f"{each.child} is not in this file: in {each.parent} at 0 0 0, quaternion x y z w {words}")
     return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 

@@ -2,10 +2,10 @@
 differ in their view; simulated cameras."""
 
 import contextlib
-import os
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 import cv2
 import numpy as np
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError, InputNote, environment
 from stcal.io.files import IMAGE_BYTES, read_bytes, save, unwritable
 from stcal.io.images import SUFFIXES, decode, find_images, grey_8bit
 from stcal.parallel import scratch_folder
@@ -170,17 +170,10 @@ def quiet_opencv() -> Iterator[None]:
 
 def _device(source: int | str) -> cv2.VideoCapture:
     """Return the source, opened if it can be. The libraries' own words about it are kept back."""
-    before = os.environ.get(FFMPEG_LEVEL)
-    os.environ[FFMPEG_LEVEL] = "-8"
-    try:
-        with quiet_opencv():
-            device = cv2.VideoCapture(source)
-            device.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor wrote them, which the camera file describes
-            return device
-    finally:
-        os.environ.pop(FFMPEG_LEVEL)
-        if before is not None:
-            os.environ[FFMPEG_LEVEL] = before
+    with environment({FFMPEG_LEVEL: "-8"}), quiet_opencv():
+        device = cv2.VideoCapture(source)
+        device.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor wrote them, which the camera file describes
+        return device
 
 
 def _grey(frame: np.ndarray) -> np.ndarray:
@@ -194,32 +187,25 @@ def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
 
 def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, None]:
     """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile."""
-    ready, ended = threading.Condition(), threading.Event()
-    newest: list[np.ndarray] = []
+    came, ended = threading.Event(), threading.Event()
+    newest: deque[np.ndarray] = deque(maxlen=1)
 
     def read() -> None:
-        while not ended.is_set():
-            came, frame = device.read()
-            if not came:
-                break
-            with ready:
-                newest[:] = [frame]
-                ready.notify()
-        with ready:
-            ended.set()
-            ready.notify()
+        while not ended.is_set() and (taken := device.read())[0]:
+            newest.append(taken[1])
+            came.set()
+        ended.set()
+        came.set()
 
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
     try:
-        while True:
-            with ready:
-                if not ready.wait_for(lambda: newest or ended.is_set(), PATIENCE_S):
-                    raise InputError("E-LIVE-LOST", f"{what}: no picture for {PATIENCE_S:g} s; is it still connected?")
-                if not newest:
-                    return
-                frame = newest.pop()
-            yield _grey(frame)
+        while newest or not ended.is_set():
+            if not came.wait(PATIENCE_S):
+                raise InputError("E-LIVE-LOST", f"{what}: no picture for {PATIENCE_S:g} s; is it still connected?")
+            came.clear()
+            if newest:
+                yield _grey(newest.pop())
     finally:
         ended.set()
         thread.join()

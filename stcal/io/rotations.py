@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
-from stcal.io.table import ANGLES, Table, require_unit
+from stcal.io.table import ANGLES, Table, refuse, require_unit
 
 ROTATION_VECTOR = "rotvec"
 MOST_RADIANS = 4 * np.pi
@@ -124,13 +123,6 @@ def rotations(
     return Rotation.from_euler(convention.order, angles).as_matrix(), words
 
 
-def turned_values(
-    values: np.ndarray, rotation: str | None, what: str, places: tuple[str, ...], where: str
-) -> tuple[np.ndarray, str]:
-    """Return rotations (m, 3, 3) of numbers (m, 3) or (m, 4) in the user's convention, and the convention in words."""
-    return rotations(values, said_convention(rotation, what, where, values.shape[1]), places, where)
-
-
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
     """Return matrices (m, 3, 3) projected onto rotations, since files state few digits."""
     require_finite(rotation, places, where)
@@ -138,31 +130,29 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
     off = np.abs(size - 1).max(axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # matrices that are refused by their size
         determinant = np.linalg.det(rotation)
-    bad = np.flatnonzero((off > UNIT_WITHIN) | (determinant < 0))
-    if len(bad):
-        i = bad[0]
-        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        finding = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
-        if off[i] > UNIT_WITHIN:
-            stretched = f"its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}"
-            finding = f"not a rotation: {stretched}, 1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
-        raise InputError("E-ROTATION-IMPROPER", f"{where}: {places[i]}: the 3×3 part is {finding}{suffix}")
+
+    def said(i: int) -> str:
+        if off[i] <= UNIT_WITHIN:
+            return "the 3×3 part is a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
+        stretched = f"its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, 1 ± {UNIT_WITHIN:g} needed"
+        return f"the 3×3 part is not a rotation: {stretched}; correct it, or write more digits"
+
+    bad = (off > UNIT_WITHIN) | (determinant < 0)
+    refuse(bad, "E-ROTATION-IMPROPER", lambda i: f"{where}: {places[i]}", said)
     return u @ vt
 
 
 def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
     """Return the rotations (m, 3, 3) of quaternions (m, 4), w first."""
     require_finite(wxyz, places, where)
-    require_unit(wxyz, places.__getitem__, where, "correct it")
-    return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)
+    require_unit(wxyz, lambda i: f"{where}: {places[i]}", "correct it")
+    return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 
 
 def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
     """Refuse values (m, …) that are not finite; the message names the row."""
-    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-    if len(bad):
-        reason = f"a value that is not finite, numbers needed{f' (and {len(bad) - 1} more)' * (len(bad) > 1)}"
-        raise InputError("E-TABLE-NUMBER", f"{where}: {places[bad[0]]}: {reason}; take it out")
+    bad, said = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1), "a value that is not finite, numbers needed"
+    refuse(bad, "E-TABLE-NUMBER", lambda i: f"{where}: {places[i]}", lambda _: said, "; take it out")
 
 
 EXPLAINS = 0.2  # a mistake explains a misfit if its correction reduces the misfit below this share
@@ -220,9 +210,6 @@ class Turned:
     words: str
     columns: tuple[str, ...]
     stated: bool = True
-
-    def __post_init__(self):
-        freeze(self, "rotation", (len(self.rotation), 3, 3), "rotations")
 
 
 def places_of(table: Table) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -31,12 +31,12 @@ class Static:
 
 def metres(pose: Rigid) -> list[float]:
     """Return the translation of a pose in metres."""
-    return [float(v) / METRE_MM for v in pose.translation]
+    return (pose.translation / METRE_MM).tolist()
 
 
 def xyzw(pose: Rigid) -> list[float]:
     """Return the quaternion of a pose in the order of ROS, w ≥ 0."""
-    return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
+    return pose.as_scipy().as_quat(canonical=True).tolist()
 
 
 def messages(statics: Iterable[Static]) -> str:
@@ -106,12 +106,8 @@ def _arguments(each: Static) -> list[str]:
 
 
 def _pose_words(pose: Rigid) -> list[str]:
-    return [*plain_numbers(metres(pose), METRE_DIGITS), *plain_numbers(xyzw(pose), QUATERNION_DIGITS)]
-
-
-def plain_numbers(values, digits: int) -> list[str]:
-    """Return the texts of numbers without exponents, and without a minus before zero."""
-    return [fixed(v, digits) for v in values]
+    place = [fixed(value, METRE_DIGITS) for value in metres(pose)]
+    return [*place, *(fixed(value, QUATERNION_DIGITS) for value in xyzw(pose))]
 
 
 METRE_MM = 1000.0  # millimetres per metre, the unit of ROS, URDF and Universal Robots
@@ -156,24 +152,19 @@ class ImageLine:
 def image_lines(text: str, where: str) -> list[ImageLine]:
     """Return the images of ``images.txt``, also of one from which empty lines were removed."""
     images: list[ImageLine] = []
-    lines = iter([*enumerate(text.splitlines(), 1), (0, "")])
-    number, line = next(lines)
-    while number:
-        if not line.strip() or line.lstrip().startswith("#"):
-            number, line = next(lines)
-            continue
-        if not _is_image(line):
-            no_image = f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew"
-            raise InputError("E-MODEL-UNREADABLE", no_image)
-        first, name = number, line.split(maxsplit=CELLS - 1)[-1].strip()
-        number, line = next(lines)
-        followed = number > 0 and not _is_image(line)
-        images.append(ImageLine(first, name, followed))
-        if followed and not _are_points(line):
-            cells = f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each"
-            raise InputError("E-MODEL-UNREADABLE", f"{cells}; export the model anew")
-        if followed:
-            number, line = next(lines)
+    after_image = False
+    for number, line in enumerate(text.splitlines(), 1):
+        fault = ""
+        if _is_image(line):
+            images.append(ImageLine(number, line.split(maxsplit=CELLS - 1)[-1].strip(), followed=False))
+        elif after_image:
+            images[-1] = replace(images[-1], followed=True)
+            fault = "" if _are_points(line) else f"{len(line.split())} cells, not points of `x y id` each"
+        elif line.strip() and not line.lstrip().startswith("#"):
+            fault = "not `id qw qx qy qz tx ty tz camera name`"
+        if fault:
+            raise InputError("E-MODEL-UNREADABLE", f"{where}: line {number}: {fault}; export the model anew")
+        after_image = _is_image(line)
     return images
 
 

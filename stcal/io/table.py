@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +98,7 @@ class Table(ByValue):
 
     def refuse(self, bad: np.ndarray, code: str, said: Callable[[int], str]) -> None:
         """Refuse rows, by a mask (m,), by the line of the first one; ``said`` : returns what is wrong in row i."""
-        rows = np.flatnonzero(bad)
-        if len(rows):
-            more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
-            raise InputError(code, f"{self.where}: line {self.lines[rows[0]]}: {said(int(rows[0]))}{more}")
+        refuse(bad, code, lambda i: f"{self.where}: line {self.lines[i]}", said)
 
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
         """Return the values (m,) of the column ``name_unit``, in mm or rad."""
@@ -155,7 +153,7 @@ class Table(ByValue):
         """Return the m transforms of the columns ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
         wxyz = np.column_stack([self._near(prefix + c) for c in self.quaternion_columns(prefix)])
-        require_unit(wxyz, lambda i: f"line {self.lines[i]}", self.where, "is the order qw, qx, qy, qz?")
+        require_unit(wxyz, lambda i: f"{self.where}: line {self.lines[i]}", "is the order qw, qx, qy, qz?")
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
@@ -483,30 +481,33 @@ POSE_MM = 1e-6
 """Largest difference of a written pose, mm at :data:`LEVER_MM`. Decimals of degrees and quaternions cause less."""
 
 
-def pose_values(poses: Poses | Mapping[str, Rigid]) -> np.ndarray:
+def pose_values(poses: Poses) -> np.ndarray:
     """Returns poses as lengths (m, 3, 4), mm: rotations at :data:`LEVER_MM`, and translations."""
-    matrices = [pose.matrix() for pose in poses.values()] if isinstance(poses, Mapping) else poses.matrix()
-    return np.reshape(matrices, (-1, 4, 4))[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
-
-
-def require_poses_written(path: str | Path, read: Callable[[], Poses | Mapping[str, Rigid]], poses) -> None:
-    """Read a written file again, and require that its poses are ``poses``, of the type that ``read`` returns."""
-    require_written(path, lambda: pose_values(read()), pose_values(poses), POSE_MM, "mm")
+    return poses.matrix()[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
 
 
 def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> None:
     """Read a written table again, and require that its poses are ``poses``, by the prefix of their columns."""
     for prefix, own in poses.items():
-        require_poses_written(path, lambda prefix=prefix: read_table(path, "poses").poses(prefix), own)
+        again = partial(lambda prefix: pose_values(read_table(path, "poses").poses(prefix)), prefix)
+        require_written(path, again, pose_values(own), POSE_MM, "mm")
 
 
-def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
-    """Refuse quaternions (m, 4) that are not of unit length; ``place`` : returns that of row i; ``remedy`` : ends the
-    message."""
+def refuse(
+    bad: np.ndarray, code: str, place: Callable[[int], str], said: Callable[[int], str], remedy: str = ""
+) -> None:
+    """Refuse rows, by a mask (m,); ``place``, ``said`` : return where row i is, and what is wrong in it; ``remedy`` :
+    ends the message, after the number of further rows."""
+    rows = np.flatnonzero(bad).tolist()
+    if rows:
+        more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+        raise InputError(code, f"{place(rows[0])}: {said(rows[0])}{more}{remedy}")
+
+
+def require_unit(wxyz: np.ndarray, place: Callable[[int], str], remedy: str) -> None:
+    """Refuse quaternions (m, 4) that are not of unit length; ``place``, ``remedy`` : as of :func:`refuse`."""
     with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)
-    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))
-    if len(bad):
-        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        fault = f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}"
-        raise InputError("E-QUATERNION-LENGTH", f"{fault}, 1 ± {UNIT_WITHIN:g} needed{suffix}; {remedy}")
+    bad, needed = ~(np.abs(length - 1) <= UNIT_WITHIN), f"1 ± {UNIT_WITHIN:g} needed"
+    said = "quaternion of length {:.4g}, {}".format
+    refuse(bad, "E-QUATERNION-LENGTH", place, lambda i: said(length[i], needed), f"; {remedy}")

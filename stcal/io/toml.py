@@ -125,11 +125,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda own, node: own.construct_mapping(node, deep=True))
 
 
 def load_yaml(text: str):

@@ -11,8 +11,7 @@ import numpy as np
 from stcal.boards.target_file import target_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.read import read_camera, written
+from stcal.io.cameras.read import WRITERS, read_camera, save_camera
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml
@@ -127,11 +126,11 @@ def _cameras(folder: Path) -> None:
     storage.release()
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
-    write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
+    save_camera(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
     names = {"ros": "ros.yaml", "opencv": "opencv.yaml", "colmap-bin": "cameras.bin", "kalibr": "camchain.yaml"}
     names |= {"mrcal": "camera.cameramodel", "metashape": "metashape.xml", "matlab": "matlab.mat"}
     for form, name in names.items():
-        content = written(given, form, "cam0").content
+        content = WRITERS[form](given, "cam0")
         (forms / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
@@ -211,7 +210,7 @@ def _tags(folder: Path, rng: np.random.Generator) -> None:
     cv2.imwrite(str(folder / "scenes/a/1.png"), image)
     cv2.imwrite(str(folder / "scenes/a/2.png"), cv2.convertScaleAbs(image, alpha=0.6))
     (folder / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
-    write_cameras_txt(folder / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
+    save_camera(folder / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     hand_eye = {"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}
     hand_eye |= {"covariance": np.diag([1e-6] * 3 + [0.01] * 3).tolist()}
     (folder / "handeye.json").write_text(json.dumps(hand_eye))

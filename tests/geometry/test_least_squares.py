@@ -212,7 +212,7 @@ def test_the_amplitude_of_a_print_is_found_from_its_points(amplitude):
     modes = PrintModes.of(reference_board().xy_mm())
     for _ in range(30):
         along = amplitude * modes.spread_mm * rng.standard_normal(11) + 0.01 * rng.standard_normal(11)
-        prior = modes.variances(0.003)
+        prior = 0.003**2 + modes.spread_mm**2
         covariance = np.diag(1 / (1 / prior + 1 / 0.01**2))  # points measured to 0.01 mm
         off = (modes.modes @ (covariance @ along / 0.01**2)).reshape(-1, 3)
         logs.append(np.log(modes.as_found(off, covariance, 0.003).amplitude))

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry import least_squares
 from stcal.geometry.least_squares import Normal, block_diagonal, descend
 from stcal.geometry.plane import (
+    OUTLIER,
     apply_homography,
     camera_from_plane,
     circle_image_offset,
@@ -62,8 +63,7 @@ def test_fit_plane_finds_the_plane(pose):
         np.testing.assert_allclose(plane.normal, side * normal, atol=1e-12)
         assert plane.offset == pytest.approx(side * normal @ pose.translation, abs=1e-9)  # lengths of 1e3 mm
         assert plane.rms < 1e-10
-        np.testing.assert_allclose(plane.distance(xyz + 3 * normal), side * 3, atol=1e-9)
-        np.testing.assert_allclose(plane.project(xyz + 3 * normal), xyz, atol=1e-9)
+        np.testing.assert_allclose((xyz + 3 * normal) @ plane.normal - plane.offset, side * 3, atol=1e-9)
 
 
 def test_plane_rms_is_the_spread_about_it():
@@ -73,7 +73,7 @@ def test_plane_rms_is_the_spread_about_it():
     plane = fit_plane(xyz, towards=np.array([0, 0, 1.0]))
     # Standard error of a σ from 4000 values: 1.1 %; of the offset 0.1/√4000 = 0.0016 mm.
     assert plane.rms == pytest.approx(0.1, rel=0.05)
-    assert plane.rms == pytest.approx(np.sqrt((plane.distance(xyz) ** 2).mean()), rel=1e-9)
+    assert plane.rms == pytest.approx(np.sqrt(((xyz @ plane.normal - plane.offset) ** 2).mean()), rel=1e-9)
     assert plane.offset == pytest.approx(5, abs=0.008)
 
 
@@ -378,7 +378,7 @@ def test_both_minima_are_found_from_either(side):
     found = minima(truth, start)
     assert len(found.minima.cost) == 2
     assert found.minima.cost[0] < found.minima.cost[1]
-    assert found.robust_sigma == 1.0
+    assert found.outlier_limit == OUTLIER
     error = found.minima.poses[0].difference(truth)
     assert error @ found.minima.normal[0] @ error < 30  # χ² of 6 unknowns: once in 25 000
     second = found.minima.poses[1].difference(mirrored(Poses.of([truth]), MIDDLE)[0])
@@ -397,7 +397,8 @@ def test_minima_are_told_apart_by_the_residuals_own_sigma():
     poses = Poses.of([Rigid.exp([0, 0, 0, 0, 0, 500.0]), Rigid.exp([0.005, 0, 0, 0, 0, 500.0])])  # 5 σ
     assert distinct(poses, normal)
     assert not distinct(poses, normal, robust_sigma=10.0)
-    assert 5 < minima(tilted(0.44, 2000.0), tilted(0.44, 2000.0), factor=10.0).robust_sigma < 20
+    limit = minima(tilted(0.44, 2000.0), tilted(0.44, 2000.0), factor=10.0).outlier_limit
+    assert 5 * OUTLIER < limit < 20 * OUTLIER
 
 
 def test_mirrored_twice_is_where_it_was():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.camera_model import write_cameras_txt
+from stcal.io.cameras.read import save_camera
 from tests.boards.drawn import photograph
 from tests.handeye.written import table
 from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
@@ -78,6 +78,6 @@ def photographs(folder: Path, sheet: np.ndarray, first_mm: float, seen: Poses, b
     for i, pose in enumerate(seen):
         cv2.imwrite(str(found.images / f"{i}.png"), take(sheet, first_mm, pose))
     table(found.poses, {"base_from_flange": base_from_flange}, image=[f"{i}.png" for i in range(len(seen))])
-    write_cameras_txt(found.camera, Camera.of(CAMERA, "PINHOLE"))
+    save_camera(found.camera, Camera.of(CAMERA, "PINHOLE"))
     found.board.write_text(board_toml)
     return found

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.camera_model import write_cameras_txt
+from stcal.io.cameras.camera_model import cameras_txt
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with, refuses
 
@@ -75,7 +75,7 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, ratio, coeffici
     k = np.where(plain.distortion, [*coefficients, *coefficients[:4]], 0.0)
     fx, fy = lengths[0], lengths[0] * (1 if plain.focal[0] == plain.focal[1] else ratio)
     camera = Camera(6000, 4000, [fx, fy], lengths[1:], k, "FISHEYE" in name)
-    write_cameras_txt(path, Camera.of(camera, name))
+    path.write_text(cameras_txt(Camera.of(camera, name)))
     found = read_camera(path)
     assert (found.colmap_model, found.width, found.height) == (name, 6000, 4000)
     np.testing.assert_array_equal(found.focal, camera.focal)

@@ -13,21 +13,13 @@ from PIL import Image, ImageOps
 from stcal.errors import InputError
 from stcal.io import images
 from stcal.io.files import RUN_MARKER
-from stcal.io.images import TOP_GROUP, common_size, decode, find_images, name_fault, percentiles, size_fault, thumbnail
+from stcal.io.images import TOP_GROUP, common_size, decode, find_images, name_fault, size_fault, thumbnail
 from tests.outcome import fails_with, refuses
 
 
 def encoded(suffix, image=None, params=()):
     image = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64) if image is None else image
     return cv2.imencode(suffix, image, list(params))[1].tobytes()
-
-
-@pytest.mark.parametrize(("kind", "most"), [(np.uint8, 255), (np.uint16, 60_000), (np.uint8, 0)])
-def test_percentiles_are_those_of_numpy(kind, most):
-    rng = np.random.default_rng(2)
-    for size in (1, 2, 7, 200):
-        grey, percent = rng.integers(0, most + 1, (size, 3)).astype(kind), [0, 0.5, 37.3, 50, 99.95, 100]
-        np.testing.assert_allclose(percentiles(grey, percent), np.percentile(grey, percent), rtol=1e-12)
 
 
 def test_groups_and_order(tmp_path):

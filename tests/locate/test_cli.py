@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import write_cameras_txt
+from stcal.io.cameras.read import save_camera
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml, load_layout
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
@@ -34,7 +34,7 @@ def files(tmp_path_factory):
         (root / "scenes" / name).mkdir(parents=True)
         cv2.imwrite(str(root / "scenes" / name / "1.png"), image)
     (root / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
-    write_cameras_txt(root / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
+    save_camera(root / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     (root / "he.json").write_text(json.dumps({"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}))
     rows = [",".join([name, *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]) for name in ("good", "empty")]
     (root / "robot.csv").write_text("\n".join([",".join(["scene", *POSE]), *rows]) + "\n")
@@ -139,7 +139,7 @@ def test_calibrate_with_a_board_of_dots(locate, tmp_path):
     (tmp_path / "board.toml").write_text(BOARD)
     entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
     (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
-    write_cameras_txt(tmp_path / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
+    save_camera(tmp_path / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     out, record = tmp_path / "calibrated.toml", tmp_path / "calibrated.json"
     code, shown, _ = locate(
         *("calibrate", tmp_path / "images", "--camera", tmp_path / "cameras.txt", "--board", tmp_path / "board.toml"),

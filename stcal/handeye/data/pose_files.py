@@ -40,8 +40,8 @@ from stcal.io.rotations import (
     places_of,
     read_rotations,
     require_finite,
+    rotations,
     said_convention,
-    turned_values,
 )
 from stcal.io.table import FARTHEST, LENGTHS, Table, is_comment, read_table, separator_stated
 from stcal.io.toml import load_documents
@@ -241,7 +241,8 @@ def _of_universal(file: File) -> PoseContent:
         return match and _numbers(match[1])
 
     values, places = _table_of(file, inside, 6)
-    rotation, words = turned_values(values[:, 3:], file.said.rotation, "the numbers after x, y, z", places, file.where)
+    convention = said_convention(file.said.rotation, "the numbers after x, y, z", file.where)
+    rotation, words = rotations(values[:, 3:], convention, places, file.where)
     return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
 
 

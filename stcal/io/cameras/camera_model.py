@@ -20,10 +20,10 @@ from stcal.geometry.camera import (
     PARAMETER_NAMES,
     Camera,
     intrinsic_basis,
+    not_in_pixels,
     opencv_lens,
     require_lens,
 )
-from stcal.io.files import save
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
@@ -140,13 +140,8 @@ def refinable(camera: Camera) -> Camera:
     return camera
 
 
-def write_cameras_txt(path: str | Path, camera: Camera) -> None:
-    """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
-    save(Path(path), cameras_txt(camera))
-
-
 def cameras_txt(camera: Camera) -> str:
-    """Return the text of the file that :func:`write_cameras_txt` writes."""
+    """Return ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
     params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
     if covariance is not None:
@@ -159,7 +154,7 @@ def cameras_txt(camera: Camera) -> str:
 
 
 def stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
-    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
+    """Return the covariance (q, q) in the comments of :func:`cameras_txt`; None if there are none."""
     lines, count = text.splitlines(), len(names)
     sigmas, rows = ([line.split()[2:] for line in lines if line.startswith(key)] for key in (SIGMA, CORRELATION))
     if not sigmas and not rows:
@@ -196,9 +191,7 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraMo
     require_lens(flat, width, height)
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
-        size = f" of an image of {width:g}×{height:g} px" if width and height else ""
-        fault = f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}"
-        raise InputError("E-CAMERA-FOCAL", f"{fault}; pixels needed; check that they are not mm, or shares of a side")
+        raise not_in_pixels(flat, width, height)
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         fault = f"principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×{height:g} px"
         remedy = "pixels from the image's corner needed; check that they are not from its middle"
@@ -213,13 +206,11 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
         if colmap_model not in COLMAP_LAYOUT:
             known = ", ".join(COLMAP_LAYOUT)
             raise InputError("E-CAMERA-MODEL", f"model {colmap_model} is not supported; use one of {known}")
-        layout = COLMAP_LAYOUT[colmap_model]
-        if len(params) != len(layout):
+        basis = intrinsic_basis(colmap_model)
+        if len(params) != basis.shape[1]:
             fault = f"{len(params)} parameters of {colmap_model}"
-            raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}, {len(layout)} needed")
-        flat = np.zeros(len(PARAMETER_NAMES))
-        for place, value in zip(layout, params, strict=True):
-            flat[list(place) if isinstance(place, tuple) else place] = value
+            raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}, {basis.shape[1]} needed")
+        flat = np.where(basis.any(axis=1), np.array(params, float)[basis.argmax(axis=1)], 0.0)
         flat[2:4] -= COLMAP_PIXEL_ORIGIN
         return replace(camera_model(flat, colmap_model, width, height), source=str(source))
 

@@ -47,8 +47,7 @@ class SizedLens:
 
     def project(self, rays: np.ndarray) -> np.ndarray:
         """Return the pixels (n, 2) of rays (n, 3)."""
-        with np.errstate(all="ignore"):
-            return self.lens.project(rays)
+        return self.lens.project(rays)
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Return the unit rays (n, 3) of pixels (n, 2) by Newton's method; nan where there is none."""

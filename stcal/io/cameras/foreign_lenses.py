@@ -56,7 +56,7 @@ class ForeignLens:
     region: np.ndarray | None = None
 
     def __post_init__(self):  # a number beyond all numbers is no pixel, and no warning
-        object.__setattr__(self, "project", np.errstate(over="ignore", invalid="ignore")(self.project))
+        object.__setattr__(self, "project", np.errstate(all="ignore")(self.project))
 
     def determined(self, pixels: np.ndarray) -> np.ndarray:
         """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
@@ -82,8 +82,7 @@ def of_colmap(model: str, width: float, height: float, params) -> CameraModel | 
     require_finite(coefficients)
 
     def project(rays: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), coefficients)
+        return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), coefficients)
 
     return ForeignLens(f"COLMAP's {model}", project, int(width), int(height))
 
@@ -230,27 +229,20 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
     flat = Camera(1, 1, [1, 1], [0, 0], in_opencv_order, fisheye)
 
     def project(rays: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            xy = _on_plane(rays, lens, shape)
-            return centre + focal * (_of_fov(xy, coefficients[0]) if distortion == "fov" else flat.distort(xy))
+        xy = _on_plane(rays, lens, shape)
+        return centre + focal * (_of_fov(xy, coefficients[0]) if distortion == "fov" else flat.distort(xy))
 
     return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None)
 
 
 def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
     """Return the normalised coordinates (n, 2) of rays (n, 3); nan where a ray has none."""
-    z, length = rays[:, 2], np.linalg.norm(rays, axis=1)
-    if lens == "omni":
-        below = z + shape[0] * length
-    elif lens == "eucm":
-        alpha, beta = shape
-        below = alpha * np.sqrt(beta * (rays[:, :2] ** 2).sum(axis=1) + z**2) + (1 - alpha) * z
-    elif lens == "ds":
-        xi, alpha = shape
-        deep = xi * length + z
-        below = alpha * np.sqrt((rays[:, :2] ** 2).sum(axis=1) + deep**2) + (1 - alpha) * deep
-    else:
-        below = z
+    below, r2, length = rays[:, 2], (rays[:, :2] ** 2).sum(axis=1), np.linalg.norm(rays, axis=1)
+    if lens in ("omni", "ds"):
+        below = below + shape[0] * length
+    if lens in ("eucm", "ds"):
+        alpha, beta = (shape[0], shape[1]) if lens == "eucm" else (shape[1], 1.0)
+        below = alpha * np.sqrt(beta * r2 + below**2) + (1 - alpha) * below
     return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
 
 
@@ -309,12 +301,11 @@ def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens
     axis = np.array([np.sin(alpha) * np.cos(beta), np.sin(beta), np.cos(alpha) * np.cos(beta)])
 
     def project(rays: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            along = rays @ axis
-            tau = (rays**2).sum(axis=1) / along**2 - 1
-            bent = rays + (r[0] + tau * (r[1] + tau * r[2]))[:, None] * (rays - along[:, None] * axis)
-            inside = (along > 0) & (bent[:, 2] > 0)
-            xy = np.array([cx, cy]) + np.array([fx, fy]) * bent[:, :2] / bent[:, 2:]
+        along = rays @ axis
+        tau = (rays**2).sum(axis=1) / along**2 - 1
+        bent = rays + (r[0] + tau * (r[1] + tau * r[2]))[:, None] * (rays - along[:, None] * axis)
+        inside = (along > 0) & (bent[:, 2] > 0)
+        xy = np.array([cx, cy]) + np.array([fx, fy]) * bent[:, :2] / bent[:, 2:]
         return np.where(inside[:, None], xy, np.nan)
 
     return ForeignLens("mrcal's CAHVOR", project, int(width), int(height))

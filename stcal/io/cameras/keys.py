@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stcal.errors import InputError, InputNote, named
+from stcal.errors import InputError, InputNote, held, named
 
 _HARMLESS = """
 cameraid cameraindex cameraname cameraserial camname camoverlaps comment createdat createdby data description
@@ -55,12 +55,8 @@ _file: ContextVar[str] = ContextVar("_file", default="")
 @contextmanager
 def reading(file: str) -> Iterator[None]:
     """Let errors and notes name the camera file that is read in the context."""
-    token = _file.set(file)
-    try:
-        with named(file):
-            yield
-    finally:
-        _file.reset(token)
+    with held(_file, file), named(file):
+        yield
 
 
 def note(text: str) -> None:
@@ -72,11 +68,8 @@ def note(text: str) -> None:
 def collecting_passed_over() -> Iterator[list[str]]:
     """Collect what is in a camera file and not in the camera that is read: other cameras, and keys with numbers."""
     collected: list[str] = []
-    token = _passed_over.set(collected)
-    try:
+    with held(_passed_over, collected):
         yield collected
-    finally:
-        _passed_over.reset(token)
 
 
 def pass_over(parts: Collection[str], what: str = "") -> None:

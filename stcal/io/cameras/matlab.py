@@ -131,12 +131,10 @@ def from_structure(values: Mapping) -> CameraModel | ForeignLens:
     require_known(unread, HARMLESS)
     if "MappingCoefficients" in values:
         raise InputError("E-CAMERA-MODEL", "MATLAB's fisheye model is not supported; calibrate with another")
-    matrix = _numbers(values, "K")
-    if matrix is None:
-        turned = _numbers(values, "IntrinsicMatrix")  # with the principal point in its last row
-        matrix = None if turned is None else turned.reshape(3, 3).T
-    if matrix is not None:
-        (fx, skew, cx), (_, fy, cy) = matrix.reshape(3, 3)[:2]
+    if (matrix := _numbers(values, "K", 9)) is not None:
+        fx, skew, cx, _, fy, cy, *_ = matrix
+    elif (turned := _numbers(values, "IntrinsicMatrix", 9)) is not None:  # with the principal point in its last row
+        fx, _, _, skew, fy, _, cx, cy, _ = turned
     else:
         focal, centre = (_numbers(values, key, 2) for key in ("FocalLength", "PrincipalPoint"))
         if focal is None or centre is None:
@@ -176,9 +174,9 @@ def _numbers(values: Mapping, key: str, count: int = 0, needed: bool = False) ->
         numbers = np.asarray(values[key], float)
     except (TypeError, ValueError) as error:
         raise InputError("E-CAMERA-CONTENT", f"{key} is no list of numbers; save it again") from error
-    if (count and numbers.size != count) or (key in ("K", "IntrinsicMatrix") and numbers.size != 9):
-        raise InputError("E-CAMERA-COEFFICIENTS", f"{key} of {numbers.size} numbers; {count or 9} needed")
-    return numbers.ravel() if key not in ("K", "IntrinsicMatrix") else numbers
+    if count and numbers.size != count:
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{key} of {numbers.size} numbers; {count} needed")
+    return numbers.ravel()
 
 
 def _from_bouguet(values: Mapping) -> CameraModel | ForeignLens:

@@ -8,8 +8,8 @@ import ast
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from PIL import ExifTags, Image
 
-from stcal.errors import InputError
+from stcal.errors import InputError, held
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
 from stcal.io.cameras import foreign_lenses as foreign
@@ -153,15 +153,6 @@ MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPE
 MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
 """Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
 LEAST_CAMERA_BYTES = 48  # bytes of a camera of `cameras.bin` with three parameters
-SIGMA_FORMS = ("colmap", "metashape-cameras")  # the forms that have a place for σ and correlations
-
-
-@dataclass(frozen=True, slots=True)
-class Written:
-    """The ``content`` of a file, and ``lost`` : properties of the camera that the file has no place for."""
-
-    content: str | bytes
-    lost: tuple[str, ...]
 
 
 def from_mrcal(text: str, _: str) -> CameraModel | ForeignLens:
@@ -227,13 +218,6 @@ def name_to_write(name: str) -> str:
     return word if word[0].isalpha() else f"cam{word}"
 
 
-def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera in one of :data:`WRITERS`, named by a word; refuse a lens that it cannot hold."""
-    lost = ["σ and correlations of the parameters"] * (form not in SIGMA_FORMS)
-    lost += metashape.without_sigma(camera) if form == "metashape-cameras" else []
-    return Written(WRITERS[form](camera, name), tuple(lost) if camera.covariance is not None else ())
-
-
 def _colmap_binary(camera: Camera, _: str) -> bytes:
     params = camera.colmap_params()
     number = next(number for number, name in foreign.NUMBERS.items() if name == camera.colmap_model)
@@ -241,16 +225,13 @@ def _colmap_binary(camera: Camera, _: str) -> bytes:
     return head + struct.pack(f"<{len(params)}d", *params)
 
 
-def _fisheye_four(camera: Camera, form: str) -> list[float]:
-    """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
+def _coefficients(camera: Camera, form: str) -> list[float]:
+    """Return k1 … k4 of an equidistant camera, and refuse one with others; else the first 5 or, if needed, 8."""
+    if not camera.fisheye:
+        return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
     if camera.distortion[2:4].any() or camera.distortion[8:].any():
         raise foreign.refused(camera, form, "p1, p2 and prisms")
     return camera.distortion[[0, 1, 4, 5]].tolist()
-
-
-def _coefficients(camera: Camera) -> list[float]:
-    """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
-    return camera.distortion[: 8 if camera.distortion[5:8].any() else 5].tolist()
 
 
 def _matrix(camera: Camera) -> list[float]:
@@ -259,7 +240,7 @@ def _matrix(camera: Camera) -> list[float]:
 
 
 def _opencv(camera: Camera, _: str) -> str:
-    values = _fisheye_four(camera, "opencv") if camera.fisheye else _coefficients(camera)
+    values = _coefficients(camera, "opencv")
     node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
     kind = "distortion_model: equidistant\n" if camera.fisheye else ""
     return (
@@ -270,7 +251,7 @@ def _opencv(camera: Camera, _: str) -> str:
 
 
 def _ros(camera: Camera, name: str) -> str:
-    values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
+    values = _coefficients(camera, "ros")
     kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
     k, eye = _matrix(camera), np.eye(3).ravel().tolist()
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
@@ -289,7 +270,7 @@ def _kalibr(camera: Camera, name: str) -> str:
     if not camera.fisheye and camera.distortion[4:].any():
         raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
     kind = "equidistant" if camera.fisheye else "radtan"
-    values = _fisheye_four(camera, "kalibr") if camera.fisheye else camera.distortion[:4].tolist()
+    values = _coefficients(camera, "kalibr")[:4]
     return (
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {camera.parameters()[:4].tolist()}\n"
         f"  distortion_model: {kind}\n  distortion_coeffs: {values}\n"
@@ -300,7 +281,7 @@ def _kalibr(camera: Camera, name: str) -> str:
 def _mrcal(camera: Camera, _: str) -> str:
     if camera.fisheye:
         raise foreign.refused(camera, "mrcal", "the equidistant projection")
-    values = _coefficients(camera) if camera.distortion.any() else []
+    values = _coefficients(camera, "mrcal") if camera.distortion.any() else []
     values = values[:4] if len(values) == 5 and not values[4] else values
     lens = next(name for name, count in MRCAL.items() if count == len(values))
     return (
@@ -328,14 +309,9 @@ _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
 
 
-@contextmanager
-def camera_chosen(name: str) -> Iterator[None]:
+def camera_chosen(name: str) -> AbstractContextManager[None]:
     """Read the camera of this name from files of several; for a command's option, which applies to all it reads."""
-    token = _chosen.set(name)
-    try:
-        yield
-    finally:
-        _chosen.reset(token)
+    return held(_chosen, name)
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
@@ -475,10 +451,14 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
 
     Raises InputError: no form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
     """
-    converted = written(camera, form_of(path, form), name_to_write(name))
-    save(Path(path), converted.content)
+    kind = form_of(path, form)
+    save(Path(path), WRITERS[kind](camera, name_to_write(name)))
     require_camera_written(path, camera)
-    return converted.lost
+    if camera.covariance is None or kind == "colmap":
+        return ()
+    if kind == "metashape-cameras":
+        return tuple(metashape.without_sigma(camera))
+    return ("σ and correlations of the parameters",)
 
 
 def form_of(path: str | Path, form: str | None) -> CameraForm:

@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, MappingError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
-from stcal.geometry.plane import fit_planes
+from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.refine import projection_jacobians
@@ -112,7 +112,7 @@ def face_frames(
         )
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
-        normal, offset, _ = fit_planes(xyz, towards)
+        normal, offset, _ = fit_plane(xyz, towards)
         corners = corners - ((corners * normal).sum(2) - offset)[..., None] * normal
     origin, along_x, along_y = corners[0], corners[1] - corners[0], corners[2] - corners[0]
     axis_x = along_x / np.linalg.norm(along_x, axis=1, keepdims=True)

@@ -496,7 +496,7 @@ def _updated_factors(last: LinearFit, factors: BoardSigmaFactors) -> tuple[Board
     dots, image_redundancy = factors.dots, fit.redundancy() - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:  # by the χ² of the places of dots by themselves, without the modes of prints
         off = {model.group: model.xyz_model - fit.places[model.group] for model in fit.models}
-        square = float(sum(fit.modes[folder].costs(away, fit.sigma_mm)[0] for folder, away in off.items()))
+        square = float(sum(fit.modes[folder].cost(away, fit.sigma_mm) for folder, away in off.items()))
         dots = max(LEAST_DOTS, dots * sigma_factor(square, dots_left))
     return BoardSigmaFactors(factors.centres * sigma_factor(fit.cost(), image_redundancy), dots), modes
 

@@ -298,4 +298,4 @@ def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np
     inverse = np.linalg.inv(covariance)
     along = inverse @ free
     weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
-    return tuple(model.labels[i] for i in members), plane.distance(xyz), weight
+    return tuple(model.labels[i] for i in members), xyz @ plane.normal - plane.offset, weight

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import freeze, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
-from stcal.io.images import percentiles, shrunk
+from stcal.io.images import shrunk
 from stcal.labels import BOARD, CircleLabel
 from stcal.sfm.data.group_model import Centres, CircleRows
 
@@ -93,7 +93,7 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
 
 def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> float:
     """Returns the contrast that a circle must exceed, grey values."""
-    low, high = percentiles(image[::8, ::8], [0.5, 99.9])
+    low, high = np.percentile(image[::8, ::8], [0.5, 99.9])
     return max(MIN_THRESHOLD, options.min_contrast * (max(high, 1.0) - low))
 
 

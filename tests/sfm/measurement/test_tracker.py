@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.cameras.camera_model import write_cameras_txt
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import read_camera, save_camera
 from stcal.sfm import MeasureOptions, Tracker, measure
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.detect.predict import common_shift
@@ -51,7 +50,7 @@ def model(film, frames, tmp_path_factory):
     (folder / "images/12").mkdir(parents=True)
     for i in range(IMAGES):
         cv2.imwrite(str(folder / f"images/12/{i}.png"), frames[i])
-    write_cameras_txt(folder / "cameras.txt", film.camera)
+    save_camera(folder / "cameras.txt", film.camera)
     return folder, read_camera(folder / "cameras.txt")
 
 
