@@ -25,7 +25,6 @@ from stcal.io.static_transforms import (
     fixed_joint,
     metres,
     plain_numbers,
-    require_form,
     ros1_launch,
     ros2_commands,
     ros2_launch,
@@ -151,6 +150,7 @@ class HandEyeFile(ResultFile):
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
         result, held_out, pitch_mm = outcome.result, outcome.held_out, outcome.pitch_mm
+        same = ("setup", "method", "covariance", "sigma", "estimated", "observability")
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
         if whole:
             optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
@@ -163,10 +163,8 @@ class HandEyeFile(ResultFile):
             "version": stcal.__version__,
             "where": outcome.where,
             "verdict": judged(outcome),
-            "setup": result.setup,
-            "method": result.method,
+            **{name: getattr(result, name) for name in same},
             **result.transforms,
-            "covariance": result.covariance,
             f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
             "board": {
                 "scale": result.scale,
@@ -174,15 +172,12 @@ class HandEyeFile(ResultFile):
                 "pitch_mm": pitch_mm and pitch_mm * result.scale,
             },
             "camera": outcome.camera,
-            "sigma": result.sigma,
-            "estimated": result.estimated,
             "corner_px_is_factor": outcome.own_sigmas,
             "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),
             "poses": poses,
             "outliers": outcome.outliers(),
             "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
             "held_out": held_out and held_out.summary(result.outliers),
-            "observability": result.observability,
             "notes": outcome.all_notes(),
         }
         return cls.model_validate(content | {name: value for name, value in optional.items() if value})
@@ -199,8 +194,7 @@ def _method(each: Compared) -> dict:
 OPTICAL = "_optical_frame"
 CAMERA_FRAME = f"camera{OPTICAL}"
 """Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
-CAMERA_LINK = "camera_link"
-"""Name in ROS of a camera frame with X along the line of sight, Y to the left and Z up."""
+CAMERA_LINK = "camera_link"  # name in ROS of a camera frame with X along the line of sight, Y to the left and Z up
 LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """Rotation between both frames, which share their origin: REP 103, suffix frames."""
 CameraFrame = Literal["optical", "link"]
@@ -262,8 +256,7 @@ def opencv_yaml(result: HandEye) -> str:
 
 
 def urdf_joint(transforms: list[Static]) -> str:
-    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); of several ones, in a ``robot`` for
-    xacro."""
+    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); several in a ``robot`` for xacro."""
     joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
         return joints[0]
@@ -302,10 +295,3 @@ FORMS: dict[str, Callable[[HandEye, list[Static], str], str]] = {
     "easy-handeye2": partial(easy_handeye, second=True),
 }
 """Writers of all formats, by the word of ``--export``."""
-
-
-def exported(result: HandEye, transforms: list[Static], form: str, name: str = "handeye") -> str:
-    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`; ``name`` : the file's stem, which
-    easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
-    require_form(form, FORMS)
-    return FORMS[form](result, transforms, name)

@@ -15,19 +15,13 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_pairs import rms_of
 
-LONGEST_S = 0.25
-"""Largest distance in time of two samples between which a pose is interpolated."""
-TOLERANCE_S = 0.02
-"""Default tolerance within which the nearest sample replaces a pose that cannot be interpolated."""
-SAME_S = 1e-9
-"""Difference below which times are equal."""
+LONGEST_S = 0.25  # largest distance in time of two samples between which a pose is interpolated
+TOLERANCE_S = 0.02  # default tolerance within which the nearest sample replaces a pose that cannot be interpolated
+SAME_S = 1e-9  # difference below which times are equal
 NANOSECONDS_FROM = Decimal(10) ** 14
-LEAST_STAMP = Decimal(10) ** 8
-"""Whole numbers below this are numbers of images, not seconds since 1970."""
-STEP = 1e-3
-"""Step of a numerical derivative, in spacings of the samples."""
-WINDOW = 4
-"""Number of samples of a cubic."""
+LEAST_STAMP = Decimal(10) ** 8  # whole numbers below this are numbers of images, not seconds since 1970
+STEP = 1e-3  # step of a numerical derivative, in spacings of the samples
+WINDOW = 4  # number of samples of a cubic
 LOO_NOISE = float(np.sqrt(1 + 34 / 36))
 """Scatter of a sample about the cubic through its four neighbours, in σ of one sample, with the noise of all five."""
 
@@ -143,7 +137,6 @@ class Taken:
 
     @property
     def rows(self) -> list[int]:
-        """The places of the kept times."""
         return np.flatnonzero(self.kept).tolist()
 
     def left_out(self, names: Sequence[str]) -> tuple[tuple[str, str], ...]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.handeye_file import FORMS, exported, opencv_yaml, tree, urdf_joint
+from stcal.handeye.handeye_file import FORMS, opencv_yaml, tree, urdf_joint
 from stcal.io.static_transforms import Static, messages
 from tests.outcome import fails_with
 from tests.support.static_transforms import (
@@ -34,7 +34,7 @@ def result_of(pose: Rigid, setup: str = "eye-in-hand", covariance: np.ndarray | 
 def text_of(result: HandEye, form: str, name: str = "handeye", **frames: str) -> str:
     """The file with frames of these names."""
     transforms, own = tree(result, **frames), {"ros": messages, "urdf": urdf_joint}
-    return own[form](transforms) if form in own else exported(result, transforms, form, name)
+    return own[form](transforms) if form in own else FORMS[form](result, transforms, name)
 
 
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
