@@ -10,6 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from stcal.cli.options import exports_of
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.handeye_file import FORMS, opencv_yaml, tree, urdf_joint
@@ -126,7 +127,7 @@ def test_names_of_frames():
     with fails_with("E-FRAME-NAME … 'tool 0'"):
         text_of(result_of(Rigid()), "moveit", parent="tool 0")
     with fails_with("E-OPTION-FORM … --export … staubli … ros2"):
-        text_of(result_of(Rigid()), "staubli")
+        exports_of(["staubli=flange.txt"], FORMS)
     for setup, own, other, beyond in (
         ("eye-in-hand", "robot_effector_frame", "robot_base_frame", "base"),
         ("eye-to-hand", "robot_base_frame", "robot_effector_frame", "flange"),
