@@ -19,7 +19,7 @@ from stcal.handeye.data.pose_content import FRAMES
 from stcal.handeye.data.pose_pairs import OTHER, HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
-from stcal.handeye.remarks import HALL_MM, Grave
+from stcal.handeye.remarks import HALL_MM, Grave, Remarks
 from stcal.io.rotations import INVERTED as CONJUGATED
 from stcal.io.rotations import LAST, ORDERS, ROTATION_VECTOR
 
@@ -36,9 +36,7 @@ SIDES = (("robot", "robot"), ("board", "camera"))  # what messages and options c
 Guess = Callable[[Loop, bool], LoopState]
 
 
-def check_conventions(
-    pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale: bool, by_images: bool
-) -> tuple[str, ...]:
+def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale: bool, by_images: bool) -> Remarks:
     """Refuse poses that fit far better in another convention, or in none; return notes on what the fit cannot decide.
     With both sides inverted, X and Z change places, and only a board behind the camera shows it.
 
@@ -46,7 +44,7 @@ def check_conventions(
     robot's can be named wrongly. Raises InputError: the message says what is mixed up, and the remedy.
     """
     turn, shift = as_read = _typical(loop, guess, with_scale)
-    notes: tuple[str, ...] = ()
+    notes: Remarks = ()
     if turn > WELL[0] or shift > WELL[1]:
         size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm"
         contradict = f"{pairs.where}: the poses contradict each other by {size} (median)"
@@ -191,10 +189,8 @@ def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    mirrored_board = _changed(
-        loop, lambda seen: Poses(MIRROR @ seen.rotation @ MIRROR, seen.translation @ MIRROR), "board"
-    )
-    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", mirrored_board)
+    other_hand = _changed(loop, lambda seen: Poses(MIRROR @ seen.rotation @ MIRROR, seen.translation @ MIRROR), "board")
+    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", other_hand)
     rows = slice(1, None), slice(-1)
     for which, late, (of_robot, of_board) in (("below", "robot's", rows), ("above", "board's", rows[::-1])):
         yield Candidate(
@@ -210,9 +206,8 @@ def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
             remedy = reading.remedy if reading.conjugated or by_images else remedy
             yield Candidate(f"with the {side}'s {quaternions}, {remedy}", _changed(loop, reading.poses, side))
         if not by_images:
-            yield Candidate(
-                f"with all {quaternions}, {reading.remedy}", _changed(loop, reading.poses, "robot", "board")
-            )
+            both = _changed(loop, reading.poses, "robot", "board")
+            yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:

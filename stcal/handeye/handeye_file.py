@@ -55,9 +55,6 @@ class MethodRow(Part):
     splits: Annotated[HeldOutPoses, SPLITS] | None
 
 
-MEANS = "`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`"
-
-
 class HandEyeFile(ResultFile):
     """Result file of ``handeye``: mm, rad, px; null where there is no value."""
 
@@ -142,14 +139,16 @@ class HandEyeFile(ResultFile):
     methods: list[MethodRow] = Field(
         [],
         description="only in `--json`, with `--method all`: `method`, `X` and `Z` (`flange_from_camera`, "
-        f"`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with {MEANS}, and `splits`, with "
-        "`rows`, as above; `reason` where it fails",
+        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with `splits`, `poses`, "
+        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`, and `splits`, with `rows`, as above; "
+        "`reason` where it fails",
     )
 
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
         result, held_out, pitch_mm = outcome.result, outcome.held_out, outcome.pitch_mm
+        pitch_mm = pitch_mm and pitch_mm * result.scale
         same = ("setup", "method", "covariance", "sigma", "estimated", "observability")
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
         if whole:
@@ -166,11 +165,7 @@ class HandEyeFile(ResultFile):
             **{name: getattr(result, name) for name in same},
             **result.transforms,
             f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
-            "board": {
-                "scale": result.scale,
-                "scale_sigma": result.sigma_scale,
-                "pitch_mm": pitch_mm and pitch_mm * result.scale,
-            },
+            "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": pitch_mm},
             "camera": outcome.camera,
             "corner_px_is_factor": outcome.own_sigmas,
             "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),

@@ -80,9 +80,8 @@ def outcome_report(outcome: Outcome) -> Document:
         means[f"held out, mean without the {len(bad)} left out above"] = held_out.means(~result.outliers)
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
     transforms: list[Block] = []
-    for (name, pose), covariance in zip(
-        result.transforms.items(), (result.covariance, result.stand_covariance), strict=True
-    ):
+    covariances = (result.covariance, result.stand_covariance)
+    for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
         matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
         transforms.append(Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance)))
         transforms.append(fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix)))
@@ -92,11 +91,11 @@ def outcome_report(outcome: Outcome) -> Document:
         unit = "times its own σ" if name == "corner_px" and outcome.own_sigmas else unit
         how = "estimated" if name in result.estimated else "stated"
         sigmas.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
-    judgements = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
-    told = (
-        ("To know", [note for note in outcome.all_notes() if isinstance(note, Aside)]),
-        ("What the files were taken for", outcome.understood),
-    )
+    judged_by = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    judgements = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judged_by, css="text")
+    asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
+    told = {"To know": asides, "What the files were taken for": outcome.understood}
+    camera = Table(["<", "value", "± σ", "<unit"], _adjusted(outcome))
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *transforms,
@@ -108,16 +107,9 @@ def outcome_report(outcome: Outcome) -> Document:
         Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
         f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
-        fold(
-            "Camera, as adjusted (first pixel's centre at 0, 0)",
-            Table(["<", "value", "± σ", "<unit"], _adjusted(outcome)),
-        ),
-        *(block for title, lines in told if lines for block in (subheading(title), bullets(lines))),
-        fold(
-            "What the verdict rests on",
-            Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judgements, css="text"),
-            CHANCE,
-        ),
+        fold("Camera, as adjusted (first pixel's centre at 0, 0)", camera),
+        *(block for title, lines in told.items() if lines for block in (subheading(title), bullets(lines))),
+        fold("What the verdict rests on", judgements, CHANCE),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
     rows = _pose_rows(result)

@@ -10,7 +10,7 @@ from scipy.special import fdtri
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import by_pose
 from stcal.handeye.choose import ChosenWay, choose
 from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
@@ -223,8 +223,7 @@ def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) ->
     if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
         return None
     place = pairs.camera_from_board.translation[~result.outliers] * result.scale
-    by_turn = -skew(place @ result.mount_from_camera.rotation.T)
-    jacobian = np.concatenate([by_turn, np.tile(np.eye(3), (used, 1, 1))], axis=2)
+    jacobian = by_pose(np.tile(np.eye(3), (used, 1, 1)), place @ result.mount_from_camera.rotation.T)
     variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
     return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))

@@ -29,7 +29,7 @@ from stcal.handeye.methods.reprojection import (
     resected,
     slope,
 )
-from stcal.handeye.remarks import Aside, Observability, Verdict, check, in_words, require_scale
+from stcal.handeye.remarks import Aside, Observability, Remarks, Verdict, check, in_words, require_scale
 from stcal.io.cameras.camera_model import CameraPrior
 
 
@@ -295,7 +295,7 @@ class HandEyeProblem:
         more |= {"observability": self.seen, "notes": notes}
         return Solved(self, HandEye(method, self.setup, x, z, residuals, names, outliers, **more), solution)
 
-    def _by_equations(self, method: str) -> tuple[Rigid, Rigid, tuple[str, ...]]:
+    def _by_equations(self, method: str) -> tuple[Rigid, Rigid, Remarks]:
         """Returns X and Z, by AX = XB or AX = ZB and the named method, and notes."""
         options, pairs, loop, notes = self.options, self.pairs, self.loop, self.notes
         if options.four_dof:
@@ -400,7 +400,7 @@ class HandEyeProblem:
         more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
         return self._solved("reprojection", x, z, residuals, notes, **more)
 
-    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, Remarks]:
         """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
         contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
         noise, loop = self.options.noise, self.loop
@@ -436,7 +436,7 @@ class HandEyeProblem:
 
     def _remarks(
         self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float] | None = None
-    ) -> tuple[str, ...]:
+    ) -> Remarks:
         """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
         if self.part:
             return ()
@@ -449,9 +449,7 @@ class HandEyeProblem:
             notes += remarks.of_size(loop[good], options.noise, hint)
         return notes + remarks.of_distance(loop)
 
-    def _without_slide(
-        self, x: Rigid, z: Rigid, normal: np.ndarray
-    ) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
+    def _without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, Remarks]:
         """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
         axis, frames = self.seen.mount_axis, FRAMES[self.setup]
         x, z = closed_form.slid(x, z, axis, self.loop)

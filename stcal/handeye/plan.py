@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
 from stcal.handeye.handeye_problem import HandEye
 from stcal.io.json import Pose, ResultFile, Vector
@@ -128,8 +128,7 @@ def plan_poses(
 def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray) -> float:
     """Returns the largest σ in any direction, mm, of ``points`` (n, 3) in the camera's frame, moved to the mount's."""
     covariance = generalised_inverse(normal)[:6, :6]
-    jacobian = np.zeros((len(points), 3, 6))
-    jacobian[:, :, :3], jacobian[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
+    jacobian = by_pose(np.tile(np.eye(3), (len(points), 1, 1)), points @ mount_from_camera.rotation.T)
     return float(np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).max()))
 
 

@@ -84,10 +84,8 @@ class Observability:
         """Returns the motion that would help, in words."""
         turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
         if self.one_axis and self.turns_rad[0] > LEAST_TURN:
-            said = (
-                f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about others"
-            )
-            return f"{said}; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
+            said = f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about"
+            return f"{said} others; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
         said = f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; rotate the flange about {first}"
         return f"{said} and about {in_words(self.axes[1])}, by {WANTED_DEG}° or more each"
 
@@ -103,8 +101,7 @@ def check(loop: Loop, where: str, four_dof: bool) -> Observability:
     if not four_dof and seen.useless:
         slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
         slides += f"{FRAMES[loop.setup].camera} along that axis is determined"
-        said = f"{where}: {seen.missing()}{slides if seen.one_axis else ''}"
-        raise DegenerateError("E-HANDEYE-AXES", said)
+        raise DegenerateError("E-HANDEYE-AXES", f"{where}: {seen.missing()}{slides if seen.one_axis else ''}")
     if four_dof and seen.turns_rad[0] < LEAST_TURN:
         fault = f"; rotate it about {in_words(seen.axes[0])} by {WANTED_DEG}° or more"
     elif four_dof and not seen.one_axis:
@@ -247,6 +244,9 @@ class Verdict:
         return "; ".join(each.said for each in self.reasons())
 
 
+Remarks = tuple[str, ...]  # notes on a result, one line each
+
+
 class Grave(str):
     """A note that says that the result is wrong, or answers another question."""
 
@@ -282,9 +282,7 @@ def spoken(name: str) -> str:
     return f"pose {name}" if name.isdigit() else name
 
 
-def of_outliers(
-    names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray
-) -> tuple[str, ...]:
+def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray) -> Remarks:
     """Returns notes on the poses left out, by residuals (m, 6); those of ``flips`` agree if tilted the other way."""
     notes: list[str] = []
     for i in np.flatnonzero(outliers):
@@ -303,7 +301,7 @@ def of_outliers(
     return tuple(notes)
 
 
-def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
+def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> Remarks:
     """Returns a note if poses with residuals (m, 6) fall into two groups, as when a board is moved in between."""
     if len(names) < LEAST_IN_GROUPS:
         return ()
@@ -323,9 +321,7 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
     return ()
 
 
-def of_order(
-    names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool = False
-) -> tuple[str, ...]:
+def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool) -> Remarks:
     """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
     jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals, or be beyond
     chance where the poses are ``apart``."""
@@ -351,7 +347,7 @@ def of_order(
     return (f"{before}: solve the poses before it, and those from it on, separately",)
 
 
-def of_size(loop: Loop, noise: Noise, hint: tuple[float, float] | None) -> tuple[str, ...]:
+def of_size(loop: Loop, noise: Noise, hint: tuple[float, float] | None) -> Remarks:
     """Returns a note if the board is of another size than stated by the poses, and by the corners, if there are any,
     whose ``hint`` is the scale after one step, with its σ."""
 
@@ -373,7 +369,7 @@ def of_size(loop: Loop, noise: Noise, hint: tuple[float, float] | None) -> tuple
     return (SizeDoubt(f"{said}check its size and the camera file, or solve with the scale"),)
 
 
-def of_distance(loop: Loop) -> tuple[str, ...]:
+def of_distance(loop: Loop) -> Remarks:
     """Returns a note if all lengths are in another unit, which no equation shows."""
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
     if NEAR_MM <= away <= HALL_MM:
@@ -392,7 +388,7 @@ LONG_MM, NEARER = 250.0, 0.5
 on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
 
 
-def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[str, ...]:
+def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> Remarks:
     """Returns a note if the camera is where no flange carries it, unless the setup was ``stated``, or if X and Z seem
     to be exchanged. Poses of the other setup, or sides that were exchanged or inverted, fit as well: no residual
     tells."""

@@ -273,9 +273,8 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     opposite = OTHER[setup]
     plain = replace(problem, views=None, options=replace(problem.options, intrinsics=None, symmetries=()))
     try:
-        first, other = (
-            refitted(replace(plain, setup=each), "pose", rows[:SETUP_SPLITS]).means() for each in (setup, opposite)
-        )
+        in_either = (replace(plain, setup=each) for each in (setup, opposite))
+        first, other = (refitted(each, "pose", rows[:SETUP_SPLITS]).means() for each in in_either)
     except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
         return ()
     (turn, shift), (other_turn, other_shift) = (list(each.values()) for each in (first, other))
@@ -283,8 +282,7 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
         return ()
     as_stated = f"{np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}"
     as_other = f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}"
-    said = f"poses held out are missed by {as_stated}, by {as_other}"
-    return (Grave(f"{said}: give --setup {opposite} if it is that"),)
+    return (Grave(f"poses held out are missed by {as_stated}, by {as_other}: give --setup {opposite} if it is that"),)
 
 
 @require_arguments

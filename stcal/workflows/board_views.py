@@ -49,6 +49,7 @@ NEAREST = 6  # number of outlines about a circle, one of which is its neighbour
 MIN_SHARE = 0.35  # smallest share of a board's circles that must be seen
 Board = BoardDesign | FlatBoard | BoardSet
 Circles = BoardDesign | AsymmetricCirclesDesign
+Seen = tuple[BoardView | None, str]  # a view of a board, or why there is none
 KINDS = {
     BoardDesign: "dots",
     ChessboardDesign: "chessboard",
@@ -73,7 +74,7 @@ def symmetries(board: Board) -> list[Rigid]:
     return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
 
 
-def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
+def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> Seen:
     """Returns the view of the board, or of all that are seen of a set, in a grey image, or why there is none."""
     if not isinstance(board, BoardSet):
         try:
@@ -92,9 +93,8 @@ def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tu
         views.append(replace(view, ids=view.ids + first, xyz_board=xyz, normal=normal, unused=unused))
     if not views:
         return None, "; ".join(reasons)
-    ids, xyz, xy, normals = (
-        np.concatenate([getattr(view, part) for view in views]) for part in ("ids", "xyz_board", "xy_px", "normal")
-    )
+    parts = ("ids", "xyz_board", "xy_px", "normal")
+    ids, xyz, xy, normals = (np.concatenate([getattr(view, part) for view in views]) for part in parts)
     unused = (*(reason for view in views for reason in view.unused), *reasons)
     return BoardView(name, ids, xyz, xy, np.concatenate([*map(covariance_px2, views)]), normals, unused), ""
 
@@ -106,9 +106,7 @@ def covariance_px2(view: BoardView) -> np.ndarray:
     return view.covariance_px2
 
 
-def _find_flat(
-    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
-) -> tuple[BoardView | None, str]:
+def _find_flat(image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard) -> Seen:
     if isinstance(board, BoardDesign):
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
@@ -170,7 +168,7 @@ def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesi
 
 def _find_circles(
     image: np.ndarray, name: str, camera: Camera, board: Circles, grid: BoardDesign, place: np.ndarray
-) -> tuple[BoardView | None, str]:
+) -> Seen:
     """``grid`` : lattice in which circles are found; ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
     pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
@@ -321,9 +319,8 @@ def calibration_images(
     told, model = progress or (lambda *_: None), camera_model(camera)
     detections = detect_boards(files, model, board, dictionaries, workers, partial(told, "images"))
     names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
-    left_out = tuple(
-        f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names
-    )
+    without = (image for image in (*skipped, *detections.skipped) if image.name not in names)
+    left_out = tuple(f"{image.name}: {image.reason}" for image in without)
     tags = tuple(
         replace(each, corners_px=each.corners_px - shift_by_curves(each.corners_px, detections.camera)) for each in tags
     )

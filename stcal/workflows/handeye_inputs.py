@@ -82,15 +82,16 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         robot = replace(robot[rows], names=tuple(images), understood=lines, own=False)
         return robot, (), clock() if dense else None
     stream, seconds = clock()
-    taken, seen = taken_at(stream, np.array(list(seconds.values())), timing.tolerance_s), tuple(images)
-    if not taken.kept.any():
-        raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {seen[0]}: {taken.why[0]}")
+    seen = tuple(images)
+    taken = taken_at(stream, np.array(list(seconds.values())), seen, timing.tolerance_s)
+    if not taken.rows:
+        raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {': '.join(taken.left_out[0])}")
     kept = tuple(seen[i] for i in taken.rows)
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
     read = {"names": kept, "places": tuple(f"time of {name}" for name in kept), "covariance": None, "own": False}
     read |= {"poses": taken.base_from_flange, "understood": f"{robot.understood}{note}; {taken.said}"}
     untimed_images = tuple((name, f"no time in {timing.image_times}") for name in names if name not in images)
-    return replace(robot, **read), taken.left_out(seen) + untimed_images, (stream, seconds)
+    return replace(robot, **read), taken.left_out + untimed_images, (stream, seconds)
 
 
 def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:

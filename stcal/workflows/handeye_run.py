@@ -128,8 +128,6 @@ NO_COVARIANCE = Aside(
     "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the board's "
     "size, is not in σ; `measure` writes it (columns cov_… and common…)"
 )
-
-
 SURE_SIGMAS = 4.0  # number of its σ from which an offset is reported (1 in 16,000)
 FALLS = 0.98
 """Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
@@ -205,9 +203,8 @@ def _is_moving(timed: Timed) -> bool:
         return True
     poses = timed.stream.base_from_flange
     steps = rms_of(poses[1:].difference(poses[:-1]))
-    return len(timed.seconds) >= LEAST_ROWS and all(
-        own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True)
-    )
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
+    return smooth and len(timed.seconds) >= LEAST_ROWS
 
 
 LEAST_REACHED = 0.5  # share of the poses taken that the arm of a robot file must reach to be accepted as this robot

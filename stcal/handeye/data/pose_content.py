@@ -169,9 +169,8 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError(
-                "E-POSE-REPEATED", f"{where}: {first[name]} and {place} are both {kind}{name!r}; one needed"
-            )
+            said = f"{first[name]} and {place} are both {kind}{name!r}"
+            raise InputError("E-POSE-REPEATED", f"{where}: {said}; one needed")
         first[name] = place
 
 
@@ -202,8 +201,7 @@ ROLES_BY_NAME: dict[Role, re.Pattern] = {
 
 
 def frames_of(key: object) -> KnownName | None:
-    """Returns the transform that a name means, or, not stated, the one by default of the side that it names; None where
-    it means none."""
+    """Returns the transform that a name means; not stated where it names a side only; None where it means none."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
         return KnownName(name, f"by its name {key}")
@@ -219,9 +217,8 @@ def frames_of(key: object) -> KnownName | None:
 
 def inverse_name(key: str) -> str:
     """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
-    match = re.fullmatch(
-        r"((?:rot|trans|rotation|translation|[rt]vecs?|[rthRTH])_)?(.+?)(_from_|_wrt_|_in_|2)(.+)", key
-    )
+    parts = r"((?:rot|trans|rotation|translation|[rt]vecs?|[rthRTH])_)?(.+?)(_from_|_wrt_|_in_|2)(.+)"
+    match = re.fullmatch(parts, key)
     return match.expand(r"\1\4\3\2") if match else ""
 
 

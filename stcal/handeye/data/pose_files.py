@@ -397,15 +397,15 @@ def read_two(
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
         stream = Stream.of(times, robot.poses, first.name)
         seconds = stream.after_origin(wanted)
-        taken = taken_at(stream, seconds, tolerance_s)
-        if not taken.kept.any():
-            said = f"no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}"
+        taken = taken_at(stream, seconds, camera.names, tolerance_s)
+        if not taken.rows:
+            said = f"no pose has one of the robot: first {', '.join(taken.left_out[0])}"
             raise InputError("E-POSES-UNMATCHED", f"{camera.where}: {said}")
         lines = [taken.said]
         if robot.covariance is not None:
             lines.append("covariances of the robot's poses are not used: they are of other times")
         robot, camera = replace(robot, poses=taken.base_from_flange, covariance=None), camera[taken.rows]
-        more = {"left_out": taken.left_out(sides[1].names), "timed": Timed(stream, seconds[taken.rows])}
+        more = {"left_out": taken.left_out, "timed": Timed(stream, seconds[taken.rows])}
         return HandEyeInput.of(robot, camera, camera.names, where, lines, setup=setup, **more)
     rows, how = matched(robot, camera, key)
     a, b = ([row[k] for row in rows] for k in (0, 1))
@@ -415,12 +415,9 @@ def read_two(
         if stream.spacing_s() <= LONGEST_S:
             stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
     alone = [(robot, first, a)] if stamped is None else []  # samples between images are no mistake
-    left_out = [
-        (name, f"in {path.name} alone")
-        for side, path, used in (*alone, (camera, second, b))
-        for i, name in enumerate(side.called())
-        if i not in used
-    ]
+    left_out = []
+    for side, path, used in (*alone, (camera, second, b)):
+        left_out += [(name, f"in {path.name} alone") for i, name in enumerate(side.called()) if i not in used]
     more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
     lines = [f"rows joined {how}"] if how else []
     return HandEyeInput.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
@@ -513,12 +510,9 @@ def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Know
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option, frames = statements.frames_of(role), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
-        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}"
+        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}; if the name is wrong, change it in the file"
         name = inverse_name(frames.by.rpartition(" ")[2])
-        remedy = (
-            f"if the name is wrong, change it in the file{f', to {name}' if name else ''}; else leave the option out"
-        )
-        raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
+        raise InputError("E-OPTION-CONTRADICTS", f"{said}{f', to {name}' if name else ''}; else leave the option out")
     if option is not None:
         return KnownName(option, "as you say")
     if frames is None and side.trajectory and role == "camera":

@@ -17,8 +17,6 @@ from stcal.io.table import LENGTHS, Table, read_table
 
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
 """Transforms that each row must hold, with the inverse that is accepted in place of each."""
-
-
 LengthUnit = Literal["mm", "m", "cm", "um", "in"]  # units of translations
 
 

@@ -119,8 +119,7 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
-    infinite for a board of no size."""
+    """Returns angles and distances (s, m) by which the chains miss Z, in units of the board: infinite if of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     cosine = (np.einsum("smab,sab->sm", hand.rotation @ (x[:, None] @ eye.rotation), z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
@@ -293,11 +292,9 @@ class EvolutionOptions:
         numbers = (self.population, self.generations, self.factor, self.crossover, self.weight)
         least, most = (4, 0, 1e-300, 0, 1e-300), (MOST, MOST, 2, 1, FARTHEST)
         if not all(low <= number <= high for low, number, high in zip(least, numbers, most, strict=True)):
-            raise InputError(
-                "E-EVOLUTION-OPTIONS",
-                "differential evolution: population {}, {} generations, F {:g}, CR {:g}, λ {:g}; ".format(*numbers)
-                + f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed",
-            )
+            said = "population {}, {} generations, F {:g}, CR {:g}, λ {:g}".format(*numbers)
+            needed = f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed"
+            raise InputError("E-EVOLUTION-OPTIONS", f"differential evolution: {said}; {needed}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

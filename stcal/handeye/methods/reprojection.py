@@ -15,7 +15,7 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.geometry.robust import length_limit
 from stcal.handeye.data.corner_views import Views, resect, whitened
 from stcal.handeye.data.pose_pairs import Loop, LoopState
@@ -211,16 +211,16 @@ class Corners:
         turn, place = hand.rotation[self.view], hand.translation[self.view]
         if self.loop.inverted:  # the flange is the stand, the base is the mount
             mount_from_stand = turn
-            by_hand = np.concatenate([-skew(mount - place), np.broadcast_to(np.eye(3), turn.shape)], axis=2)
+            by_hand = by_pose(np.broadcast_to(np.eye(3), turn.shape), mount - place)
         else:
             mount_from_stand = np.swapaxes(turn, 1, 2)
-            by_hand = np.concatenate([mount_from_stand @ skew(stand - place), -mount_from_stand], axis=2)
+            by_hand = -by_pose(mount_from_stand, stand - place)
         by_mount = state.camera.projection_jacobian(xyz_camera) @ x.rotation.T
         by_stand = by_mount @ mount_from_stand
         of_board = stand - z.translation
         return {
-            "x": np.concatenate([by_mount @ skew(mount - x.translation), -by_mount], axis=2),
-            "z": np.concatenate([-by_stand @ skew(of_board), by_stand], axis=2),
+            "x": -by_pose(by_mount, mount - x.translation),
+            "z": by_pose(by_stand, of_board),
             "camera": state.camera.parameter_jacobian(xyz_camera[:, :2] / xyz_camera[:, 2:]) @ self.basis,
             "scale": np.einsum("nab,nb->na", by_stand, of_board / state.scale)[:, :, None],
             "board": state.scale * by_stand @ z.rotation,
@@ -230,14 +230,8 @@ class Corners:
     def only(self, keep: np.ndarray) -> "Corners":
         """Returns the problem of the poses ``keep``, a mask (m,)."""
         rows = np.flatnonzero(keep[self.view])
-        return replace(
-            self,
-            loop=self.loop[keep],
-            view=(np.cumsum(keep) - 1)[self.view[rows]],
-            corner=self.corner[rows],
-            xy_px=self.xy_px[rows],
-            weight=self.weight[rows],
-        )
+        same = {name: getattr(self, name)[rows] for name in ("corner", "xy_px", "weight")}
+        return replace(self, loop=self.loop[keep], view=(np.cumsum(keep) - 1)[self.view[rows]], **same)
 
     def factors(self) -> dict[str, float]:
         """Returns a factor of 1 for each kind of the intrinsics solved for."""
@@ -270,19 +264,10 @@ def problem(
         free = [name for name in free if not name.startswith("robot")]
     basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
-    corners = Corners(
-        loop=loop,
-        xyz_board=designed,
-        view=np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
-        corner=corner.ravel(),
-        xy_px=np.concatenate([view.xy_px for view in views.views]),
-        weight=np.concatenate([view.whitening() for view in views.views]),
-        sigma=sigma,
-        camera=views.camera,
-        basis=basis,
-        information=information,
-        with_scale=with_scale,
-    )
+    view = np.repeat(np.arange(len(views)), [len(each) for each in views.views])
+    xy_px = np.concatenate([each.xy_px for each in views.views])
+    measured = view, corner.ravel(), xy_px, np.concatenate([each.whitening() for each in views.views])
+    corners = Corners(loop, designed, *measured, sigma, views.camera, basis, information, with_scale)
     factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
@@ -321,12 +306,12 @@ def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrio
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
     for view, pose in zip(views.views, loop.camera_from_board, strict=True):
-        white, by_pose = whitened(view, views.camera, pose)
+        white, by_board = whitened(view, views.camera, pose)
         point = pose @ view.xyz_board
         by_own = view.whitening() @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis
         by_own = by_own.reshape(-1, q)
-        slopes.append(-np.linalg.lstsq(by_pose, by_own)[0])
-        reduced = by_own + by_pose @ slopes[-1]
+        slopes.append(-np.linalg.lstsq(by_board, by_own)[0])
+        reduced = by_own + by_board @ slopes[-1]
         information += reduced.T @ reduced
         gradient += reduced.T @ white
         cost += float(white @ white)
@@ -455,8 +440,7 @@ class AdjustedCorners:
         return moved @ scattered @ moved.T + by_camera @ second_moment @ by_camera.T
 
     def _with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> tuple[Corners, Solution]:
-        """Returns the problem with intrinsics among the unknowns, factors of their prior σ at 1, and it about the
-        state."""
+        """Returns the problem with intrinsics among the unknowns, factors of their σ at 1, and it about the state."""
         wider = replace(self.corners, basis=basis, information=information)
         wider = replace(wider, sigma=wider.sigma | wider.factors())
         return wider, wider.problem().at(self.solution.values | {"camera": Vector(np.zeros((1, basis.shape[1])))})
