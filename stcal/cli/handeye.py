@@ -232,7 +232,7 @@ def handeye(
         (ros, lambda: messages(transforms)),
         (urdf, lambda: forms.urdf_joint(transforms)),
         (opencv, lambda: forms.opencv_yaml(result)),
-        *((path, partial(forms.exported, result, transforms, form, path.stem)) for form, path in exports),
+        *((path, partial(forms.FORMS[form], result, transforms, path.stem)) for form, path in exports),
     ):
         if path:
             write(path, content := text())

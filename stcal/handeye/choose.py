@@ -10,7 +10,6 @@ from scipy.special import chdtri
 from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses
 from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
 from stcal.handeye.validate import (
@@ -36,8 +35,7 @@ such a candidate solves for is also significant by itself (:data:`SHOWN`)."""
 WITHOUT_WEIGHTS = 2.0
 """The same for closed forms against adjustments. Closed forms are many, so that one of them is often ahead by chance,
 and they know neither σ nor outliers; an adjustment is left only where its weights are clearly wrong."""
-TINY_MM = 1e-9
-"""Least standard error of a difference: differences of exact data are rounding."""
+TINY_MM = 1e-9  # least standard error of a difference: differences of exact data are rounding
 CONTRADICT = 0.01
 """Significance level: σ are widened if two answers differ so much that their σ explain it more rarely than this."""
 
@@ -142,8 +140,7 @@ def _try(problem: HandEyeProblem, candidate: Way, rows: np.ndarray) -> Tried:
 
 
 def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool:
-    """True if board and intrinsics, where solved for from this ``share`` of the poses, differ from their files beyond
-    chance."""
+    """True if board and intrinsics, solved for from this ``share`` of the poses, differ from files beyond chance."""
     tests, found, intrinsics = [], result.reprojection, problem.options.intrinsics
     if problem.options.with_scale and result.sigma_scale:
         tests.append((((result.scale - 1) / result.sigma_scale) ** 2, 1))
@@ -254,15 +251,13 @@ def widened(result: HandEye, chosen: Way, rivals: list[Tried]) -> tuple[HandEye,
     for each in rivals:
         if (rival := each.result) is None or result.covariance is None or rival.covariance is None:
             continue
-        gap = Poses.of([rival.mount_from_camera]).difference(Poses.of([result.mount_from_camera]))[0]
+        gap = rival.mount_from_camera.difference(result.mount_from_camera)
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
         if squared > chdtri(6, CONTRADICT):
             ratio, turn, shift = np.sqrt(squared / 6), np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             factor = max(factor, ratio)
-            notes.append(
-                f"{each.candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
-                f"{ratio:.2g} times what their σ allow: σ are widened by that"
-            )
+            off = f"{each.candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off"
+            notes.append(f"{off}, {ratio:.2g} times what their σ allow: σ are widened by that")
     return result.widened(factor), tuple(notes)
 
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from typing import Any
@@ -17,32 +17,27 @@ from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_content import FRAMES
-from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, LoopState, Setup, carried
+from stcal.handeye.data.pose_pairs import OTHER, HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
-from stcal.handeye.remarks import HALL_MM, Aside, Grave
+from stcal.handeye.remarks import HALL_MM, Grave, Remarks
 from stcal.io.rotations import INVERTED as CONJUGATED
 from stcal.io.rotations import LAST, ORDERS, ROTATION_VECTOR
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """Factors by which a refused reading exceeds a variant in the product of both median residuals, and in translation."""
-DOUBTFUL = 1.5
-"""Factor by which the other setup must reduce the same product before a note says that it fits better."""
-WELL = np.radians(0.5), 5.0
-"""Median residuals (rad, mm) up to which poses are not suspected."""
+DOUBTFUL = 1.5  # factor by which the other setup must reduce the same product before a note says that it fits better
+WELL = np.radians(0.5), 5.0  # median residuals (rad, mm) up to which poses are not suspected
 LOST = 0.25
 """Share of the spread of the poses left unexplained, above which those of robot and camera have nothing in common."""
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
-SIDES = (("robot", "robot"), ("board", "camera"))
-"""What messages and options call the two sides."""
+SIDES = (("robot", "robot"), ("board", "camera"))  # what messages and options call the two sides
 Guess = Callable[[Loop, bool], LoopState]
 
 
-def check_conventions(
-    pairs: HandEyePoses, loop: Loop, setup: Setup, guess: Guess, with_scale: bool, by_images: bool
-) -> tuple[str, ...]:
+def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale: bool, by_images: bool) -> Remarks:
     """Refuse poses that fit far better in another convention, or in none; return notes on what the fit cannot decide.
     With both sides inverted, X and Z change places, and only a board behind the camera shows it.
 
@@ -50,7 +45,7 @@ def check_conventions(
     robot's can be named wrongly. Raises InputError: the message says what is mixed up, and the remedy.
     """
     turn, shift = as_read = _typical(loop, guess, with_scale)
-    notes: tuple[str, ...] = ()
+    notes: Remarks = ()
     if turn > WELL[0] or shift > WELL[1]:
         size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm"
         contradict = f"{pairs.where}: the poses contradict each other by {size} (median)"
@@ -67,19 +62,18 @@ def check_conventions(
             less = _typical(reading.change(), guess, with_scale)
             return *less, f"but by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm"
 
-        if best := explain(_readings(pairs, loop, setup, by_images, turn <= WELL[0]), misfit, 1 / FAR_BETTER, ALIKE):
+        if best := explain(_readings(loop, by_images, turn <= WELL[0]), misfit, 1 / FAR_BETTER, ALIKE):
             words = "; or ".join(each.words for each, _ in best)
             raise InputError("E-HANDEYE-CONVENTION", f"{contradict}, {errs(best[0][0])[2]} {words}")
         rows = range(LEAST_PART, len(loop) - LEAST_PART + 1)
         halves = [Candidate(pairs.names[row], partial(lambda row: (loop[:row], loop[row:]), row)) for row in rows]
         if best := explain(halves, apart, 1 / PART_BETTER):
             first = best[0][0].words
-            raise InputError(
-                "E-HANDEYE-CONVENTION",
-                f"{contradict}, but those before {first}, and those from it on, fit by themselves: another tool (TCP) "
-                "or base was set in the controller there, or camera or board were moved; solve them separately",
-            )
-        inverted = _inverted(loop, setup, by_images)
+            said = f"{contradict}, but those before {first}, and those from it on, fit by themselves: another tool "
+            said += "(TCP) or base was set in the controller there, or camera or board were moved; solve them "
+            said += "separately"
+            raise InputError("E-HANDEYE-CONVENTION", said)
+        inverted = _inverted(loop, by_images)
         with suppress(DegenerateError):
             *less, words = errs(inverted)
             if turn * shift > DOUBTFUL * less[0] * less[1] and shift > less[1]:
@@ -97,11 +91,9 @@ def check_conventions(
                 more = "check the camera file" if by_images else "look for another convention of rotations"
                 remedy += f", and {more}"
             what = "positions" if turn <= WELL[0] else "poses"
-            raise InputError(
-                "E-HANDEYE-CONVENTION",
-                f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if {what} of robot and camera did not belong together; {remedy}",
-            )
+            said = f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), "
+            said += f"as if {what} of robot and camera did not belong together; {remedy}"
+            raise InputError("E-HANDEYE-CONVENTION", said)
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
         robot, camera = (" in place of ".join(names) for names in FRAMES.values())
@@ -117,31 +109,30 @@ def check_conventions(
 
 LEAST_PART, PART_BETTER = 6, 10.0
 """Least number of poses that fit by themselves, and how much better than all together, in rotation and translation."""
-ALIKE = 1.001
-"""Ratio of misfits up to which two readings cannot be told apart: they give the same residuals."""
+ALIKE = 1.001  # ratio of misfits up to which two readings cannot be told apart: they give the same residuals
 ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
 """Orders of axes, fixed (xyz …) or turned (ZYX …), whose angles are mixed up with one another or with rotation vectors,
 by the names that --rotation has for them; the most frequent first."""
 
 
-def _readings(pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, turns_agree: bool) -> Iterator[Candidate]:
+def _readings(loop: Loop, by_images: bool, turns_agree: bool) -> Iterator[Candidate]:
     """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
-    yield from _variants(loop, setup, by_images)
+    yield from _variants(loop, by_images)
     for side, role in SIDES[: 1 if by_images else 2]:
         for one, other in permutations(ANGLES, 2):
             words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad), or by the names of its "
             words += f"columns, if they were read as {one}"
             yield Candidate(words, _changed(loop, partial(_with_angles, one, other), side), 1)
-        read = loop.camera_from_board if side == "board" else _by_robot(loop)
+        read = loop.camera_from_board if side == "board" else loop.base_from_flange
         for names, places in other_axes(read.translation) if turns_agree else ():
             words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
             placed = partial(lambda places, poses: Poses(poses.rotation, places), places)
             yield Candidate(words, _changed(loop, placed, side), 1)
     if not turns_agree:
-        opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
-        other_loop, words = Loop.of(pairs, opposite), f"with --setup {opposite}"
-        yield Candidate(words, lambda: other_loop, 2)
-        for each in _variants(other_loop, opposite, by_images):
+        other = replace(loop, setup=OTHER[loop.setup])
+        words = f"with --setup {other.setup}"
+        yield Candidate(words, lambda: other, 2)
+        for each in _variants(other, by_images):
             yield Candidate(f"{words} and {each.words}", each.change, 2)
 
 
@@ -155,27 +146,16 @@ def _with_angles(read: str, meant: str, poses: Poses) -> Poses:
     return Poses(turns.as_matrix(), poses.translation)
 
 
-def _by_robot(loop: Loop) -> Poses:
-    return loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount
-
-
 def _changed(loop: Loop, change: Callable[[Poses], Poses], *sides: str) -> Callable[[], Loop]:
     """Returns a function that gives the loop with changed poses of sides, as a file would state them."""
-
-    def changed() -> Loop:
-        hand, eye = loop.stand_from_mount, loop.camera_from_board
-        if "robot" in sides:
-            flange = change(_by_robot(loop))
-            hand = flange.inverse() if loop.inverted else flange
-        return replace(loop, stand_from_mount=hand, camera_from_board=change(eye) if "board" in sides else eye)
-
-    return changed
+    names = {"robot": "base_from_flange", "board": "camera_from_board"}
+    return lambda: replace(loop, **{names[side]: change(getattr(loop, names[side])) for side in sides})
 
 
-def _inverted(loop: Loop, setup: Setup, by_images: bool) -> Candidate:
+def _inverted(loop: Loop, by_images: bool) -> Candidate:
     """Returns the loop with one side inverted. As a board is in front of its camera, that side is known unless the
     poses have the board in front in both directions."""
-    seen, kind = loop.camera_from_board, "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+    seen = loop.camera_from_board
     robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
     front, front_inverted = (bool((poses.translation[:, 2] > 0).all()) for poses in (seen, seen.inverse()))
     named = f"{camera} or {robot}"
@@ -185,16 +165,16 @@ def _inverted(loop: Loop, setup: Setup, by_images: bool) -> Candidate:
         named = f"{robot} (the board is in front of the camera as read)" if front else camera
     return Candidate(
         f"with one side inverted: either these are {named}: rename them in the file, or give --poses-are where the "
-        f"file does not name them; or all are named rightly: give --setup {kind}",
+        f"file does not name them; or all are named rightly: give --setup {OTHER[loop.setup]}",
         _changed(loop, Poses.inverse, "board"),
     )
 
 
-def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
+def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
     """Yields the loop with a side inverted, mirrored, in another unit, or beside another row, or with quaternions in
     another order. ``by_images`` : the board's poses were computed here from images."""
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
-    yield _inverted(loop, setup, by_images)
+    hand, eye = loop.base_from_flange, loop.camera_from_board
+    yield _inverted(loop, by_images)
     # Residuals show only the ratio of two units; lengths beyond a hall tell which side it is.
     for (side, _), (other, role) in (SIDES, SIDES[::-1]):
         factor, which, times = 1000.0, side, "times"
@@ -210,16 +190,14 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    mirrored_board = _changed(
-        loop, lambda seen: Poses(MIRROR @ seen.rotation @ MIRROR, seen.translation @ MIRROR), "board"
-    )
-    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", mirrored_board)
+    other_hand = _changed(loop, lambda seen: Poses(MIRROR @ seen.rotation @ MIRROR, seen.translation @ MIRROR), "board")
+    yield Candidate(f"with one side mirrored: if {states} left-handed poses, {remedy}", other_hand)
     rows = slice(1, None), slice(-1)
     for which, late, (of_robot, of_board) in (("below", "robot's", rows), ("above", "board's", rows[::-1])):
         yield Candidate(
             f"with each pose of the board beside that of the flange one row {which}: move the {late} poses up by one "
             "row, or the names of their images",
-            partial(Loop, hand[of_robot], eye[of_board], loop.inverted),
+            partial(Loop, hand[of_robot], eye[of_board], loop.setup),
         )
     for reading in (*ORDERS, CONJUGATED):
         quaternions = f"quaternions {'conjugated' if reading.conjugated else 'in another order'}: if {reading.held}"
@@ -229,9 +207,8 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
             remedy = reading.remedy if reading.conjugated or by_images else remedy
             yield Candidate(f"with the {side}'s {quaternions}, {remedy}", _changed(loop, reading.poses, side))
         if not by_images:
-            yield Candidate(
-                f"with all {quaternions}, {reading.remedy}", _changed(loop, reading.poses, "robot", "board")
-            )
+            both = _changed(loop, reading.poses, "robot", "board")
+            yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:
@@ -260,29 +237,15 @@ def _typical(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.m
 ROUNDS = 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Repair:
-    """``pairs`` : m, the board's poses as if all views had been numbered alike; ``views`` : the same, where given;
-    ``turned`` : (m,) number, from 1, of the symmetry that each view was turned by; 0 where the view stayed."""
-
-    pairs: HandEyePoses
-    views: Views | None
-    turned: np.ndarray
-
-    def notes(self) -> tuple[str, ...]:
-        """Returns a note that names the turned views."""
-        names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
-        if not names:
-            return ()
-        numbered = f"numbered from another end of the board, and corrected: {', '.join(names)}"
-        return (Aside(f"{numbered}; base_from_board may belong to either end"),)
-
-
-def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:
+def repair(
+    pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None
+) -> tuple[HandEyePoses, Views | None, np.ndarray]:
     """Give all views the most common numbering of a symmetric board. Angle and advance of robot and camera between two
     poses agree whatever X is.
 
-    ``symmetries`` : all board_from_board except the identity. Raises DegenerateError: fewer than three poses.
+    ``symmetries`` : all board_from_board except the identity. Returns poses and views as if all views had been numbered
+    alike, and (m,) the number, from 1, of the symmetry that each view was turned by; 0 where the view stayed. Raises
+    DegenerateError: fewer than three poses.
     """
     loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
     as_numbered = loop.camera_from_board
@@ -292,17 +255,13 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         labels, cost = _settled(loop, variants, labels)
         if cost < least:
             best, least = labels, cost
-
-    def nearest(turn: Rigid) -> int:
-        return int(np.argmin([Rigid(symmetry.rotation.T @ turn.rotation).angle_rad() for symmetry in every]))
-
     # Label k of a view means C S_k. All views are turned by S_common⁻¹ from the right, so that most stay as they are.
-    common_inverse = every[int(np.bincount(best).argmax())].inverse()
-    best = np.array([nearest(every[k] @ common_inverse) for k in best])
+    turns = np.array([turn.rotation for turn in every])
+    left = turns[best] @ turns[np.bincount(best).argmax()].T
+    best = np.einsum("kab,mab->mk", turns, left).argmax(1)  # the nearest of the symmetries
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
-    jacobian = np.tile(
-        np.eye(6), (len(poses), 1, 1)
-    )  # by errors of camera_from_board when its origin moves on the board
+    # The origin moves on the board, and with it errors of rotation move it in the camera.
+    jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
     jacobian[:, 3:, :3] = -skew(poses.translation - as_numbered.translation)
     errors = carried(jacobian, pairs.camera_from_board_covariance, pairs.camera_from_board_common)
     names = ("camera_from_board", "camera_from_board_covariance", "camera_from_board_common")
@@ -311,7 +270,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     if views is not None:
         turned = (view.turned(every[k].inverse()) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))
-    return Repair(repaired, views, best)
+    return repaired, views, best
 
 
 def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:

@@ -25,7 +25,6 @@ from stcal.io.static_transforms import (
     Static,
     fixed_joint,
     metres,
-    require_form,
     ros1_launch,
     ros2_commands,
     ros2_launch,
@@ -54,9 +53,6 @@ class MethodRow(Part):
     base_from_board: Pose | None = None
     flange_from_board: Pose | None = None
     splits: Annotated[HeldOutPoses, SPLITS] | None
-
-
-MEANS = "`splits`, `poses`, `rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`"
 
 
 class HandEyeFile(ResultFile):
@@ -143,14 +139,17 @@ class HandEyeFile(ResultFile):
     methods: list[MethodRow] = Field(
         [],
         description="only in `--json`, with `--method all`: `method`, `X` and `Z` (`flange_from_camera`, "
-        f"`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with {MEANS}, and `splits`, with "
-        "`rows`, as above; `reason` where it fails",
+        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with `splits`, `poses`, "
+        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`, and `splits`, with `rows`, as above; "
+        "`reason` where it fails",
     )
 
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
         result, held_out, pitch_mm = outcome.result, outcome.held_out, outcome.pitch_mm
+        pitch_mm = pitch_mm and pitch_mm * result.scale
+        same = ("setup", "method", "covariance", "sigma", "estimated", "observability")
         optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
         if whole:
             optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
@@ -163,26 +162,17 @@ class HandEyeFile(ResultFile):
             "version": stcal.__version__,
             "where": outcome.where,
             "verdict": judged(outcome),
-            "setup": result.setup,
-            "method": result.method,
+            **{name: getattr(result, name) for name in same},
             **result.transforms,
-            "covariance": result.covariance,
             f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
-            "board": {
-                "scale": result.scale,
-                "scale_sigma": result.sigma_scale,
-                "pitch_mm": pitch_mm and pitch_mm * result.scale,
-            },
+            "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": pitch_mm},
             "camera": outcome.camera,
-            "sigma": result.sigma,
-            "estimated": result.estimated,
             "corner_px_is_factor": outcome.own_sigmas,
             "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),
             "poses": poses,
             "outliers": outcome.outliers(),
             "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
             "held_out": held_out and held_out.summary(result.outliers),
-            "observability": result.observability,
             "notes": outcome.all_notes(),
         }
         return cls.model_validate(content | {name: value for name, value in optional.items() if value})
@@ -199,8 +189,7 @@ def _method(each: Compared) -> dict:
 OPTICAL = "_optical_frame"
 CAMERA_FRAME = f"camera{OPTICAL}"
 """Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
-CAMERA_LINK = "camera_link"
-"""Name in ROS of a camera frame with X along the line of sight, Y to the left and Z up."""
+CAMERA_LINK = "camera_link"  # name in ROS of a camera frame with X along the line of sight, Y to the left and Z up
 LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """Rotation between both frames, which share their origin: REP 103, suffix frames."""
 CameraFrame = Literal["optical", "link"]
@@ -262,8 +251,7 @@ def opencv_yaml(result: HandEye) -> str:
 
 
 def urdf_joint(transforms: list[Static]) -> str:
-    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); of several ones, in a ``robot`` for
-    xacro."""
+    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); several in a ``robot`` for xacro."""
     joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
         return joints[0]
@@ -302,10 +290,3 @@ FORMS: dict[str, Callable[[HandEye, list[Static], str], str]] = {
     "easy-handeye2": partial(easy_handeye, second=True),
 }
 """Writers of all formats, by the word of ``--export``."""
-
-
-def exported(result: HandEye, transforms: list[Static], form: str, name: str = "handeye") -> str:
-    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`; ``name`` : the file's stem, which
-    easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
-    require_form(form, FORMS)
-    return FORMS[form](result, transforms, name)

@@ -3,7 +3,6 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
@@ -40,15 +39,11 @@ ERRORS = {
     "pose_mm": ("3-D by pose mm", 1.0, 3),
 }
 """Heads, unit factors and digits of the errors on held-out poses."""
-CELLS = 60
-"""Number of cells along the longer side of the image, in which views of the board are counted."""
+CELLS = 60  # number of cells along the longer side of the image, in which views of the board are counted
 GOOD, BAD = COLOURS[0], COLOURS[1]
-BLUES = "#f7fbff #c6dbef #6baed6 #2171b5 #08306b"
-"""The ramp Blues of ColorBrewer, light to dark."""
-MOST_VECTORS = 1500
-"""Largest number of residuals that are drawn over the image."""
-LONGEST = 0.06
-"""Length at which the 95 % quantile of the residuals is drawn, as a share of the image's width."""
+BLUES = "#f7fbff #c6dbef #6baed6 #2171b5 #08306b"  # the ramp Blues of ColorBrewer, light to dark
+MOST_VECTORS = 1500  # largest number of residuals that are drawn over the image
+LONGEST = 0.06  # length at which the 95 % quantile of the residuals is drawn, as a share of the image's width
 SIGMA_NAMES = {
     "corner_px": ("corner in the image", "px", 1.0),
     "robot_rad": ("robot, rotation", "°", DEGREE),
@@ -77,34 +72,33 @@ def means_text(means: dict[str, float]) -> str:
 
 
 def outcome_report(outcome: Outcome) -> Document:
-    """Returns the report of ``handeye``."""
     result, frames, found = outcome.result, FRAMES[outcome.result.setup], judged(outcome)
     turn, shift = result.rms()
-    covariances, bad, seen = (result.covariance, result.stand_covariance), outcome.outliers(), result.observability
-    means = {}
-    if outcome.held_out is not None:
-        means[f"held out ({_splits_text(outcome)}), mean"] = outcome.held_out.means()
-        if bad:
-            means[f"held out, mean without the {len(bad)} left out above"] = outcome.held_out.means(~result.outliers)
+    held_out, bad, seen = outcome.held_out, outcome.outliers(), result.observability
+    means = {f"held out ({_splits_text(outcome)}), mean": held_out.means() if held_out else {}}
+    if held_out and bad:
+        means[f"held out, mean without the {len(bad)} left out above"] = held_out.means(~result.outliers)
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
+    transforms: list[Block] = []
+    covariances = (result.covariance, result.stand_covariance)
+    for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
+        matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
+        transforms.append(Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance)))
+        transforms.append(fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix)))
     sigmas = []
     for name, value in result.sigma.items():
         text, unit, factor = SIGMA_NAMES[name]
         unit = "times its own σ" if name == "corner_px" and outcome.own_sigmas else unit
         how = "estimated" if name in result.estimated else "stated"
         sigmas.append([text, f"{value * factor:.3g}{unit if unit == '°' else f' {unit}'}", how])
-    judgements = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
-    told = (
-        ("To know", [note for note in outcome.all_notes() if isinstance(note, Aside)]),
-        ("What the files were taken for", outcome.understood),
-    )
+    judged_by = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    judgements = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judged_by, css="text")
+    asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
+    told = {"To know": asides, "What the files were taken for": outcome.understood}
+    camera = Table(["<", "value", "± σ", "<unit"], _adjusted(outcome))
     answer: list[Block] = [
         tiles(_tiles(outcome)),
-        *(
-            block
-            for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True)
-            for block in _transform(name, pose, covariance)
-        ),
+        *transforms,
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
@@ -113,16 +107,9 @@ def outcome_report(outcome: Outcome) -> Document:
         Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
         f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
-        fold(
-            "Camera, as adjusted (first pixel's centre at 0, 0)",
-            Table(["<", "value", "± σ", "<unit"], _adjusted(outcome)),
-        ),
-        *(block for title, lines in told if lines for block in (subheading(title), bullets(lines))),
-        fold(
-            "What the verdict rests on",
-            Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judgements, css="text"),
-            CHANCE,
-        ),
+        fold("Camera, as adjusted (first pixel's centre at 0, 0)", camera),
+        *(block for title, lines in told.items() if lines for block in (subheading(title), bullets(lines))),
+        fold("What the verdict rests on", judgements, CHANCE),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
     rows = _pose_rows(result)
@@ -163,13 +150,6 @@ CHANCE = (
     "happens in one of a hundred thousand. The same holds if the transform has more than half, or nine tenths, of the "
     "variance of a prediction. Whether the errors in mm above are small enough depends on the task"
 )
-
-
-def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
-    """Returns a transform with σ, and its matrix, folded."""
-    matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
-    table = Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance))
-    return [table, fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix))]
 
 
 def _tried(choice: ChosenWay | None) -> list[Block]:
@@ -234,18 +214,14 @@ def _coverage(outcome: Outcome) -> list[Block]:
     if views is None or pairs is None:
         return []
     if board is None:
-        measured = np.concatenate([view.xy_px for view in views.views])
+        measured, by = np.concatenate([view.xy_px for view in views.views]), "robot and transforms"
         residuals = np.concatenate(by_robot(outcome.result, pairs, views)) - measured
     else:
-        measured = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)])
+        measured, by = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)]), "the adjustment"
         residuals = board.residuals_px
-    finite, size, counts = (
-        np.isfinite(residuals).all(1),
-        (views.camera.width, views.camera.height),
-        image_coverage(views),
-    )
-    measured, residuals = measured[finite], residuals[finite]
-    by, factor = "the adjustment" if board is not None else "robot and transforms", enlargement(residuals, size[0])
+    finite, counts = np.isfinite(residuals).all(1), image_coverage(views)
+    measured, residuals, size = measured[finite], residuals[finite], (views.camera.width, views.camera.height)
+    factor = enlargement(residuals, size[0])
     return [
         f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
@@ -321,8 +297,7 @@ def _pose_rows(result: HandEye) -> list[list[str]]:
 
 
 def image_coverage(views: Views) -> np.ndarray:
-    """Returns the number (rows, columns) of photographs whose board, the convex hull of its corners, covers each cell
-    of the image."""
+    """Returns the number (rows, columns) of photographs in which the hull of the corners covers a cell of the image."""
     width, height = views.camera.width, views.camera.height
     cell = max(width, height) / CELLS
     columns, rows = max(1, round(width / cell)), max(1, round(height / cell))

@@ -10,7 +10,7 @@ from scipy.special import fdtri
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import by_pose
 from stcal.handeye.choose import ChosenWay, choose
 from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
@@ -102,10 +102,8 @@ class Outcome:
         return {"model": self.colmap_model, "parameters": values, "sigma": sigmas}
 
 
-SUSPICIOUS, FAILED = 1e-3, 1e-5
-"""Significance levels of ``use with care`` and of ``do not use``."""
-SHOWN = 3
-"""Number of poses that a sentence names."""
+SUSPICIOUS, FAILED = 1e-3, 1e-5  # significance levels of ``use with care`` and of ``do not use``
+SHOWN = 3  # number of poses that a sentence names
 HALF, MOST = 0.5, 0.9
 """Limits of the transform's share in the variance of a prediction. Beyond half, more poses help more than a better
 robot or camera would; beyond nine tenths, the error of a prediction is three times that of a pose."""
@@ -116,14 +114,11 @@ WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 that were never calibrated and poses of single tags stay below half of these."""
 OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
 """Deviation of a board's size, and in σ, beyond which it is told: printers err by that, measured pitches do not."""
-FEW_FREEDOM = 12
-"""Redundancy of four poses, of which σ are known to 1/√24, 20 %."""
-NOTHING_MM = 1e-6
-"""Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
+FEW_FREEDOM = 12  # redundancy of four poses, of which σ are known to 1/√24, 20 %
+NOTHING_MM = 1e-6  # smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors
 
 
 def judged(outcome: Outcome) -> Verdict:
-    """Returns the verdict on a calibration."""
     kinds = _of_residuals, _of_prediction, _of_share, _of_common_errors, _of_motions, _of_size, _of_outliers, _of_number
     tests = [judge(outcome) for judge in kinds]
     for note in outcome.all_notes():  # the text behind a note's colon is the remedy
@@ -228,8 +223,7 @@ def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) ->
     if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
         return None
     place = pairs.camera_from_board.translation[~result.outliers] * result.scale
-    by_turn = -skew(place @ result.mount_from_camera.rotation.T)
-    jacobian = np.concatenate([by_turn, np.tile(np.eye(3), (used, 1, 1))], axis=2)
+    jacobian = by_pose(np.tile(np.eye(3), (used, 1, 1)), place @ result.mount_from_camera.rotation.T)
     variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
     return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,19 +17,19 @@ from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.bundle import ROBOT
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
-from stcal.handeye.methods.pose_adjustment import Noise, PoseSolution, adjust_poses, by_places, places
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
+    ROBOT,
     AdjustedCorners,
     Reprojection,
     adjust_views,
-    in_common,
     of_poses,
     resected,
+    slope,
 )
-from stcal.handeye.remarks import Aside, Observability, Verdict, check, in_words, require_scale
+from stcal.handeye.remarks import Aside, Observability, Remarks, Verdict, check, in_words, require_scale
 from stcal.io.cameras.camera_model import CameraPrior
 
 
@@ -138,8 +138,7 @@ class HandEye(Brief):
 
 
 S = TypeVar("S", PoseSolution, AdjustedCorners)
-SCALED = ("pose", "reprojection")
-"""Methods that weigh errors, and can find the board's size."""
+SCALED = ("pose", "reprojection")  # methods that weigh errors, and can find the board's size
 METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", *SCALED)
 """Names of all methods."""
 UNIT_MM = 1000.0
@@ -153,8 +152,7 @@ FACTORS = {
 }
 LEAST_WITH_SCALE = 4
 """Least number of poses if the scale is unknown: three leave a redundancy of five, too little to estimate σ."""
-WIDENED = 2.0
-"""Factor on the σ of a camera file, or of poses computed with it, beyond which a note questions the file."""
+WIDENED = 2.0  # factor on the σ of a camera file, or of poses computed with it, beyond which a note questions the file
 ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
 """Smallest ratio of estimated to stated σ at which a robot's stated σ are doubted, and the probability with which
 chance may exceed the ratio that is required."""
@@ -219,11 +217,9 @@ class HandEyeProblem:
         return len(self.pairs)
 
     def __getitem__(self, rows: np.ndarray) -> "HandEyeProblem":
-        """Returns the problem of these poses alone."""
         return replace(self, pairs=self.pairs[rows], views=None if self.views is None else self.views[rows])
 
     def without(self, out: np.ndarray) -> "HandEyeProblem":
-        """Returns the problem without the poses ``out``, (k,)."""
         return replace(self[np.setdiff1d(np.arange(len(self)), out)], part=True)
 
     @cached_property
@@ -234,15 +230,18 @@ class HandEyeProblem:
     @cached_property
     def seen(self) -> Observability:
         """What the poses determine; raises DegenerateError if that is not enough."""
-        return check(self.loop, self.setup, self.pairs.where, self.options.four_dof)
+        return check(self.loop, self.pairs.where, self.options.four_dof)
 
     def mended(self) -> "HandEyeProblem":
         """Returns the problem with the numberings of a symmetric board corrected, and a note on that."""
         if not self.options.symmetries:
             return self
-        mended = repair(self.pairs, self.setup, self.options.symmetries, self.views)
-        options, notes = replace(self.options, symmetries=()), (*self.notes, *mended.notes())
-        return replace(self, pairs=mended.pairs, views=mended.views, options=options, notes=notes)
+        pairs, views, turned = repair(self.pairs, self.setup, self.options.symmetries, self.views)
+        options, notes = replace(self.options, symmetries=()), self.notes
+        if named := ", ".join(name for name, turn in zip(pairs.names, turned, strict=True) if turn):
+            said = f"numbered from another end of the board, and corrected: {named}"
+            notes = (*notes, Aside(f"{said}; base_from_board may belong to either end"))
+        return replace(self, pairs=pairs, views=views, options=options, notes=notes)
 
     def solved(self, method: str | None = None) -> "Solved":
         """Returns the result of one method, ``reprojection`` with views, else ``pose``, if None, with the state from
@@ -262,16 +261,11 @@ class HandEyeProblem:
             raise DegenerateError("E-HANDEYE-FEW-POSES", f"{pairs.where}: {said}")
         problem = self.mended()
         problem.pairs.require_moving_flange()
-
-        @cache
-        def guess(loop: Loop, with_scale: bool) -> LoopState:
-            if options.four_dof:
-                return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
-            return closed_form.robust(loop, with_scale)
-
+        about_axis = partial(closed_form.about_one_axis, seen.mount_axis)
+        guess = cache(about_axis if options.four_dof else closed_form.robust)
         if not self.part:
             by_images = problem.views is not None
-            doubts = check_conventions(problem.pairs, problem.loop, self.setup, guess, options.with_scale, by_images)
+            doubts = check_conventions(problem.pairs, problem.loop, guess, options.with_scale, by_images)
             problem = replace(problem, notes=(*problem.notes, *doubts))
         if method not in SCALED:
             x, z, notes = problem._by_equations(method)
@@ -301,7 +295,7 @@ class HandEyeProblem:
         more |= {"observability": self.seen, "notes": notes}
         return Solved(self, HandEye(method, self.setup, x, z, residuals, names, outliers, **more), solution)
 
-    def _by_equations(self, method: str) -> tuple[Rigid, Rigid, tuple[str, ...]]:
+    def _by_equations(self, method: str) -> tuple[Rigid, Rigid, Remarks]:
         """Returns X and Z, by AX = XB or AX = ZB and the named method, and notes."""
         options, pairs, loop, notes = self.options, self.pairs, self.loop, self.notes
         if options.four_dof:
@@ -314,11 +308,9 @@ class HandEyeProblem:
             notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
             loop = loop[used]
             if len(loop) < 3 or Observability.of(loop).useless:
-                raise DegenerateError(
-                    "E-HANDEYE-LARGE-TURNS",
-                    f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
-                    f"left for {method}; use method pose or shah",
-                )
+                said = f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses "
+                said += f"are left for {method}; use method pose or shah"
+                raise DegenerateError("E-HANDEYE-LARGE-TURNS", said)
         if method in (*AX_XB, *AX_ZB):
             x, z = closed_form.solve_closed_form(loop, method, unit_mm)
         else:
@@ -351,7 +343,7 @@ class HandEyeProblem:
         if options.four_dof:
             x, z, covariance, notes = self._without_slide(x, z, solution.normal)
         inverse = covariance
-        notes += self._remarks(x, solution.outliers, solution.residuals, solution.scale_hint)
+        notes += self._remarks(x, solution.outliers, solution.residuals)
         if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
             notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
         if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -362,11 +354,11 @@ class HandEyeProblem:
                 notes += (f"{times}; correct σ, or look for errors",)
                 covariance = covariance * max(factor, 1)
         if loop.camera_common is not None:
-            added = in_common(loop, solution, loop.camera_common).covariance(inverse) - inverse
+            moved = inverse @ slope(loop, solution, loop.camera_common)
+            added = moved @ moved.T
             common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
         if self.views is not None and options.camera is not None:
-            error = of_poses(loop, solution, self.views, options.camera)
-            covariance = covariance + error.covariance(inverse) - inverse
+            covariance = covariance + of_poses(loop, solution, self.views, options.camera, inverse)
         stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
         sigma = {name: value for name, value in stated.items() if value} | solution.sigma
         more: dict[str, Any] = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
@@ -376,21 +368,17 @@ class HandEyeProblem:
     def _by_views(self, first: LoopState, views: Views) -> "Solved":
         """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
         options, pairs = self.options, self.pairs
-
-        def adjusted(loop: Loop, noise: Noise) -> AdjustedCorners:
-            prior, scaled, flange = options.intrinsics, options.with_scale, pairs.base_from_flange
-            return adjust_views(loop, flange, views, first, noise, prior, scaled, options.camera)
-
-        solution, _, notes = self._by_true_robot(adjusted)
+        unknowns = options.intrinsics, options.with_scale
+        solution, _, notes = self._by_true_robot(lambda loop, noise: adjust_views(loop, views, first, noise, *unknowns))
         state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
         if sigma_scale is not None:
             require_scale(state.scale, sigma_scale, self.loop, pairs.where)
         x, z = state.mount_from_camera, state.stand_from_board
-        notes, covariance = self.notes + notes, solution.covariance
+        notes, covariance = self.notes + notes, solution.inverse[:UNKNOWNS, :UNKNOWNS]
         if options.four_dof:
             x, z, covariance, notes = self._without_slide(x, z, solution.normal())
-        if solution.camera_error is not None:
-            covariance = solution.camera_error.covariance(covariance)
+        if options.intrinsics is None and options.camera is not None:
+            covariance = solution.considering(options.camera, covariance)
         closed = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
         residuals, good = closed.residuals(x, z), closed[~outliers]
         if not options.four_dof and places(good) is not None:
@@ -402,7 +390,7 @@ class HandEyeProblem:
                 if sigma_scale is not None:
                     sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
         notes += self._remarks(x, outliers, residuals, solution.scale_hint)
-        if solution.camera_gain > CAMERA_GAIN:
+        if options.intrinsics is None and solution.camera_gain() > CAMERA_GAIN:
             notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
         doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
         if doubted:
@@ -412,7 +400,7 @@ class HandEyeProblem:
         more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
         return self._solved("reprojection", x, z, residuals, notes, **more)
 
-    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, tuple[str, ...]]:
+    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, Remarks]:
         """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
         contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
         noise, loop = self.options.noise, self.loop
@@ -442,15 +430,13 @@ class HandEyeProblem:
             contradicted = solution.misfit(used) - free.misfit(used) >= chdtri(len(ROBOT), BY_CHANCE)
         if not contradicted:
             return solution, noise, ()
-        note = f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
-        note += (
-            f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses"
-        )
-        return free, unknown, (note,)
+        own, said = (f"{np.degrees(turn):.2g}° and {shift:.2g} mm" for turn, shift in (estimated, (rad, mm)))
+        note = f"the robot's poses err by {own} an axis, where {said} are stated: its σ are estimated instead"
+        return free, unknown, (f"{note}; check the robot's poses",)
 
     def _remarks(
-        self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
-    ) -> tuple[str, ...]:
+        self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float] | None = None
+    ) -> Remarks:
         """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
         if self.part:
             return ()
@@ -460,12 +446,10 @@ class HandEyeProblem:
         moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
         notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
         if not (options.with_scale or options.four_dof):
-            notes += remarks.of_size(loop[good], hint, options.noise)
+            notes += remarks.of_size(loop[good], options.noise, hint)
         return notes + remarks.of_distance(loop)
 
-    def _without_slide(
-        self, x: Rigid, z: Rigid, normal: np.ndarray
-    ) -> tuple[Rigid, Rigid, np.ndarray, tuple[str, ...]]:
+    def _without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, Remarks]:
         """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
         axis, frames = self.seen.mount_axis, FRAMES[self.setup]
         x, z = closed_form.slid(x, z, axis, self.loop)

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.handeye.data.pose_pairs import HandEyePoses, Loop
 from stcal.handeye.handeye_problem import HandEye
 from stcal.io.json import Pose, ResultFile, Vector
@@ -20,14 +20,11 @@ from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table
 from stcal.report.text import NONE, number
 
-CANDIDATES = 2000
-"""Number of candidate views of the board for each pose that is planned."""
-ASKED = 64
-"""Number of poses per call of ``reachable``."""
+CANDIDATES = 2000  # number of candidate views of the board for each pose that is planned
+ASKED = 64  # number of poses per call of ``reachable``
 MOST_TILT = np.radians(40)
 """Largest tilt of the board against the line of sight, in rad. Beyond it dots and corners lose accuracy."""
-MARGIN = 0.1
-"""Margin that the board's outermost points keep from the image border, as a share of the image's sides."""
+MARGIN = 0.1  # margin that the board's outermost points keep from the image border, as a share of the image's sides
 ABOUT = 0.25
 """Distance from the board's mean place to the other points at which σ is judged, as a share of its distance."""
 
@@ -105,13 +102,11 @@ def plan_poses(
         stand_from_mount = z @ candidate_views.inverse() @ x.inverse()
         flange = stand_from_mount.inverse() if loop.inverted else stand_from_mount
         if not len(flange):
-            raise InputError(
-                "E-PLAN-NO-VIEW",
-                f"plan: none of {CANDIDATES} views at the distances at which the board was seen shows all of it and "
-                f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board",
-            )
+            said = f"plan: none of {CANDIDATES} views at the distances at which the board was seen shows all of it and "
+            said += f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board"
+            raise InputError("E-PLAN-NO-VIEW", said)
         unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)
-        normals = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
+        normals = normal + _information(Loop(flange, unscaled, result.setup), errors, result)
         sigma_after = np.array([worst_sigma(candidate, x, points) for candidate in normals])
         order = np.argsort(sigma_after)
         batches = [order[start : start + ASKED] for start in range(0, len(order), ASKED)]
@@ -133,8 +128,7 @@ def plan_poses(
 def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray) -> float:
     """Returns the largest σ in any direction, mm, of ``points`` (n, 3) in the camera's frame, moved to the mount's."""
     covariance = generalised_inverse(normal)[:6, :6]
-    jacobian = np.zeros((len(points), 3, 6))
-    jacobian[:, :, :3], jacobian[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
+    jacobian = by_pose(np.tile(np.eye(3), (len(points), 1, 1)), points @ mount_from_camera.rotation.T)
     return float(np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).max()))
 
 
@@ -190,12 +184,11 @@ def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ma,ma->m", facing, sight))
     onto = Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None])
-    straight = onto.as_matrix() @ earlier.rotation[base]
-    roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
+    roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight)
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]
-    tilt = Rotation.from_rotvec(rng.uniform(0, MOST_TILT, (CANDIDATES, 1)) * across).as_matrix()
-    rotation = tilt @ roll @ straight
+    tilt = Rotation.from_rotvec(rng.uniform(0, MOST_TILT, (CANDIDATES, 1)) * across)
+    rotation = (tilt * roll * onto).as_matrix() @ earlier.rotation[base]
     poses = Poses(rotation, place - rotation @ middle)
     if camera is None:
         return poses
@@ -223,21 +216,14 @@ class HandEyePlanFile(ResultFile):
 
     @classmethod
     def of(cls, result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> "HandEyePlanFile":
-        """Returns the file of the planned poses, after those of a result."""
-        return cls(
-            format="stcal handeye plan 1",
-            setup=result.setup,
-            method=result.method,
-            taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
-            sigma_mm=planned.sigma_mm,
-            turn_rad=planned.turn_rad,
-            joints=joints,
-            **{name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")},
-        )
+        taken = [name for name, out in zip(result.names, result.outliers, strict=True) if not out]
+        known = {"setup": result.setup, "method": result.method, "taken": taken, "joints": joints}
+        known |= {name: getattr(planned, name) for name in ("sigma_mm", "turn_rad")}
+        known |= {name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")}
+        return cls(format="stcal handeye plan 1", **known)
 
 
 def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
-    """Returns the report of ``handeye plan``."""
     taken = int((~result.outliers).sum())
     heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
     rows, cells = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]], []

@@ -18,8 +18,7 @@ from stcal.report.document import Answer
 from stcal.row_order import change_along
 
 UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}
-SAME_UNIT = 0.05
-"""Largest difference of logarithms between a size and the ratio of two units that it is taken for."""
+SAME_UNIT = 0.05  # largest difference of logarithms between a size and the ratio of two units that it is taken for
 LARGEST_SCALE = 5.0
 """Largest plausible factor between a board's real and stated size; a larger one is an error of the unit."""
 SCALE_SEEN = 36.0
@@ -29,10 +28,8 @@ COMMON_RAD, COMMON_MM = 1e-3, 0.5
 """σ of the poses of a common camera at half a metre, by which the usefulness of a set of poses is judged."""
 USELESS_RAD = np.radians(5)
 """σ of a hand-eye rotation from such poses beyond which the transform, then at least 44 mm off, is not worth having."""
-WANTED_DEG = 30
-"""Size of rotations between poses that makes σ of X's translation about that of a pose."""
-LEAST_TURN = np.radians(5)
-"""Smallest RMS rotation of a robot of four axes."""
+WANTED_DEG = 30  # size of rotations between poses that makes σ of X's translation about that of a pose
+LEAST_TURN = np.radians(5)  # smallest RMS rotation of a robot of four axes
 LEAST_POSES = 3
 MOST_PAIRS = 100_000
 """Number of pairs of poses from which the principal axes are computed, drawn at random from 450 poses on."""
@@ -62,8 +59,7 @@ class Observability:
     @classmethod
     def of(cls, loop: Loop) -> "Observability":
         """Returns the observability of a loop of at least two poses. X itself is not needed."""
-        flange = loop.stand_from_mount.rotation
-        base_from_flange = np.swapaxes(flange, 1, 2) if loop.inverted else flange
+        flange, base_from_flange = loop.stand_from_mount.rotation, loop.base_from_flange.rotation
         turns, axes = _principal(np.swapaxes(base_from_flange, 1, 2))  # flange_j_from_flange_i
         mount_axis = _principal(base_from_flange)[1][0] if loop.inverted else axes[0]
         # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations with
@@ -88,31 +84,24 @@ class Observability:
         """Returns the motion that would help, in words."""
         turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
         if self.one_axis and self.turns_rad[0] > LEAST_TURN:
-            return (
-                f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about "
-                f"others; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
-            )
-        return (
-            f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; "
-            f"rotate the flange about {first} and about {in_words(self.axes[1])}, by {WANTED_DEG}° or more each"
-        )
+            said = f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about"
+            return f"{said} others; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
+        said = f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; rotate the flange about {first}"
+        return f"{said} and about {in_words(self.axes[1])}, by {WANTED_DEG}° or more each"
 
 
-def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
+def check(loop: Loop, where: str, four_dof: bool) -> Observability:
     """Returns the observability of a loop. Raises DegenerateError: fewer than three poses, rotations about one axis
     only (unless ``four_dof``), or none."""
     if len(loop) < LEAST_POSES:
-        raise DegenerateError(
-            "E-HANDEYE-FEW-POSES",
-            f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
-            f"own, by {WANTED_DEG}° or more, and take more",
-        )
+        said = f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of "
+        said += f"its own, by {WANTED_DEG}° or more, and take more"
+        raise DegenerateError("E-HANDEYE-FEW-POSES", said)
     seen, fault = Observability.of(loop), ""
     if not four_dof and seen.useless:
         slides = "; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
-        slides += f"{FRAMES[setup].camera} along that axis is determined"
-        said = f"{where}: {seen.missing()}{slides if seen.one_axis else ''}"
-        raise DegenerateError("E-HANDEYE-AXES", said)
+        slides += f"{FRAMES[loop.setup].camera} along that axis is determined"
+        raise DegenerateError("E-HANDEYE-AXES", f"{where}: {seen.missing()}{slides if seen.one_axis else ''}")
     if four_dof and seen.turns_rad[0] < LEAST_TURN:
         fault = f"; rotate it about {in_words(seen.axes[0])} by {WANTED_DEG}° or more"
     elif four_dof and not seen.one_axis:
@@ -125,10 +114,8 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
 
 def motions_missing(base_from_flange: Poses, setup: Setup) -> list[str]:
     """Returns a line on the motions that are missing, where the poses cannot determine the transform."""
-    inverted = setup == "eye-to-hand"
-    stand_from_mount = base_from_flange.inverse() if inverted else base_from_flange
     try:
-        check(Loop(stand_from_mount, base_from_flange, inverted), setup, "motions", False)
+        check(Loop(base_from_flange, base_from_flange, setup), "motions", False)
     except DegenerateError as error:
         return [str(error)]
     return []
@@ -146,14 +133,12 @@ def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
             said = f"{where}: the board would be {scale:.4g} times as large as stated{unit_of(scale)}"
             raise DegenerateError("E-HANDEYE-BOARD-SCALE", f"{said}; correct the unit of its size, or of the poses")
         return
-    place = (loop.stand_from_mount.inverse() if loop.inverted else loop.stand_from_mount).translation
+    place = loop.base_from_flange.translation
     moved = float(np.sqrt(((place - place.mean(0)) ** 2).sum(1).mean()))
-    raise DegenerateError(
-        "E-HANDEYE-BOARD-SCALE",
-        f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, which "
-        f"moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or more, or "
-        "solve without the scale",
-    )
+    said = f"{where}: the board's size is {scale:.2g} ± {sigma:.2g} times as stated by the motions of the flange, "
+    said += f"which moves by {moved:.3g} mm (RMS): too little to tell; move it by a tenth of the board's distance or "
+    said += "more, or solve without the scale"
+    raise DegenerateError("E-HANDEYE-BOARD-SCALE", said)
 
 
 def unit_of(scale: float) -> str:
@@ -259,6 +244,9 @@ class Verdict:
         return "; ".join(each.said for each in self.reasons())
 
 
+Remarks = tuple[str, ...]  # notes on a result, one line each
+
+
 class Grave(str):
     """A note that says that the result is wrong, or answers another question."""
 
@@ -276,8 +264,7 @@ SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 HINTED = 2.0
 """Number of σ by which one step must change the scale before it is solved for. The limit is low, since a wrong size
 inflates these σ, and with few poses all of them."""
-MANY = 0.25
-"""Share of bad poses above which something else is suspected."""
+MANY = 0.25  # share of bad poses above which something else is suspected
 LEAST_IN_GROUPS, APART = 10, 0.9
 """Least number of poses, and the share of their scatter along its main direction that two groups must explain. Two
 halves of normal errors explain 0.64 (2/π), and at most 0.8 of a dozen of them."""
@@ -287,8 +274,7 @@ SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
 the same where each pose is at a place of its own, so that errors common to a place are no move."""
 HALL_MM = 5e4
 """Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
-NEAR_MM = 20.0
-"""Distance, in mm, below which no camera sees a board."""
+NEAR_MM = 20.0  # distance, in mm, below which no camera sees a board
 
 
 def spoken(name: str) -> str:
@@ -296,11 +282,8 @@ def spoken(name: str) -> str:
     return f"pose {name}" if name.isdigit() else name
 
 
-def of_outliers(
-    names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray
-) -> tuple[str, ...]:
-    """Returns notes on the poses left out, (m,), by residuals (m, 6); those of ``flips`` agree if tilted the other
-    way."""
+def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray) -> Remarks:
+    """Returns notes on the poses left out, by residuals (m, 6); those of ``flips`` agree if tilted the other way."""
     notes: list[str] = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
@@ -318,7 +301,7 @@ def of_outliers(
     return tuple(notes)
 
 
-def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
+def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> Remarks:
     """Returns a note if poses with residuals (m, 6) fall into two groups, as when a board is moved in between."""
     if len(names) < LEAST_IN_GROUPS:
         return ()
@@ -332,16 +315,13 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
             k = int(first[between.argmax()])
             one, two = sorted((sorted(order[:k].tolist()), sorted(order[k:].tolist())))
             gap = abs(along[one].mean() - along[two].mean()) * unit
-            return (
-                f"the poses fall into two groups that are {gap:.2g}{word} apart, {len(one)} with {names[0]} and "
-                f"{len(two)} with {names[two[0]]}: was board or camera moved in between? solve each separately",
-            )
+            said = f"the poses fall into two groups that are {gap:.2g}{word} apart, {len(one)} with {names[0]} and "
+            said += f"{len(two)} with {names[two[0]]}: was board or camera moved in between? solve each separately"
+            return (said,)
     return ()
 
 
-def of_order(
-    names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool = False
-) -> tuple[str, ...]:
+def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool) -> Remarks:
     """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
     jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals, or be beyond
     chance where the poses are ``apart``."""
@@ -367,15 +347,16 @@ def of_order(
     return (f"{before}: solve the poses before it, and those from it on, separately",)
 
 
-def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
-    """Returns a note if the board is of another size than stated. ``hint`` is the scale after one step, with its σ."""
+def of_size(loop: Loop, noise: Noise, hint: tuple[float, float] | None) -> Remarks:
+    """Returns a note if the board is of another size than stated by the poses, and by the corners, if there are any,
+    whose ``hint`` is the scale after one step, with its σ."""
 
     def other(scale: float, sigma: float, sigmas: float) -> bool:
         return abs(scale - 1) > max(sigmas * sigma, SIZE_SHARE)
 
-    if not other(*hint, HINTED):
+    if hint is not None and not other(*hint, HINTED):
         return ()
-    try:  # the hint comes from one large step, so the scale is solved for
+    try:
         solution = adjust_poses(loop, robust(loop, with_scale=True), noise, with_scale=True)
     except StcalError:
         return ()
@@ -388,7 +369,7 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     return (SizeDoubt(f"{said}check its size and the camera file, or solve with the scale"),)
 
 
-def of_distance(loop: Loop) -> tuple[str, ...]:
+def of_distance(loop: Loop) -> Remarks:
     """Returns a note if all lengths are in another unit, which no equation shows."""
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
     if NEAR_MM <= away <= HALL_MM:
@@ -407,7 +388,7 @@ LONG_MM, NEARER = 250.0, 0.5
 on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
 
 
-def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[str, ...]:
+def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> Remarks:
     """Returns a note if the camera is where no flange carries it, unless the setup was ``stated``, or if X and Z seem
     to be exchanged. Poses of the other setup, or sides that were exchanged or inverted, fit as well: no residual
     tells."""

@@ -22,16 +22,11 @@ WITHIN_S, SCAN_S = 1.0, 0.05
 """Range and step of the scan for a first offset, in s. A robot's motion within one step is smooth."""
 MOST_STEP_S = 0.05
 ROUNDS = 30
-SETTLED = 1e-3
-"""Largest last step as a share of σ."""
-WINDOW_S = 0.1
-"""Time window around an image in which the flange must move, in s."""
-MOVED = 5.0
-"""Least motion of the flange within the window, in multiples of the noise of the stream's samples."""
-MOST_SIGMA_S = 0.1
-"""Largest σ with which an offset is reported, in s."""
-LEAST_KEPT = 2 / 3
-"""Least share of the images that must lie within the stream for an offset to be tried."""
+SETTLED = 1e-3  # largest last step as a share of σ
+WINDOW_S = 0.1  # time window around an image in which the flange must move, in s
+MOVED = 5.0  # least motion of the flange within the window, in multiples of the noise of the stream's samples
+MOST_SIGMA_S = 0.1  # largest σ with which an offset is reported, in s
+LEAST_KEPT = 2 / 3  # least share of the images that must lie within the stream for an offset to be tried
 LEAST_POSES = 4
 """Least number of poses: three of six numbers each leave too little redundancy for σ beside thirteen unknowns."""
 
@@ -60,12 +55,10 @@ class TimeOffset:
     def in_words(self) -> str:
         """Returns the offset with its sign, σ, and the speed of the flange as one sentence."""
         order, sign = ("ahead of", "+") if self.seconds >= 0 else ("behind", "-")
-        return (
-            f"time offset: {1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms, robot's clock minus camera's: the "
-            f"robot's is {order} the camera's, an image stamped t was taken at t {sign} {1e3 * abs(self.seconds):.2f} "
-            f"ms of the robot's; the flange moves by {self.speed_mm_s:.3g} mm/s and "
-            f"{np.degrees(self.speed_rad_s):.3g}°/s at the images (RMS)"
-        )
+        offset, speed = f"{1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms", f"{self.speed_mm_s:.3g} mm/s"
+        said = f"time offset: {offset}, robot's clock minus camera's: the robot's is {order} the camera's, an image "
+        said += f"stamped t was taken at t {sign} {1e3 * abs(self.seconds):.2f} ms of the robot's; the flange moves by "
+        return said + f"{speed} and {np.degrees(self.speed_rad_s):.3g}°/s at the images (RMS)"
 
     def carried(self, result: HandEye) -> HandEye:
         """Returns ``result``, which was solved at the offset, with the offset's σ propagated into its covariances."""
@@ -98,13 +91,11 @@ def estimate_offset(
     if (within := _inside(stream, seconds)).any():  # at rest the noise of the samples would pass for motion
         noises, moved = stream.rest(), stream.travel(seconds[within], WINDOW_S)
         if not any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noises, moved, strict=True)):
-            raise DegenerateError(
-                "E-TIME-OFFSET-STANDSTILL",
-                f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and "
-                f"{np.degrees(moved[0]):.2g}° within {WINDOW_S:g} s (RMS), where samples err by {noises[1]:.2g} mm and "
-                f"{np.degrees(noises[0]):.2g}°: no time offset can be determined; leave --time-offset out, or take "
-                "images while the robot moves",
-            )
+            said = f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and "
+            said += f"{np.degrees(moved[0]):.2g}° within {WINDOW_S:g} s (RMS), where samples err by {noises[1]:.2g} mm "
+            said += f"and {np.degrees(noises[0]):.2g}°: no time offset can be determined; leave --time-offset out, or "
+            said += "take images while the robot moves"
+            raise DegenerateError("E-TIME-OFFSET-STANDSTILL", said)
     offset, state = _scanned(pairs, stream, seconds, setup, with_scale), None
     for _ in range(ROUNDS):
         within = _inside(stream, seconds + offset)
@@ -125,12 +116,10 @@ def estimate_offset(
         sigma = float(np.sqrt(inverse[count, count]))
         step = -float(inverse[count] @ np.einsum("mai,ma->i", weighted, solution.residuals[used]))
         if not 0 < sigma < MOST_SIGMA_S:
-            raise DegenerateError(
-                "E-TIME-OFFSET-SIGMA",
-                f"{stream.where}: the time offset would have σ {sigma:.2g} s, {MOST_SIGMA_S:g} s allowed: the motions "
-                "at the images do not determine it; leave --time-offset out, or take images while the flange turns and "
-                "moves",
-            )
+            said = f"{stream.where}: the time offset would have σ {sigma:.2g} s, {MOST_SIGMA_S:g} s allowed: the "
+            said += "motions at the images do not determine it; leave --time-offset out, or take images while the "
+            said += "flange turns and moves"
+            raise DegenerateError("E-TIME-OFFSET-SIGMA", said)
         offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
         if abs(step) < SETTLED * sigma:
             within = _inside(stream, seconds + offset)
@@ -161,9 +150,7 @@ def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Se
             best, least = float(offset), cost
     if not np.isfinite(least):
         share = _inside(stream, seconds).sum()
-        raise InputError(
-            "E-TIME-OFFSET-RANGE",
-            f"{stream.where}: {share} of {len(seconds)} images lie within its times, {LEAST_KEPT:.0%} needed at some "
-            f"offset up to {WITHIN_S:g} s; give the whole stream, and times of clocks that differ by less",
-        )
+        said = f"{stream.where}: {share} of {len(seconds)} images lie within its times, {LEAST_KEPT:.0%} needed at "
+        said += f"some offset up to {WITHIN_S:g} s; give the whole stream, and times of clocks that differ by less"
+        raise InputError("E-TIME-OFFSET-RANGE", said)
     return best

@@ -14,19 +14,15 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, resect
-from stcal.handeye.data.pose_pairs import HandEyePoses, Loop, Motions, Setup
+from stcal.handeye.data.pose_pairs import OTHER, HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.handeye_problem import IN_COMMON, METHODS, HandEye, HandEyeOptions, HandEyeProblem
-from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS
 from stcal.handeye.remarks import Aside, Grave
 from stcal.parallel import one_thread, run_in_order
 
-SETUP_SPLITS = 6
-"""Number of splits that decide which setup is meant."""
-SETUP_BETTER = 4.0
-"""Factor by which the product of rotation and translation error must be smaller in the other setup."""
-LEAST_LEFT = 3
-"""Least number of poses that must remain to solve with."""
+SETUP_SPLITS = 6  # number of splits that decide which setup is meant
+SETUP_BETTER = 4.0  # factor by which the product of rotation and translation error must be smaller in the other setup
+LEAST_LEFT = 3  # least number of poses that must remain to solve with
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 TRANSFORMS = ("mount_from_camera", "stand_from_board")
 SCATTERED = 1.5
@@ -226,15 +222,14 @@ def naming_held_out(problem: HandEyeProblem, out: np.ndarray) -> Iterator[None]:
 
 def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
     """Returns the fields of :class:`HeldOutPoses` by name, (k,) each, for poses that the result has not seen."""
-    pairs, views = unseen.pairs, unseen.views
-    loop, x, z, scale = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board, result.scale
+    loop, x, z, scale = unseen.loop, result.mount_from_camera, result.stand_from_board, result.scale
     errors = {"mount_from_camera": x.matrix()}
-    if views is not None:
-        camera, seen = as_adjusted(result, views)
-        by_view, _ = resect(Views(camera, tuple(seen)), pairs.names)
-        chains = list(zip(seen, poses_by_robot(result, loop), by_view, strict=True))
+    if unseen.views is not None:
+        camera, seen = as_adjusted(result, unseen.views)
+        by_view, _ = resect(Views(camera, tuple(seen)), unseen.pairs.names)
+        chains = zip(seen, poses_by_robot(result, loop), by_view, strict=True)
         off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
-        errors["board_mm"] = np.array([_beside(view, camera, pose) for view, pose, _ in chains])
+        errors["board_mm"] = deciding_error(result, unseen)
         errors["pose_mm"] = np.array([np.linalg.norm(each, axis=1).mean() for each in off])
         loop, scale = replace(loop, camera_from_board=by_view), 1.0
     turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
@@ -246,7 +241,7 @@ def deciding_error(result: HandEye, unseen: HandEyeProblem) -> np.ndarray:
     if unseen.views is None:
         return errors_of(result, unseen)["translation_mm"]
     camera, seen = as_adjusted(result, unseen.views)
-    poses = zip(seen, poses_by_robot(result, Loop.of(unseen.pairs, result.setup)), strict=True)
+    poses = zip(seen, poses_by_robot(result, unseen.loop), strict=True)
     return np.array([_beside(view, camera, pose) for view, pose in poses])
 
 
@@ -273,17 +268,13 @@ def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
 
 @one_thread()
 def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
-    """Returns a note with both errors if method ``pose`` predicts held-out poses ``rows`` (s, k) far better in the
-    other setup."""
+    """Returns a note if method ``pose`` predicts held-out poses ``rows`` (s, k) far better in the other setup."""
     setup = problem.setup
-    opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+    opposite = OTHER[setup]
     plain = replace(problem, views=None, options=replace(problem.options, intrinsics=None, symmetries=()))
     try:
-        if not problem.options.four_dof and SETUP_BETTER * _robust_miss(plain, setup) < _robust_miss(plain, opposite):
-            return ()
-        first, other = (
-            refitted(replace(plain, setup=each), "pose", rows[:SETUP_SPLITS]).means() for each in (setup, opposite)
-        )
+        in_either = (replace(plain, setup=each) for each in (setup, opposite))
+        first, other = (refitted(each, "pose", rows[:SETUP_SPLITS]).means() for each in in_either)
     except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
         return ()
     (turn, shift), (other_turn, other_shift) = (list(each.values()) for each in (first, other))
@@ -291,15 +282,7 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
         return ()
     as_stated = f"{np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}"
     as_other = f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}"
-    said = f"poses held out are missed by {as_stated}, by {as_other}"
-    return (Grave(f"{said}: give --setup {opposite} if it is that"),)
-
-
-def _robust_miss(problem: HandEyeProblem, setup: Setup) -> float:
-    """Returns the product of median rotation and translation (rad mm) by which a quick solution misses the poses."""
-    loop = Loop.of(problem.pairs, setup)
-    misses = loop.residuals(*robust(loop, problem.options.with_scale)).reshape(-1, 2, 3)
-    return float(np.median(np.linalg.norm(misses, axis=2), axis=0).prod())
+    return (Grave(f"poses held out are missed by {as_stated}, by {as_other}: give --setup {opposite} if it is that"),)
 
 
 @require_arguments
@@ -358,8 +341,7 @@ def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
 
 def _differences(others: list[HandEye], result: HandEye) -> list[np.ndarray]:
     """Returns the differences (n, 6) of X and of Z of other results against ``result``."""
-    pairs = [[(getattr(each, name), getattr(result, name)) for each in others] for name in TRANSFORMS]
-    return [Poses.of([a for a, _ in each]).difference(Poses.of([b for _, b in each])) for each in pairs]
+    return [np.array([getattr(each, name).difference(getattr(result, name)) for each in others]) for name in TRANSFORMS]
 
 
 def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:

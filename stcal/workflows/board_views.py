@@ -24,7 +24,6 @@ from stcal.boards.finders import find_charuco, find_chessboard, shift_by_curves,
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
@@ -49,6 +48,8 @@ CORNER_SIGMA_PX = 0.1  # σ of corners whose detector states none
 NEAREST = 6  # number of outlines about a circle, one of which is its neighbour
 MIN_SHARE = 0.35  # smallest share of a board's circles that must be seen
 Board = BoardDesign | FlatBoard | BoardSet
+Circles = BoardDesign | AsymmetricCirclesDesign
+Seen = tuple[BoardView | None, str]  # a view of a board, or why there is none
 KINDS = {
     BoardDesign: "dots",
     ChessboardDesign: "chessboard",
@@ -73,7 +74,7 @@ def symmetries(board: Board) -> list[Rigid]:
     return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
 
 
-def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
+def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> Seen:
     """Returns the view of the board, or of all that are seen of a set, in a grey image, or why there is none."""
     if not isinstance(board, BoardSet):
         try:
@@ -92,9 +93,8 @@ def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tu
         views.append(replace(view, ids=view.ids + first, xyz_board=xyz, normal=normal, unused=unused))
     if not views:
         return None, "; ".join(reasons)
-    ids, xyz, xy, normals = (
-        np.concatenate([getattr(view, part) for view in views]) for part in ("ids", "xyz_board", "xy_px", "normal")
-    )
+    parts = ("ids", "xyz_board", "xy_px", "normal")
+    ids, xyz, xy, normals = (np.concatenate([getattr(view, part) for view in views]) for part in parts)
     unused = (*(reason for view in views for reason in view.unused), *reasons)
     return BoardView(name, ids, xyz, xy, np.concatenate([*map(covariance_px2, views)]), normals, unused), ""
 
@@ -106,9 +106,7 @@ def covariance_px2(view: BoardView) -> np.ndarray:
     return view.covariance_px2
 
 
-def _find_flat(
-    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
-) -> tuple[BoardView | None, str]:
+def _find_flat(image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard) -> Seen:
     if isinstance(board, BoardDesign):
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
@@ -141,29 +139,20 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     if not ids:
         return f"{few}: no tag of {board.dictionary}"
     if foreign := [tag for tag in ids if tag not in board_ids]:
-        extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}"
-        return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}" + (
-            f" from {board_ids[0]}" if board_ids[0] else ""
-        )
+        first = f" from {board_ids[0]}" if board_ids[0] else ""
+        extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}{first}"
+        return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}"
     turned, few = replace(board, rows=board.columns, columns=board.rows), f"{few}, but {len(ids)} of its tags"
-    candidates = [
-        Candidate(
-            f"rows = {own.rows}, columns = {own.columns}"
-            + (f", legacy = {str(legacy).lower()}" if legacy != board.legacy else ""),
-            partial(replace, own, legacy=legacy),
-        )
-        for own in (board, turned)
-        for legacy in (False, True)
-    ]
 
-    def missing(other: CharucoDesign) -> float:
+    def corners(other: CharucoDesign) -> int:
         view = find_charuco(image, "", other)
-        return np.inf if view is None else 1 / len(view)
+        return 0 if view is None else len(view)
 
-    fits = explain(candidates, missing, np.inf, alike=1)
-    if not fits:
+    best = max((replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)), key=corners)
+    if not corners(best):
         return f"{few}, not where rows and columns of its file put them; correct them"
-    return f"{few}, as on a board of {fits[0][0].words}; correct its file"
+    legacy = f", legacy = {str(best.legacy).lower()}" if best.legacy != board.legacy else ""
+    return f"{few}, as on a board of rows = {best.rows}, columns = {best.columns}{legacy}; correct its file"
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
@@ -178,13 +167,8 @@ def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesi
 
 
 def _find_circles(
-    image: np.ndarray,
-    name: str,
-    camera: Camera,
-    board: BoardDesign | AsymmetricCirclesDesign,
-    grid: BoardDesign,
-    place: np.ndarray,
-) -> tuple[BoardView | None, str]:
+    image: np.ndarray, name: str, camera: Camera, board: Circles, grid: BoardDesign, place: np.ndarray
+) -> Seen:
     """``grid`` : lattice in which circles are found; ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
     pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
@@ -204,7 +188,7 @@ def _find_circles(
     return BoardView(name, ids[0], xyz, centre_px, sharp.covariance_px2), ""
 
 
-def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:
+def _turned_only(ids: np.ndarray, board: Circles) -> bool:
     """True if all numberings (k, n) differ only by a rotation that leaves the board as it is."""
     xy = board.xy_mm()
     pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
@@ -267,7 +251,7 @@ def detect_boards(
     board: Board,
     dictionaries: Sequence[str] = (),
     workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> BoardDetections:
     """Find the board, and the tags of ``dictionaries``, in all images that can be used; ``progress`` : called with
     images done, and all. Raises InputError: no image is readable, or the camera is not that of the images."""
@@ -283,8 +267,7 @@ def detect_boards(
     jobs = [(file, camera, size_from, board, tuple(dictionaries)) for file in files]
     for i, outcome in run_on_images(_detect_board, jobs, workers):
         outcomes[i] = outcome
-        if progress:
-            progress(len(outcomes), len(jobs))
+        progress(len(outcomes), len(jobs))
     every = [outcomes[i] for i in range(len(jobs))]
     detections = tuple(each for each in every if isinstance(each, BoardDetection))
     unusable = tuple(each for each in every if isinstance(each, Skipped))
@@ -336,9 +319,8 @@ def calibration_images(
     told, model = progress or (lambda *_: None), camera_model(camera)
     detections = detect_boards(files, model, board, dictionaries, workers, partial(told, "images"))
     names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
-    left_out = tuple(
-        f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names
-    )
+    without = (image for image in (*skipped, *detections.skipped) if image.name not in names)
+    left_out = tuple(f"{image.name}: {image.reason}" for image in without)
     tags = tuple(
         replace(each, corners_px=each.corners_px - shift_by_curves(each.corners_px, detections.camera)) for each in tags
     )
@@ -396,9 +378,7 @@ eccentricity shrinks to less than a tenth with each round. Corners of chessboard
 def corner_grid(board: FlatBoard) -> CornerBoard:
     """Returns a board's points as dots without extent; raises InputError: points that are not on a grid."""
     if isinstance(board, TagLayout):
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid, asymmetric "
-            "or hexagonal circles needed to calibrate a camera",
-        )
+        said = f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid, asymmetric "
+        said += "or hexagonal circles needed to calibrate a camera"
+        raise InputError("E-BOARD-TYPE", said)
     return CornerBoard.of(board)

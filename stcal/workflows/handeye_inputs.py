@@ -12,11 +12,11 @@ import numpy as np
 from stcal.boards.target_file import load_boards
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Order, Rigid
-from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views
+from stcal.geometry.rigid import Order
+from stcal.handeye import View, Views, pairs_of_views
 from stcal.handeye.data.pose_content import PoseSide, Said
 from stcal.handeye.data.pose_files import (
-    ToldPairs,
+    HandEyeInput,
     own_told,
     read_pairs,
     read_robot,
@@ -27,15 +27,14 @@ from stcal.handeye.data.pose_files import (
 from stcal.handeye.data.pose_pairs import Setup
 from stcal.handeye.data.pose_partners import rows_of_images
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import motions_missing
-from stcal.io.cameras.camera_model import CameraModel, CameraPrior, camera_prior, refinable
+from stcal.io.cameras.camera_model import camera_prior, refinable
 from stcal.io.cameras.read import read_camera
-from stcal.io.images import ImageFile, find_images
+from stcal.io.images import find_images
 from stcal.io.join import join_tables
 from stcal.io.table import Table, read_table
 from stcal.parallel import Progress, one_thread
-from stcal.workflows.board_views import Board, detect_boards, kind_of
+from stcal.workflows.board_views import detect_boards, kind_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +48,8 @@ class Timing:
     offset: bool = False
 
 
-LeftOut = tuple[tuple[str, str], ...]
-"""Names of images or rows, and why they do not take part."""
-Clock = tuple[Stream, dict[str, float]]
-"""The robot's stream, and the time of each image after its origin, by name."""
+LeftOut = tuple[tuple[str, str], ...]  # names of images or rows, and why they do not take part
+Clock = tuple[Stream, dict[str, float]]  # the robot's stream, and the time of each image after its origin, by name
 
 
 def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tuple[PoseSide, LeftOut, Clock | None]:
@@ -79,25 +76,28 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         stream = Stream.of(known, robot.poses, Path(robot.where).name)
         return stream, dict(zip(images, stream.after_origin(list(images.values())).tolist(), strict=True))
 
-    read: dict[str, Any] = {"own": False, "timed": False}
     if not timing.offset and all(time in known for time in images.values()):  # rows without an image are no mistake
         rows = [known.index(time) for time in images.values()]
-        read |= {
-            "names": tuple(images),
-            "understood": f"{robot.understood}; {len(rows)} of them at the times of images",
-        }
+        lines = f"{robot.understood}; {len(rows)} of them at the times of images"
         dense = len(images) < len(known) == len(set(known))
-        return replace(robot[rows], **read), (), clock() if dense else None
+        robot = replace(robot[rows], names=tuple(images), understood=lines, own=False)
+        return robot, (), clock() if dense else None
     stream, seconds = clock()
-    taken, seen = taken_at(stream, np.array(list(seconds.values())), timing.tolerance_s), tuple(images)
-    if not taken.kept.any():
-        raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {seen[0]}: {taken.why[0]}")
+    seen = tuple(images)
+    taken = taken_at(stream, np.array(list(seconds.values())), seen, timing.tolerance_s)
+    if not taken.rows:
+        raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {': '.join(taken.left_out[0])}")
     kept = tuple(seen[i] for i in taken.rows)
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    read |= {"names": kept, "places": tuple(f"time of {name}" for name in kept), "covariance": None}
+    read: dict[str, Any] = {
+        "names": kept,
+        "places": tuple(f"time of {name}" for name in kept),
+        "covariance": None,
+        "own": False,
+    }
     read |= {"poses": taken.base_from_flange, "understood": f"{robot.understood}{note}; {taken.said}"}
     untimed_images = tuple((name, f"no time in {timing.image_times}") for name in names if name not in images)
-    return replace(robot, **read), taken.left_out(seen) + untimed_images, (stream, seconds)
+    return replace(robot, **read), taken.left_out + untimed_images, (stream, seconds)
 
 
 def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:
@@ -124,33 +124,7 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
 
 
 PREFIXES = "base_from_flange_", "camera_from_board_"
-Source = Path | Table | ToldPairs
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeInput:
-    """Input of a hand-eye calibration.
-
-    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
-    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
-    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
-    """
-
-    where: str
-    pairs: HandEyePoses
-    views: Views | None = None
-    symmetries: tuple[Rigid, ...] = ()
-    prior: CameraPrior | None = None
-    pitch_mm: float | None = None
-    left_out: LeftOut = ()
-    understood: tuple[str, ...] = ()
-    setup: Setup | None = None
-    timed: Timed | None = None
-    notes: tuple[str, ...] = ()
-
-    def problem(self, options: HandEyeOptions) -> HandEyeProblem:
-        return HandEyeProblem(self.pairs, self.setup or "eye-in-hand", self.views, options)
+Source = Path | Table | HandEyeInput
 
 
 def one_source(
@@ -249,15 +223,14 @@ class Files:
     def read(self, workers: int | None = None, progress: Progress | None = None) -> HandEyeInput:
         """Returns the pairs of poses, and the views of the board if there are images."""
         if isinstance(self.source, Path) and self.source.is_dir():
-            return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
+            return _Photographs(self, self.source).pairs(workers, progress or (lambda *_: None))
         self._require_no_images()
         source, stated = self.source, self.statements.setup
-        told = source if isinstance(source, ToldPairs) else read_pairs(source, self.statements, self.quaternions)
-        where = source.name if isinstance(source, Path) else told.pairs.where
+        told = source if isinstance(source, HandEyeInput) else read_pairs(source, self.statements, self.quaternions)
+        where = source.name if isinstance(source, Path) else told.where
         if stated and told.setup and stated != told.setup:
             raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")
-        more = {"left_out": told.left_out, "understood": told.understood, "timed": told.timed}
-        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **more)
+        return replace(told, where=where, setup=stated or told.setup)
 
     def _of_images(self) -> dict[str, Path | None]:
         return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
@@ -267,11 +240,11 @@ class Files:
         source = self.source
         place, held = source, "is a file of poses"
         if not isinstance(source, Path):
-            place, held = source.pairs.where if isinstance(source, ToldPairs) else source.where, "are poses"
+            place, held = source.where, "are poses"
         elif not source.exists():
             raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; poses or a folder of images needed")
         extra = ", ".join(name for name, path in self._of_images().items() if path is not None)
-        timed = isinstance(source, ToldPairs) and source.timed is not None
+        timed = isinstance(source, HandEyeInput) and source.timed is not None
         times = f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
         for message, refused in {
             f"{extra}: only with a folder of images; {place} {held}": bool(extra),
@@ -285,15 +258,16 @@ class Files:
         """Returns lines on how the inputs are understood, without looking for the board in images."""
         source = self.source
         if isinstance(source, Path) and source.is_dir():
-            own = _Photographs.of(self, source)
+            own = _Photographs(self, source)
             stated, flange = self.statements.setup, own.robot.poses[list(own.row_of.values())]
-            lines, left_out, with_pose = own.lines(), own.left_out, f"{len(own.row_of)} of {len(own.images)}"
+            lines, left_out = own.understood + own.lines, own.left_out
+            with_pose = f"{len(own.row_of)} of {len(own.images)}"
             count = f"images: {with_pose} with a pose of the robot; the board was not looked for"
         else:
             inputs = self.read()
             stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
             lines, count = list(inputs.understood), f"pairs: {len(inputs.pairs)}"
-            if not lines and not isinstance(source, ToldPairs):
+            if not lines and not isinstance(source, HandEyeInput):
                 lines = own_told(source, self.quaternions)
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
@@ -301,7 +275,6 @@ class Files:
         return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Photographs:
     """The ``images`` of a folder with the robot's poses, before the board is looked for.
 
@@ -309,44 +282,28 @@ class _Photographs:
     where they were taken by time; ``left_out`` : (image, why).
     """
 
-    files: Files
-    folder: Path
-    design: Board
-    model: CameraModel
-    images: list[ImageFile]
-    robot: PoseSide
-    row_of: dict[str, int]
-    understood: tuple[str, ...]
-    clock: Clock | None
-    left_out: LeftOut
-
-    @classmethod
-    def of(cls, files: Files, folder: Path) -> "_Photographs":
-        poses, camera, board, timing = files.poses, files.camera, files.board, files.timing
+    def __init__(self, files: Files, folder: Path):
+        poses, camera, board = files.poses, files.camera, files.board
         if poses is None or camera is None or board is None:
             missing = ", ".join(name for name, path in files._of_images().items() if path is None)
             raise InputError("E-OPTION-MISSING", f"image folder {folder}: {missing} needed with images")
         robot = read_robot(poses, files.statements, files.quaternions)
-        design, model = load_boards(board), read_camera(camera)
-        images, skipped = find_images(folder)
-        names = [image.name for image in images]
-        robot, late, clock = robot_at_images(robot, names, timing)
+        self.files, self.folder, self.design, self.model = files, folder, load_boards(board), read_camera(camera)
+        self.images, skipped = find_images(folder)
+        names = [image.name for image in self.images]
+        self.robot, late, self.clock = robot_at_images(robot, names, files.timing)
         names = [name for name in names if name not in dict(late)]
-        row_of, missing, how = rows_of_images(robot, names)
-        if not row_of:
-            said = f"no row is of an image in {folder}: {robot.names[0]} … there, {names[0]} … here"
-            raise InputError("E-POSES-UNMATCHED", f"robot poses {robot.where}: {said}; correct them")
-        left_out = [*((each.name, each.reason) for each in skipped), *late]
-        left_out += [(name, f"no row in {poses.name}") for name in names if name not in row_of]
-        left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-        understood = (f"robot: {robot.understood}", *([f"images matched {how}"] if how else []))
-        return cls(files, folder, design, model, images, robot, row_of, understood, clock, tuple(left_out))
-
-    def lines(self) -> list[str]:
-        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
-        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
-        size = f"{width} × {height} px, focal length {focal_px:.6g} px"
-        return [*self.understood, f"camera: {camera}: {size}", f"board: {board}: {kind_of(self.design)}"]
+        self.row_of, missing, how = rows_of_images(self.robot, names)
+        if not self.row_of:
+            said = f"no row is of an image in {folder}: {self.robot.names[0]} … there, {names[0]} … here"
+            raise InputError("E-POSES-UNMATCHED", f"robot poses {self.robot.where}: {said}; correct them")
+        self.left_out = [*((each.name, each.reason) for each in skipped), *late]
+        self.left_out += [(name, f"no row in {poses.name}") for name in names if name not in self.row_of]
+        self.left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
+        self.understood = [f"robot: {self.robot.understood}", *([f"images matched {how}"] if how else [])]
+        self.where = f"{folder.name}, {poses.name}"
+        size = f"{self.model.width} × {self.model.height} px, focal length {self.model.focal[0]:.6g} px"
+        self.lines = [f"camera: {camera.name}: {size}", f"board: {board.name}: {kind_of(self.design)}"]
 
     def pairs(self, workers: int | None, progress: Progress) -> HandEyeInput:
         """Returns the pairs of all images that show the board and have a pose."""
@@ -365,15 +322,7 @@ class _Photographs:
         timed = self.clock and Timed(self.clock[0], np.array([self.clock[1][name] for name in found]))
         stated = ("pitch_mm", "square_mm", "spacing_mm")  # by which boards state their size
         pitch_mm = next((getattr(self.design, key) for key in stated if hasattr(self.design, key)), None)
-        return HandEyeInput(
-            f"{self.folder.name}, {self.files.poses.name if self.files.poses else ''}",
-            pairs,
-            views,
-            detections.symmetries,
-            camera_prior(refinable(self.model.calibrated(camera.width, camera.height))),
-            pitch_mm,
-            (*without_board, *self.left_out),
-            (*understood, *(f"board: {part}" for part in detections.unused())),
-            self.files.statements.setup,
-            timed=timed,
-        )
+        prior = camera_prior(refinable(self.model.calibrated(camera.width, camera.height)))
+        lines = (*understood, *(f"board: {part}" for part in detections.unused()))
+        more = ((*without_board, *self.left_out), lines, self.files.statements.setup, timed)
+        return HandEyeInput(self.where, pairs, views, detections.symmetries, prior, pitch_mm, *more)

@@ -9,7 +9,6 @@ import numpy as np
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.conventions import flipped, tilted
@@ -26,8 +25,7 @@ from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
 from stcal.workflows.handeye_inputs import HandEyeInput
 
-ALL = "all"
-"""Word in place of a method's name: all methods, compared."""
+ALL = "all"  # word in place of a method's name: all methods, compared
 
 
 @require_arguments
@@ -81,13 +79,13 @@ def calibrate_handeye(
         pairs, rows = given.pairs, np.zeros((0, 0), int)
         if repeats and (held_out or len(pairs) > LEAST_LEFT):
             rows = splits(len(pairs), held_out, repeats, seed)
-        problem = given.problem(options)
+        problem = problem_of(given, options)
         if method == ALL:
             outcome = _compared(problem, rows, workers, partial(told, "methods"))
         else:
             prior = given.prior if given.views is not None else None
             outcome = validated(problem, method, rows, prior, choosing, workers, partial(told, "held out"))
-        problem, result, notes = given.problem(outcome.options), outcome.result, outcome.notes
+        problem, result, notes = problem_of(given, outcome.options), outcome.result, outcome.notes
         if len(rows):
             notes += better_setup(problem, rows)
         if not given.setup:
@@ -111,6 +109,10 @@ def calibrate_handeye(
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
+def problem_of(given: HandEyeInput, options: HandEyeOptions) -> HandEyeProblem:
+    return HandEyeProblem(given.pairs, given.setup or "eye-in-hand", given.views, options)
+
+
 def _compared(
     problem: HandEyeProblem, rows: np.ndarray, workers: int | None, progress: Callable[[int, int], None]
 ) -> Outcome:
@@ -126,14 +128,10 @@ NO_COVARIANCE = Aside(
     "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the board's "
     "size, is not in σ; `measure` writes it (columns cov_… and common…)"
 )
-
-
-HINT_T, SURE_SIGMAS = 3.0, 4.0
-"""Student's t from which an offset is solved for, and number of its σ from which it is reported (1 in 16,000)."""
+SURE_SIGMAS = 4.0  # number of its σ from which an offset is reported (1 in 16,000)
 FALLS = 0.98
 """Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
-HARMFUL = 1.0
-"""Change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always."""
+HARMFUL = 1.0  # change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always
 SMOOTH, LEAST_ROWS = 0.2, 20
 """Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
 their order counts as that of a motion; and least number of such poses."""
@@ -152,19 +150,17 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
     if options.four_dof:
         said = "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out"
         raise InputError("E-OPTION-CONFLICT", said)
-    problem = given.problem(options).mended()
+    problem = problem_of(given, options).mended()
     pairs, views, noise = problem.pairs, problem.views, options.noise
     offset = estimate_offset(pairs, timed.stream, timed.seconds, problem.setup, noise, options.with_scale)
-    rows = np.flatnonzero(offset.kept)
-    outside = [name for name, kept in zip(pairs.names, offset.kept, strict=True) if not kept]
-    given = replace(
-        given,
-        pairs=replace(pairs[rows], base_from_flange=offset.base_from_flange),
-        views=None if views is None else views[rows],
-        symmetries=(),
-        left_out=(*given.left_out, *((name, "outside of the robot's times at the time offset") for name in outside)),
-        understood=(*given.understood, *problem.notes),
+    rows, outside = np.flatnonzero(offset.kept), np.flatnonzero(~offset.kept)
+    left_out = (
+        *given.left_out,
+        *((pairs.names[i], "outside of the robot's times at the time offset") for i in outside),
     )
+    lines, views = (*given.understood, *problem.notes), None if views is None else views[rows]
+    pairs = replace(pairs[rows], base_from_flange=offset.base_from_flange)
+    given = replace(given, pairs=pairs, views=views, symmetries=(), left_out=left_out, understood=lines)
     return given, problem.options, offset
 
 
@@ -176,8 +172,6 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
     if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _is_moving(timed):
         return result, ()
     try:
-        if abs(_lag_t(problem, timed, result)) < HINT_T:
-            return result, ()
         plain = replace(options, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
@@ -200,8 +194,7 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
 
 
 def _is_moving(timed: Timed) -> bool:
-    """Returns whether the robot's poses tell velocities at the images; about one sample for each image must be
-    smooth."""
+    """True if the robot's poses tell velocities at the images; about one sample for each image must be smooth."""
     samples = timed.stream.seconds
     after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
     if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
@@ -210,30 +203,11 @@ def _is_moving(timed: Timed) -> bool:
         return True
     poses = timed.stream.base_from_flange
     steps = rms_of(poses[1:].difference(poses[:-1]))
-    return len(timed.seconds) >= LEAST_ROWS and all(
-        own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True)
-    )
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
+    return smooth and len(timed.seconds) >= LEAST_ROWS
 
 
-def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
-    """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
-    good = np.flatnonzero(~result.outliers)
-    loop, x = problem.loop[good], result.mount_from_camera
-    residuals = loop.residuals(x, result.stand_from_board, result.scale)
-    by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
-    columns = 12 + (result.sigma_scale is not None)
-    jacobian = np.concatenate([loop.jacobian(x, result.scale, columns), by_time], axis=2)
-    size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
-    weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
-    flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()
-    covariance = generalised_inverse(flat.T @ flat)
-    step = -covariance @ (flat.T @ left)
-    variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
-    return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
-
-
-LEAST_REACHED = 0.5
-"""Share of the poses taken that the arm of a robot file must reach to be accepted as this robot."""
+LEAST_REACHED = 0.5  # share of the poses taken that the arm of a robot file must reach to be accepted as this robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,7 +240,7 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
     Raises InputError: for the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of
     the poses taken. Raises DegenerateError: for the reasons given in :func:`stcal.handeye.handeye`.
     """
-    result = given.problem(HandEyeOptions(symmetries=given.symmetries)).solved().result
+    result = problem_of(given, HandEyeOptions(symmetries=given.symmetries)).solved().result
     camera = outline = None
     if given.views is not None:
         camera = given.views.camera
@@ -318,7 +292,7 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
 
     Raises InputError: the input consists of images, which determine the poses by themselves.
     """
-    problem = given.problem(options or HandEyeOptions())
+    problem = problem_of(given, options or HandEyeOptions())
     if given.views is not None:
         raise InputError("E-OPTION-NEEDS", "--undo-flips: only with poses; of images, the corners decide the tilt")
     undone = np.zeros(len(problem), bool)

@@ -153,8 +153,7 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
             starts.append(camera_from_plane(fit_homography(xyz[:, :2], seen[rows])) @ board_from_plane.inverse())
     if not starts:
         which = "of each board are fewer than four or " * (view.normal is not None)
-        said = f"{name}: the corners seen {which}lie on a line; take the image out"
-        raise DegenerateError("E-VIEW-CORNERS", said)
+        raise DegenerateError("E-VIEW-CORNERS", f"{name}: the corners seen {which}lie on a line; take the image out")
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -68,7 +69,6 @@ class PoseSide:
         return len(self.places)
 
     def __getitem__(self, rows: Sequence[int]) -> "PoseSide":
-        """Returns these rows alone."""
         at = list(rows)
         names, places = (tuple(every[i] for i in at) if every else () for every in (self.names, self.places))
         covariance, common = (None if each is None else each[at] for each in (self.covariance, self.common))
@@ -169,9 +169,8 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
-            raise InputError(
-                "E-POSE-REPEATED", f"{where}: {first[name]} and {place} are both {kind}{name!r}; one needed"
-            )
+            said = f"{first[name]} and {place} are both {kind}{name!r}"
+            raise InputError("E-POSE-REPEATED", f"{where}: {said}; one needed")
         first[name] = place
 
 
@@ -202,8 +201,7 @@ ROLES_BY_NAME: dict[Role, re.Pattern] = {
 
 
 def frames_of(key: object) -> KnownName | None:
-    """Returns the transform that a name means, or, not stated, the one by default of the side that it names; None where
-    it means none."""
+    """Returns the transform that a name means; not stated where it names a side only; None where it means none."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
         return KnownName(name, f"by its name {key}")
@@ -213,17 +211,14 @@ def frames_of(key: object) -> KnownName | None:
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
                 return KnownName(frames, f"by its name {key}", only)
-    for role in ROLES:
-        if ROLES_BY_NAME[role].fullmatch(name):
-            return KnownName(FRAMES[role][0], BY_DEFAULT, False)
-    return None
+    role = next((role for role, names in ROLES_BY_NAME.items() if names.fullmatch(name)), None)
+    return KnownName(FRAMES[role][0], BY_DEFAULT, False) if role else None
 
 
 def inverse_name(key: str) -> str:
     """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
-    match = re.fullmatch(
-        r"((?:rot|trans|rotation|translation|[rt]vecs?|[rthRTH])_)?(.+?)(_from_|_wrt_|_in_|2)(.+)", key
-    )
+    parts = r"((?:rot|trans|rotation|translation|[rt]vecs?|[rthRTH])_)?(.+?)(_from_|_wrt_|_in_|2)(.+)"
+    match = re.fullmatch(parts, key)
     return match.expand(r"\1\4\3\2") if match else ""
 
 
@@ -264,12 +259,10 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseConten
 def numbers(value: Any) -> np.ndarray | None:
     """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for others, and for ragged lists."""
     if isinstance(value, Mapping):
-        if not {"rows", "cols", "data"} <= value.keys():
+        flat, rows, columns = numbers(value.get("data")), value.get("rows"), value.get("cols")
+        if flat is None or not (isinstance(rows, int) and isinstance(columns, int)):
             return None
-        flat = numbers(value["data"])
-        rows, columns = value["rows"], value["cols"]
-        fits = isinstance(rows, int) and isinstance(columns, int) and flat is not None and flat.size == rows * columns
-        return flat.reshape(rows, columns) if fits and flat is not None else None
+        return flat.reshape(rows, columns) if flat.size == rows * columns else None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
     try:
@@ -371,10 +364,10 @@ def _of_messages(values: Any, where: str, frames: KnownName) -> PoseSide:
         raise InputError("E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; save them anew")
     places, rows = tuple(f"sample {i}" for i in range(1, len(values) + 1)), []
     for value, place in zip(values, places, strict=True):
-        parts = value.get("transform", value) if isinstance(value, Mapping) else {}
-        at, turn = (parts.get(key) for key in ("translation", "rotation")) if isinstance(parts, Mapping) else ({}, {})
         row = None
-        if isinstance(at, Mapping) and isinstance(turn, Mapping):
+        with suppress(AttributeError):  # of what is no mapping
+            parts = value.get("transform", value)
+            at, turn = parts.get("translation"), parts.get("rotation")
             row = numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
         if row is None:
             said = "no translation x, y, z and rotation x, y, z, w; correct it"

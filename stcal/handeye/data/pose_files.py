@@ -6,7 +6,7 @@ import re
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,8 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Order, Poses
+from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_content import (
     EVERY_FRAME,
     FRAMES,
@@ -32,6 +33,7 @@ from stcal.handeye.data.pose_content import (
 from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Setup, inverted, read_poses, read_side
 from stcal.handeye.data.pose_partners import matched
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, taken_at
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.join import keys_of
 from stcal.io.rotations import (
@@ -40,7 +42,6 @@ from stcal.io.rotations import (
     places_of,
     read_rotations,
     require_finite,
-    rotations,
     said_convention,
 )
 from stcal.io.table import FARTHEST, LENGTHS, Table, is_comment, read_table, separator_stated
@@ -115,14 +116,11 @@ KNOWN = (
     "a table with named columns, a TUM trajectory, 4×4 matrices in JSON, npy, npz or OpenCV's FileStorage, samples of "
     "easy_handeye or MoveIt, or lines p[x, y, z, rx, ry, rz] of Universal Robots"
 )
-NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
-"""First bytes of the files."""
+NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"  # first bytes of the files
 DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError, SyntaxError, tokenize.TokenError)
 """Errors that NumPy raises for damaged files, whose heads are literals of Python."""
-TUM = 8
-"""Numbers in a line of a TUM trajectory."""
-NANOSECONDS = 19
-"""Digits of a time in ns since 1970."""
+TUM = 8  # numbers in a line of a TUM trajectory
+NANOSECONDS = 19  # digits of a time in ns since 1970
 _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 _UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
 _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
@@ -130,28 +128,6 @@ _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
 _HEADER = re.compile(r"[^:\[{]*[,;\t]")
 _SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
 """A header of columns between which spaces stand, of six names at least, as a pose needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class File:
-    """A file of poses. ``lines`` : those that are neither empty nor comments, by their number; ``key``,
-    ``quaternions`` : see :func:`read_content`."""
-
-    path: Path
-    data: bytes
-    text: str
-    lines: tuple[tuple[int, str], ...]
-    said: Said
-    key: str
-    quaternions: Order
-
-    @property
-    def where(self) -> str:
-        return str(self.path)
-
-    @property
-    def first(self) -> str:
-        return next((line.strip() for _, line in self.lines if not separator_stated(line)), "")
 
 
 def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
@@ -166,45 +142,46 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
         data = read_bytes(path, TABLE_BYTES)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
-    try:
-        text = "" if data.startswith((NPY, NPZ)) else text_of(data)
-    except UnicodeDecodeError:
-        return None
-    used = ((i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not is_comment(line))
-    file = File(path, data, text, tuple(used), statements, key, quaternions)
-    if (text and not file.first) or not data:
-        return None
-    content = _content(file)
+    content = _content(path, data, statements, key, quaternions)
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
         said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
         raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
     return content
 
 
-def _content(file: File) -> PoseContent | None:
+def _content(path: Path, data: bytes, said: Said, key: str, quaternions: Order) -> PoseContent | None:
     """Returns the content as of the first format that the file may be of."""
-    value, first = None, file.first
-    if file.data.startswith(NPY):
-        return _of_values(file, _array(file.data, file.where), "NumPy array")
-    if file.data.startswith(NPZ):
-        return _of_npz(file)
-    if file.text.lstrip().startswith(("{", "[")):
-        with suppress(ValueError, RecursionError):
-            value = json.loads(file.text)
-    if value is not None:
-        return _of_values(file, value, "JSON")
+    where = str(path)
+    if data.startswith(NPY):
+        return _of_values(_array(data, where), "NumPy array", said, where)
+    if data.startswith(NPZ):
+        return _of_npz(data, said, where)
+    try:
+        text = text_of(data)
+    except UnicodeDecodeError:
+        return None
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not is_comment(line)]
+    first = next((line.strip() for _, line in lines if not separator_stated(line)), "")
+    if not first:
+        return None
+    if text.lstrip().startswith(("{", "[")):
+        with suppress(ValueError, RecursionError):  # YAML may begin so, too
+            return _of_values(json.loads(text), "JSON", said, where)
     if _UNIVERSAL.fullmatch(first):
-        return _of_universal(file)
+        inside = [(number, _UNIVERSAL.fullmatch(line.strip())) for number, line in lines]
+        values, places = _rows_of([(number, match[1] if match else "") for number, match in inside], 6, where)
+        rotation, words = turned_values(values[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
+        return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
     name, *others = re.split(r"[\s,;]+", first, maxsplit=1)
     named = _numbers(others[0]) if others and ":" not in name and name != "-" else None
     if numbers := _numbers(first) or named:
         if len(_numbers(first) or ()) == TUM:
-            return _of_tum(file)
-        raise _not_known(file.where, f"rows of {len(numbers)} numbers without a header")
+            return _of_tum(lines, [line for line in text.splitlines() if is_comment(line)], said, where)
+        raise _not_known(where, f"rows of {len(numbers)} numbers without a header")
     if _HEADER.match(_BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first):
-        table = read_table(file.path, "pose file", file.quaternions)
-        return None if todays(table) else read_columns(table, file.key, file.said)
-    return _of_yaml(file)
+        table = read_table(path, "pose file", quaternions)
+        return None if todays(table) else read_columns(table, key, said)
+    return _of_yaml(text, said, where)
 
 
 def _not_known(where: str, found: str) -> InputError:
@@ -219,99 +196,84 @@ def _numbers(line: str) -> list[float] | None:
         return None
 
 
-def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: int) -> tuple[np.ndarray, tuple]:
+def _rows_of(lines: list[tuple[int, str]], count: int, where: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """Returns the numbers (m, count) of all lines, and their places; refuses a line that holds something else."""
     values = []
-    for number, line in file.lines:
-        row = of_line(line)
+    for number, line in lines:
+        row = _numbers(line)
         if row is None or len(row) != count:
             held = "no numbers" if row is None else f"{len(row)} numbers"
-            raise InputError("E-POSES-ROWS", f"{file.where}: line {number}: {held}, {count} as in the first one needed")
+            raise InputError("E-POSES-ROWS", f"{where}: line {number}: {held}, {count} as in the first one needed")
         values.append(row)
-    places = tuple(f"line {number}" for number, _ in file.lines)
-    require_finite(np.array(values), places, file.where)
+    places = tuple(f"line {number}" for number, _ in lines)
+    require_finite(np.array(values), places, where)
     return np.array(values), places
 
 
-def _of_universal(file: File) -> PoseContent:
-    """Returns the poses of lines ``p[x, y, z, rx, ry, rz]``."""
-
-    def inside(line: str) -> list[float] | None:
-        match = _UNIVERSAL.fullmatch(line.strip())
-        return match and _numbers(match[1])
-
-    values, places = _table_of(file, inside, 6)
-    convention = said_convention(file.said.rotation, "the numbers after x, y, z", file.where)
-    rotation, words = rotations(values[:, 3:], convention, places, file.where)
-    return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
-
-
-def _of_tum(file: File) -> PoseContent:
+def _of_tum(lines: list[tuple[int, str]], comments: list[str], said: Said, where: str) -> PoseContent:
     """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
-    values, places = _table_of(file, _numbers, TUM)
-    names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
-    comments = (line for line in file.text.splitlines() if is_comment(line))
+    values, places = _rows_of(lines, TUM, where)
+    names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in lines)
     order = next((letters for c in comments if len(letters := _QUATERNION.findall(c.lower())) == 4), [])
     if sorted(order) != sorted("wxyz"):
         order = list("xyzw")
-        if file.said.rotation or all(name.isdigit() and len(name) >= NANOSECONDS for name in names):
+        if said.rotation or all(name.isdigit() and len(name) >= NANOSECONDS for name in names):
             what = "the last four numbers after a time in ns"
-            order = list(said_convention(file.said.rotation, what, file.where, len("wxyz")).order)
-    require_each_once(names, places, file.where)
+            order = list(said_convention(said.rotation, what, where, len("wxyz")).order)
+    require_each_once(names, places, where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
     turned, unit = f"quaternions {', '.join(order)}", KnownName("m", "as in TUM", False)
-    poses = Poses(of_quaternions(wxyz, places, file.where), values[:, 1:4])
+    poses = Poses(of_quaternions(wxyz, places, where), values[:, 1:4])
     side = PoseSide(poses, places, turned, unit, names=names, trajectory=True)
     return PoseContent("TUM trajectory (timestamp, place, quaternion)", (side,))
 
 
-def _of_values(file: File, value: Any, form: str) -> PoseContent:
-    content = read_tree(value, form, file.said, file.where)
+def _of_values(value: Any, form: str, said: Said, where: str) -> PoseContent:
+    content = read_tree(value, form, said, where)
     if content is None:
         held = f"keys {', '.join(map(str, list(value)[:SHOWN]))} …" if isinstance(value, dict) else form
-        raise _not_known(file.where, f"no poses in {held}")
+        raise _not_known(where, f"no poses in {held}")
     return content
 
 
-def _of_yaml(file: File) -> PoseContent:
-    if len(file.text.encode("utf-8")) > SETTINGS_BYTES:
-        sizes = f"{len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
-        raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
+def _of_yaml(text: str, said: Said, where: str) -> PoseContent:
+    if len(text.encode("utf-8")) > SETTINGS_BYTES:
+        sizes = f"{len(text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
+        raise InputError("E-FILE-TOO-LARGE", f"{where}: {sizes}")
     try:
-        documents = [each for each in load_documents(file.text) if each is not None]
+        documents = [each for each in load_documents(text) if each is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(
-            "E-YAML-INVALID", f"{file.where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed"
-        ) from error
+        reason = " ".join(str(error).split())[:100]
+        raise InputError("E-YAML-INVALID", f"{where}: not YAML ({reason}); {KNOWN} needed") from error
     if len(documents) != 1 or not isinstance(documents[0], list | dict):
-        raise _not_known(file.where, f"{len(documents)} documents of YAML" if documents[1:] else "not understood")
-    return _of_values(file, documents[0], "YAML")
+        raise _not_known(where, f"{len(documents)} documents of YAML" if documents[1:] else "not understood")
+    return _of_values(documents[0], "YAML", said, where)
 
 
-def _of_npz(file: File) -> PoseContent:
+def _of_npz(data: bytes, said: Said, where: str) -> PoseContent:
     """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
     others = []
     try:
-        with zipfile.ZipFile(io.BytesIO(file.data)) as archive:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
             size = sum(member.file_size for member in members)
             if size > TABLE_BYTES:
                 sizes = f"{size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
-                raise InputError("E-FILE-TOO-LARGE", f"{file.where}: {sizes}")
+                raise InputError("E-FILE-TOO-LARGE", f"{where}: {sizes}")
             for member in members:
                 name, content = member.filename.removesuffix(".npy"), archive.read(member)
                 try:
-                    arrays[name] = _array(content, file.where)
+                    arrays[name] = _array(content, where)
                 except InputError:
                     others.append(name)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
-        raise _damaged(file.where, error) from error
+        raise _damaged(where, error) from error
     if not any(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise InputError("E-NUMPY-CONTENT", f"{file.where}: no arrays of numbers; save it with np.savez")
+        raise InputError("E-NUMPY-CONTENT", f"{where}: no arrays of numbers; save it with np.savez")
     form, [first, *more] = "NumPy arrays", arrays.values()
-    single = None if more else read_tree(first, form, file.said, file.where)
-    content = single or _of_values(file, arrays, form)
+    single = None if more else read_tree(first, form, said, where)
+    content = single or _of_values(arrays, form, said, where)
     return replace(content, passed_over=(*content.passed_over, *others))
 
 
@@ -339,34 +301,44 @@ def _damaged(where: str, error: Exception) -> InputError:
 METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
 """Lengths are metres if all are below the first limit, and millimetres if one is above the second. Flanges and boards
 are farther from base and camera than 5 mm, and nearer than 50 m."""
-MIXED = 100.0
-"""Ratio of the farthest to the nearest pose above which poses are in two units."""
-SHOWN = 4
-"""Keys that a message names."""
+MIXED = 100.0  # ratio of the farthest to the nearest pose above which poses are in two units
+SHOWN = 4  # keys that a message names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToldPairs:
-    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
-    (name, why); ``timed`` : where the robot's poses were taken by time."""
+class HandEyeInput:
+    """Input of a hand-eye calibration.
 
+    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
+    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
+    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    """
+
+    where: str
     pairs: HandEyePoses
-    understood: tuple[str, ...]
-    setup: Setup | None = None
+    views: Views | None = None
+    symmetries: tuple[Rigid, ...] = ()
+    prior: CameraPrior | None = None
+    pitch_mm: float | None = None
     left_out: tuple[tuple[str, str], ...] = ()
+    understood: tuple[str, ...] = ()
+    setup: Setup | None = None
     timed: Timed | None = None
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
         cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, lines: Sequence[str] = (), **more: Any
-    ) -> "ToldPairs":
+    ) -> "HandEyeInput":
         """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
         covariances = robot.covariance, camera.covariance
         pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
-        return cls(pairs, (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines), **more)
+        understood = (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines)
+        return cls(where, pairs, understood=understood, **more)
 
 
-def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> ToldPairs:
+def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> HandEyeInput:
     """Returns the pose pairs of one file, or of a table of the package's own.
 
     Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
@@ -374,7 +346,7 @@ def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxy
     if isinstance(source, Table) or (content := read_content(source, statements, "image", quaternions)) is None:
         pairs = read_poses(source, quaternions)  # first: a table that is not understood states nothing
         require_unsaid(statements, str(source))
-        return ToldPairs(pairs, ())
+        return HandEyeInput(pairs.where, pairs)
     if len(content.sides) == 1:
         frames = content.sides[0].frames
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
@@ -386,7 +358,7 @@ def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxy
             f"{source}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
         )
         raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
-    return ToldPairs.of(robot, camera, robot.names or camera.called(), source.name, setup=content.setup)
+    return HandEyeInput.of(robot, camera, robot.names or camera.called(), source.name, setup=content.setup)
 
 
 def read_two(
@@ -397,7 +369,7 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
-) -> ToldPairs | None:
+) -> HandEyeInput | None:
     """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
     tables.
 
@@ -424,16 +396,16 @@ def read_two(
     if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
         stream = Stream.of(times, robot.poses, first.name)
         seconds = stream.after_origin(wanted)
-        taken = taken_at(stream, seconds, tolerance_s)
-        if not taken.kept.any():
-            said = f"no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}"
+        taken = taken_at(stream, seconds, camera.names, tolerance_s)
+        if not taken.rows:
+            said = f"no pose has one of the robot: first {', '.join(taken.left_out[0])}"
             raise InputError("E-POSES-UNMATCHED", f"{camera.where}: {said}")
         lines = [taken.said]
         if robot.covariance is not None:
             lines.append("covariances of the robot's poses are not used: they are of other times")
         robot, camera = replace(robot, poses=taken.base_from_flange, covariance=None), camera[taken.rows]
-        more = {"left_out": taken.left_out(sides[1].names), "timed": Timed(stream, seconds[taken.rows])}
-        return ToldPairs.of(robot, camera, camera.names, where, lines, setup=setup, **more)
+        more = {"left_out": taken.left_out, "timed": Timed(stream, seconds[taken.rows])}
+        return HandEyeInput.of(robot, camera, camera.names, where, lines, setup=setup, **more)
     rows, how = matched(robot, camera, key)
     a, b = ([row[k] for row in rows] for k in (0, 1))
     stamped = None
@@ -442,19 +414,15 @@ def read_two(
         if stream.spacing_s() <= LONGEST_S:
             stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
     alone = [(robot, first, a)] if stamped is None else []  # samples between images are no mistake
-    left_out = [
-        (name, f"in {path.name} alone")
-        for side, path, used in (*alone, (camera, second, b))
-        for i, name in enumerate(side.called())
-        if i not in used
-    ]
+    left_out = []
+    for side, path, used in (*alone, (camera, second, b)):
+        left_out += [(name, f"in {path.name} alone") for i, name in enumerate(side.called()) if i not in used]
     more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
     lines = [f"rows joined {how}"] if how else []
-    return ToldPairs.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
+    return HandEyeInput.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
 
 
-TIME = "time_s"
-"""Column of a stream of poses, in place of ``image``."""
+TIME = "time_s"  # column of a stream of poses, in place of ``image``
 
 
 def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> PoseSide:
@@ -484,12 +452,10 @@ def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> Pos
 def require_unsaid(statements: Said, where: str) -> None:
     """Refuse statements on a table whose columns state the same."""
     if statements.options():
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{where}: the names of columns state unit, rotation and direction; leave "
-            f"{', '.join(statements.options())} out, and "
-            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, or flange_from_base_x_mm)",
-        )
+        said = f"{where}: the names of columns state unit, rotation and direction; leave "
+        said += f"{', '.join(statements.options())} out, and "
+        said += "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, or flange_from_base_x_mm)"
+        raise InputError("E-OPTION-NEEDS", said)
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
@@ -507,11 +473,9 @@ def require_own(path: Path, quaternions: Order = "wxyz") -> None:
 
 
 def _no_poses(table: Table) -> InputError:
-    return InputError(
-        "E-POSES-NOT-FOUND",
-        f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
-        f"a, b, c …) needed; the header is {table.header()}; rename them",
-    )
+    said = f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
+    said += f"a, b, c …) needed; the header is {table.header()}; rename them"
+    return InputError("E-POSES-NOT-FOUND", said)
 
 
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
@@ -545,12 +509,9 @@ def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Know
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option, frames = statements.frames_of(role), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
-        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}"
+        said = f"{path}: {frames.name} {frames.by}, --poses-are {option}; if the name is wrong, change it in the file"
         name = inverse_name(frames.by.rpartition(" ")[2])
-        remedy = (
-            f"if the name is wrong, change it in the file{f', to {name}' if name else ''}; else leave the option out"
-        )
-        raise InputError("E-OPTION-CONTRADICTS", f"{said}; {remedy}")
+        raise InputError("E-OPTION-CONTRADICTS", f"{said}{f', to {name}' if name else ''}; else leave the option out")
     if option is not None:
         return KnownName(option, "as you say")
     if frames is None and side.trajectory and role == "camera":
@@ -572,10 +533,8 @@ def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[Know
         said = f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units"
         raise InputError("E-POSES-UNITS", f"{said}; write all in the same unit and give --length-unit mm or m")
     if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
-        raise InputError(
-            "E-POSES-UNITS",
-            f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
-            f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
-        )
+        said = f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
+        said += f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m"
+        raise InputError("E-POSES-UNITS", said)
     guess = "m" if farthest <= METRES_UP_TO else "mm"
     return KnownName(guess, f"by their size, up to {farthest:.4g}", False), guess

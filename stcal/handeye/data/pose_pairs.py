@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -16,10 +17,7 @@ from stcal.io.table import LENGTHS, Table, read_table
 
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
 """Transforms that each row must hold, with the inverse that is accepted in place of each."""
-
-
-LengthUnit = Literal["mm", "m", "cm", "um", "in"]
-"""Units of translations."""
+LengthUnit = Literal["mm", "m", "cm", "um", "in"]  # units of translations
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -144,12 +142,10 @@ class HandEyePoses(Brief):
             same = max(stale, key=len)
             named = ", ".join(self.names[i] for i in same[:3]) + (" …" if len(same) > 3 else "")
             turn, shift = apart(board, same).max(0)
-            raise InputError(
-                "E-POSES-IDENTICAL",
-                f"{self.where}: {named}: the flange's pose is the same to the last digit in {len(same)} rows, while "
-                f"the board moved by up to {shift:.3g} mm and {np.degrees(turn):.3g}°; read the robot's pose anew with "
-                "each image",
-            )
+            said = f"{self.where}: {named}: the flange's pose is the same to the last digit in {len(same)} rows, "
+            said += f"while the board moved by up to {shift:.3g} mm and {np.degrees(turn):.3g}°; read the robot's pose "
+            said += "anew with each image"
+            raise InputError("E-POSES-IDENTICAL", said)
 
 
 def _copies(poses: Poses) -> list[np.ndarray]:
@@ -247,6 +243,7 @@ def inverse_jacobian(poses: Poses) -> np.ndarray:
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 SETUPS: tuple[str, ...] = get_args(Setup)
+OTHER: dict[Setup, Setup] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,43 +262,48 @@ FRAMES = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Loop:
     """m pose pairs in the terms of the one equation.
 
-    ``inverted`` : whether stand_from_mount is the inverse of what the robot reports, base_from_flange;
     ``robot_covariance``, ``camera_covariance`` : (m, 6, 6) of base_from_flange and camera_from_board, where known, the
     latter without ``camera_common`` : (m, 6, k), the errors that camera_from_board have in common.
     """
 
-    stand_from_mount: Poses
+    base_from_flange: Poses
     camera_from_board: Poses
-    inverted: bool = False
+    setup: Setup = "eye-in-hand"
     robot_covariance: np.ndarray | None = None
     camera_covariance: np.ndarray | None = None
     camera_common: np.ndarray | None = None
 
     @classmethod
     def of(cls, pairs: HandEyePoses, setup: Setup) -> "Loop":
-        """Returns the loop of pairs in one of the setups."""
         if setup not in SETUPS:
             raise InputError("E-HANDEYE-SETUP", f"hand-eye: setup {setup!r}; {' or '.join(SETUPS)} needed")
-        inverted = setup == "eye-to-hand"
-        hand = pairs.base_from_flange.inverse() if inverted else pairs.base_from_flange
         of_camera, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
         if of_camera is not None and common is not None:
             of_camera = of_camera - common @ np.swapaxes(common, 1, 2)
         covariances = (pairs.base_from_flange_covariance, of_camera, common)
-        return cls(hand, pairs.camera_from_board, inverted, *covariances)
+        return cls(pairs.base_from_flange, pairs.camera_from_board, setup, *covariances)
+
+    @property
+    def inverted(self) -> bool:
+        """Whether the mount is the base, and the stand the flange."""
+        return self.setup == "eye-to-hand"
+
+    @cached_property
+    def stand_from_mount(self) -> Poses:
+        """The robot's part of the loop."""
+        return self.base_from_flange.inverse() if self.inverted else self.base_from_flange
 
     def __len__(self) -> int:
         return len(self.stand_from_mount)
 
     def __getitem__(self, index) -> "Loop":
-        """Returns the pairs selected by a mask, slice or list."""
         known = (self.robot_covariance, self.camera_covariance, self.camera_common)
         covariances = (None if c is None else c[index] for c in known)
-        return Loop(self.stand_from_mount[index], self.camera_from_board[index], self.inverted, *covariances)
+        return Loop(self.base_from_flange[index], self.camera_from_board[index], self.setup, *covariances)
 
     def chain(self, mount_from_camera: Rigid, scale: float = 1.0) -> Poses:
         """Returns stand_from_board by each pose; the camera's lengths are multiplied by ``scale``."""
@@ -309,8 +311,7 @@ class Loop:
         return self.stand_from_mount @ mount_from_camera @ Poses(seen.rotation, scale * seen.translation)
 
     def residuals(self, mount_from_camera: Rigid, stand_from_board: Rigid, scale: float = 1.0) -> np.ndarray:
-        """Returns the residuals of the chains against ``stand_from_board``, (m, 6): rad, and mm at the board's origin;
-        stand axes."""
+        """Returns residuals (m, 6) of the chains against ``stand_from_board``: rad, mm at its origin; stand axes."""
         return self.chain(mount_from_camera, scale).difference(Poses.of([stand_from_board] * len(self)))
 
     def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0, count: int = 12) -> np.ndarray:
@@ -380,19 +381,16 @@ class Motions:
 
     @classmethod
     def consecutive(cls, loop: Loop) -> "Motions":
-        """Returns the motions from each pose to the next."""
         return cls.between(loop, np.arange(len(loop) - 1), np.arange(1, len(loop)))
 
     @classmethod
     def all(cls, loop: Loop) -> "Motions":
-        """Returns the motions between every pair of poses."""
         return cls.between(loop, *np.triu_indices(len(loop), 1))
 
     def __len__(self) -> int:
         return len(self.first)
 
     def __getitem__(self, index) -> "Motions":
-        """Returns the motions selected by a mask, slice or list."""
         return Motions(*(getattr(self, name)[index] for name in self.__slots__))
 
     def has_log(self) -> np.ndarray:
@@ -400,14 +398,12 @@ class Motions:
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
 
     def with_log(self, method: str) -> "Motions":
-        """Returns the motions that satisfy :meth:`has_log`."""
         good = self.has_log()
         if good.sum() < 2:
-            raise DegenerateError(
-                "E-HANDEYE-LARGE-TURNS",
-                f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
-                f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of poses",
-            )
+            said = f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
+            said += f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of "
+            said += "poses"
+            raise DegenerateError("E-HANDEYE-LARGE-TURNS", said)
         return self[good]
 
 

@@ -9,8 +9,7 @@ from stcal.handeye.data.stream import stem_of, time_of
 
 
 def matched(robot: PoseSide, camera: PoseSide, key: str) -> tuple[list[tuple[int, int]], str]:
-    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched;
-    empty where the names are the same."""
+    """Returns the rows of both sides that belong together, in the robot's order, and how they match if not by name."""
     if not robot.names and not camera.names:
         if len(robot) == len(camera):
             return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"

@@ -15,19 +15,13 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_pairs import rms_of
 
-LONGEST_S = 0.25
-"""Largest distance in time of two samples between which a pose is interpolated."""
-TOLERANCE_S = 0.02
-"""Default tolerance within which the nearest sample replaces a pose that cannot be interpolated."""
-SAME_S = 1e-9
-"""Difference below which times are equal."""
+LONGEST_S = 0.25  # largest distance in time of two samples between which a pose is interpolated
+TOLERANCE_S = 0.02  # default tolerance within which the nearest sample replaces a pose that cannot be interpolated
+SAME_S = 1e-9  # difference below which times are equal
 NANOSECONDS_FROM = Decimal(10) ** 14
-LEAST_STAMP = Decimal(10) ** 8
-"""Whole numbers below this are numbers of images, not seconds since 1970."""
-STEP = 1e-3
-"""Step of a numerical derivative, in spacings of the samples."""
-WINDOW = 4
-"""Number of samples of a cubic."""
+LEAST_STAMP = Decimal(10) ** 8  # whole numbers below this are numbers of images, not seconds since 1970
+STEP = 1e-3  # step of a numerical derivative, in spacings of the samples
+WINDOW = 4  # number of samples of a cubic
 LOO_NOISE = float(np.sqrt(1 + 34 / 36))
 """Scatter of a sample about the cubic through its four neighbours, in σ of one sample, with the noise of all five."""
 
@@ -130,30 +124,18 @@ class Timed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """Poses at k times.
+    """``rows`` : places of the times at which there is a pose; ``base_from_flange`` : these poses; ``left_out`` : names
+    of the other times, and why; ``said`` : a line on how the poses were found."""
 
-    ``kept`` : (k,) whether there is a pose; ``base_from_flange`` : poses at the kept times; ``why`` : (k,) reason why
-    there is no pose, empty where there is one; ``said`` : a line on how the poses were found.
-    """
-
-    kept: np.ndarray
+    rows: list[int]
     base_from_flange: Poses
-    why: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
     said: str
 
-    @property
-    def rows(self) -> list[int]:
-        """The places of the kept times."""
-        return np.flatnonzero(self.kept).tolist()
 
-    def left_out(self, names: Sequence[str]) -> tuple[tuple[str, str], ...]:
-        """Returns the names (k) of times without a pose, and why."""
-        return tuple((name, why) for name, why in zip(names, self.why, strict=True) if why)
-
-
-def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE_S) -> Taken:
-    """Returns poses at times (k,) after the stream's origin. They are interpolated where the samples are close, else
-    taken from the nearest sample within the tolerance."""
+def taken_at(stream: Stream, seconds: np.ndarray, names: Sequence[str], tolerance_s: float = TOLERANCE_S) -> Taken:
+    """Returns poses at times (k,) after the stream's origin, of ``names`` (k). They are interpolated where the samples
+    are close, else taken from the nearest sample within the tolerance."""
     samples = stream.seconds
     after = np.clip(np.searchsorted(samples, seconds), 1, len(samples) - 1)
     nearest = np.where(seconds - samples[after - 1] <= samples[after] - seconds, after - 1, after)
@@ -161,13 +143,13 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     same, covered = gap_s < SAME_S, (seconds >= samples[0]) & (seconds <= samples[-1])
     between = covered & (spacing <= LONGEST_S) & ~same
     nearby = ~between & ~same & (gap_s <= tolerance_s)
-    kept, why = between | same | nearby, []
-    for k, time in enumerate(seconds):
-        reason = f"{gap_s[k]:.4g} s {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
+    kept, left_out = between | same | nearby, []
+    for k in np.flatnonzero(~kept):
+        reason = f"{gap_s[k]:.4g} s {'before' if seconds[k] < samples[0] else 'after'} the samples of {stream.where}"
         if covered[k]:
             reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed"
             reason += f"; the nearest sample is {gap_s[k]:.4g} s away"
-        why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
+        left_out.append((names[k], f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)"))
     parts = [f"{same.sum()} at a sample"] if same.any() else []
     if between.any():
         turn, shift = stream.rest()
@@ -176,11 +158,11 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     if nearby.any():
         farthest = f"up to {gap_s[nearby].max():.3g} s away ({tolerance_s:g} s allowed)"
         parts.append(f"{nearby.sum()} by the nearest sample, {farthest}")
-    if not kept.all():
-        parts.append(f"{(~kept).sum()} left out")
+    if left_out:
+        parts.append(f"{len(left_out)} left out")
     message = f"poses by time: {len(seconds)} times in {len(samples)} samples of {stream.where}: {', '.join(parts)}"
-    at = np.where(between, seconds, samples[nearest])[kept]
-    return Taken(kept, stream.at(at) if kept.any() else Poses.of([]), tuple(why), message)
+    poses = stream.at(np.where(between, seconds, samples[nearest])[kept]) if kept.any() else Poses.of([])
+    return Taken(np.flatnonzero(kept).tolist(), poses, tuple(left_out), message)
 
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:

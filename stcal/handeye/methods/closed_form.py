@@ -18,10 +18,8 @@ SUBSETS = 200
 """Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
 LEAST_LENGTH = 0.1
 """Least ratio of the lengths of camera's and flange's paths: 1 but for the board's size, 0 where neither moves."""
-LEAST_SCALE = 1e-6
-"""Smallest scale of the board; lengths in metres give 0.001."""
-SEED = 0
-"""Seed of the subsets, so that they are the same every time."""
+LEAST_SCALE = 1e-6  # smallest scale of the board; lengths in metres give 0.001
+SEED = 0  # seed of the subsets, so that they are the same every time
 
 
 def robust(loop: Loop, with_scale: bool = False) -> LoopState:
@@ -56,7 +54,7 @@ def robust(loop: Loop, with_scale: bool = False) -> LoopState:
     return LoopState(Rigid(x, t_x), Rigid(z, t_z), float(scale))
 
 
-def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> LoopState:
+def about_one_axis(mount_axis: np.ndarray, loop: Loop, with_scale: bool = False) -> LoopState:
     """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along it.
     Translations give the angle about it, and the scale."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
@@ -75,11 +73,9 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
     length = float(np.hypot(cosine, sine))
     if length < LEAST_LENGTH:
-        raise DegenerateError(
-            "E-HANDEYE-AXES",
-            "hand-eye: the flange turns about one axis only and does not move across it, so that the angle about it "
-            "is not determined; also move it across the axis by a tenth of the board's distance or more",
-        )
+        said = "hand-eye: the flange turns about one axis only and does not move across it, so that the angle about it "
+        said += "is not determined; also move it across the axis by a tenth of the board's distance or more"
+        raise DegenerateError("E-HANDEYE-AXES", said)
     scale = length if with_scale else 1.0
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
@@ -123,8 +119,7 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z, the latter in units of the board;
-    infinite for a board of no size."""
+    """Returns angles and distances (s, m) by which the chains miss Z, in units of the board: infinite if of no size."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     cosine = (np.einsum("smab,sab->sm", hand.rotation @ (x[:, None] @ eye.rotation), z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
@@ -177,8 +172,7 @@ def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple
     return rigid(r_x, t_x).inverse(), rigid(r_z, t_z).inverse()
 
 
-GAP = 1e-4
-"""Largest relative excess of the largest error over the proven bound: a hundredth of any σ."""
+GAP = 1e-4  # largest relative excess of the largest error over the proven bound: a hundredth of any σ
 
 
 def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
@@ -202,21 +196,15 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
 
 def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """Returns C (k, 12, 12), d (k, 12) of R_A R_X − R_X R_B and (R_A − I) b_X − R_X b_B + b_A; x has R_X by columns."""
-    a, b, k = motions.mount, motions.camera, len(motions)
-    eye = np.eye(3)
-    c, d = np.zeros((k, 12, 12)), np.zeros((k, 12))
-    left = np.einsum("ab,kij->kaibj", eye, a.rotation).reshape(k, 9, 9)
-    right = np.einsum("kba,ij->kaibj", b.rotation, eye).reshape(k, 9, 9)
-    c[:, :9, :9] = left - right
-    c[:, 9:, :9] = -np.einsum("ka,ij->kiaj", b.translation / unit_mm, eye).reshape(k, 3, 9)
-    c[:, 9:, 9:] = a.rotation - eye
-    d[:, 9:] = -a.translation / unit_mm
-    return c, d
+    eye, none = np.eye(3), np.zeros((9, 3))
+    parts = zip(motions.mount.rotation, motions.camera.rotation, motions.camera.translation / unit_mm, strict=True)
+    rows = [[[np.kron(eye, a) - np.kron(b.T, eye), none], [-np.kron(shift, eye), a - eye]] for a, b, shift in parts]
+    d = np.concatenate([np.zeros((len(motions), 9)), -motions.mount.translation / unit_mm], axis=1)
+    return np.array([np.block(each) for each in rows]), d
 
 
 def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Returns the x of least largest ‖C_i x − d_i‖, from a start; raises ConvergenceError if not proven within
-    :data:`GAP`."""
+    """Returns the x of least largest ‖C_i x − d_i‖; raises ConvergenceError if not proven within :data:`GAP`."""
     scale = np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
     if scale < 1e-12:  # the start has no residuals
         return x
@@ -242,20 +230,15 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
     mean, right = np.tensordot(shares, hessian[active], 1), shares @ pull[active]
     bound = shares @ level[active] - right @ np.linalg.lstsq(mean, right, rcond=None)[0]
     if errors.max() > (1 + 2 * GAP) * bound:
-        raise ConvergenceError(
-            "E-HANDEYE-METHOD-FAILS",
-            f"hand-eye: zhao's largest error is {np.sqrt(errors.max() / max(bound, 1e-300)):.4g} times its proven "
-            "bound; use another method",
-        )
+        said = f"hand-eye: zhao's largest error is {np.sqrt(errors.max() / max(bound, 1e-300)):.4g} times its proven "
+        said += "bound; use another method"
+        raise ConvergenceError("E-HANDEYE-METHOD-FAILS", said)
     return x
 
 
-MOST = 100_000
-"""Largest number of candidates, and of generations."""
-EXACT = 1e-24
-"""Gain of a step at which the minimum is reached, rad²: the objective is not in units of any σ."""
-FARTHEST = 1e9
-"""Largest number of bounds, mm or rad: a thousand kilometres."""
+MOST = 100_000  # largest number of candidates, and of generations
+EXACT = 1e-24  # gain of a step at which the minimum is reached, rad²: the objective is not in units of any σ
+FARTHEST = 1e9  # largest number of bounds, mm or rad: a thousand kilometres
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,11 +257,9 @@ class Bounds:
     def __post_init__(self):
         require_fields(self, "differential evolution")
         if not (0 < self.half_width <= FARTHEST and (np.abs(self.centre or 0) <= FARTHEST).all()):
-            raise InputError(
-                "E-EVOLUTION-OPTIONS",
-                f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; numbers up to "
-                f"{FARTHEST:g} and a positive half width needed",
-            )
+            said = f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; numbers up "
+            said += f"to {FARTHEST:g} and a positive half width needed"
+            raise InputError("E-EVOLUTION-OPTIONS", said)
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,11 +292,9 @@ class EvolutionOptions:
         numbers = (self.population, self.generations, self.factor, self.crossover, self.weight)
         least, most = (4, 0, 1e-300, 0, 1e-300), (MOST, MOST, 2, 1, FARTHEST)
         if not all(low <= number <= high for low, number, high in zip(least, numbers, most, strict=True)):
-            raise InputError(
-                "E-EVOLUTION-OPTIONS",
-                "differential evolution: population {}, {} generations, F {:g}, CR {:g}, λ {:g}; ".format(*numbers)
-                + f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed",
-            )
+            said = "population {}, {} generations, F {:g}, CR {:g}, λ {:g}".format(*numbers)
+            needed = f"4 to {MOST}, 0 to {MOST}, above 0 to 2, 0 to 1, and a positive number needed"
+            raise InputError("E-EVOLUTION-OPTIONS", f"differential evolution: {said}; {needed}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -327,7 +306,6 @@ class Objective:
     weight: float
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Returns the objective (p,) of candidates (p, 6)."""
         turn = Rotation.from_rotvec(x[:, :3]).as_matrix()
         rotation, translation = self._parts(turn, x[:, 3:])
         return (rotation**2).sum((1, 2)) + self.weight * (translation**2).sum((1, 2))

@@ -16,18 +16,14 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
 from stcal.handeye.data.pose_pairs import Loop, LoopState
 
-LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
-"""Lower limits of estimated σ, by kind: exact data would give 0."""
+LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}  # lower limits of estimated σ, by kind: exact data would give 0
 CAUTION = 2.0
 """Redundancies that are not counted. The variance from redundancy ν is the sum of squares over ν − 2, so that errors in
 units of its root have mean square 1 (the mean of F is ν / (ν − 2)). This also keeps a component of few poses off 0, as
 the penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
-MOST_RAD, MOST_MM = np.radians(10), 100.0
-"""Largest σ of poses; beyond it poses tell nothing."""
-FARTHEST = 7.0
-"""Largest logarithm of the ratio between an estimated σ and its first guess: a factor of a thousand."""
-UNKNOWNS = 12
-"""Number of unknowns of X and Z."""
+MOST_RAD, MOST_MM = np.radians(10), 100.0  # largest σ of poses; beyond it poses tell nothing
+FARTHEST = 7.0  # largest logarithm of the ratio between an estimated σ and its first guess: a factor of a thousand
+UNKNOWNS = 12  # number of unknowns of X and Z
 LEAST_SHARE = 1e-3
 """Lower limit of an estimated variance as a share of its first guess. Less makes no difference to the weights, but a
 few poses that fit by chance would pull all others to themselves."""
@@ -86,16 +82,15 @@ class LoopComponents:
         """Returns the covariances (m, 6, 6) for these variances (f,)."""
         return self.known + np.tensordot(variances, self.free, 1)
 
-    def first(self, residuals: np.ndarray) -> np.ndarray:
-        """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect."""
+    def first(self, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect, and
+        their lower limits."""
         turn, shift = (robust_sigma(each, 3) ** 2 for each in np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T)
-        turns = max(sum(name.endswith("_rad") for name in self.names), 1)
-        by_kind = {"rad": turn / turns, "mm": shift, "factor": 1.0}
-        return np.maximum([by_kind[name.rpartition("_")[2]] for name in self.names], self.least())
-
-    def least(self) -> np.ndarray:
-        """Returns the lower limits (f,) of the variances."""
-        return np.square([LEAST[name.rpartition("_")[2]] for name in self.names])
+        kinds = [name.rpartition("_")[2] for name in self.names]
+        by_kind = {"rad": turn / max(kinds.count("rad"), 1), "mm": shift, "factor": 1.0}
+        least = np.square([LEAST[kind] for kind in kinds])
+        first = np.maximum([by_kind[kind] for kind in kinds], least)
+        return first, np.maximum(least, LEAST_SHARE * first)
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
@@ -128,27 +123,22 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
     return LoopComponents(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
 
 
-FALSE_ALARM = 0.01
-"""False-alarm probability that a set of good poses has an outlier."""
-MOSTLY_GOOD = 2 / 3
-"""Share of the poses that is taken to be good."""
-LEAST_POSES = 4
-"""Number of poses that must be left to contradict an outlier: any three poses can be fitted."""
+FALSE_ALARM = 0.01  # false-alarm probability that a set of good poses has an outlier
+MOSTLY_GOOD = 2 / 3  # share of the poses that is taken to be good
+LEAST_POSES = 4  # number of poses that must be left to contradict an outlier: any three poses can be fitted
 ROUNDS = 30
 SEEN = 1e-6
 """Share of a pose's own variance below which this pose alone determined the solution and cannot contradict it."""
 SAME_RAD, SAME_MM = 2e-4, 0.05
 """Largest difference of two poses of a robot that stands still: what its encoders resolve."""
-SETTLED = 1e-4
-"""Relative change of the estimated σ between rounds below which the iteration has converged."""
+SETTLED = 1e-4  # relative change of the estimated σ between rounds below which the iteration has converged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
     """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) of the residuals;
     ``outliers`` : (m,); ``sigma`` : the estimated σ, by name; ``variance_factor`` : mean squared residual in units of
-    σ, over the ``redundancy``; ``scale_hint`` : the scale if it were solved for, and its σ; ``settled`` : whether σ and
-    outliers settled within :data:`ROUNDS`."""
+    σ, over the ``redundancy``; ``settled`` : whether σ and outliers settled within :data:`ROUNDS`."""
 
     state: LoopState
     normal: np.ndarray
@@ -158,7 +148,6 @@ class PoseSolution:
     sigma: dict[str, float]
     variance_factor: float
     redundancy: int
-    scale_hint: tuple[float, float]
     settled: bool
 
     def misfit(self, used: np.ndarray) -> float:
@@ -180,9 +169,8 @@ def adjust_poses(
     parameter). Raises ConvergenceError: no minimum is reached."""
     count, state, residuals = 12 + with_scale, start, loop.residuals(*start)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
-    variances = first = parts.first(residuals)
-    least = np.maximum(parts.least(), LEAST_SHARE * first)
-    limits = least, np.maximum(first, least) * np.exp(2 * FARTHEST)
+    first, least = parts.first(residuals)
+    variances, limits = first, (least, first * np.exp(2 * FARTHEST))
     used = _near(residuals, parts.total(variances)) if robust else np.ones(len(loop), bool)
     for round_ in range(ROUNDS):
         parts = components(loop, noise, state.mount_from_camera, state.scale)
@@ -205,8 +193,7 @@ def adjust_poses(
     residuals, redundancy = loop.residuals(*state), max(6 * int(used.sum()) - count, 1)
     sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
     factor = float(_squared(residuals, covariance)[used].sum() / redundancy)
-    hint = _scale_hint(loop[used], state, residuals[used], covariance[used])
-    return PoseSolution(state, normal, residuals, covariance, ~used, sigma, factor, redundancy, hint, settled)
+    return PoseSolution(state, normal, residuals, covariance, ~used, sigma, factor, redundancy, settled)
 
 
 def places(loop: Loop) -> np.ndarray | None:
@@ -234,15 +221,6 @@ def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
     pull = -np.einsum("mai,ma->mi", weighted, solution.residuals[used])
     information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
     return by_clusters(solution.normal, member.T @ pull, information)
-
-
-def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Returns the scale, one step from the solution, if it were solved for, and its σ."""
-    jacobian = loop.jacobian(state.mount_from_camera, state.scale, 13)
-    weighted = np.linalg.solve(covariance, jacobian)
-    inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
-    step = -inverse[12] @ np.einsum("mai,ma->i", weighted, residuals)
-    return state.scale + float(step), float(np.sqrt(inverse[12, 12]))
 
 
 def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:

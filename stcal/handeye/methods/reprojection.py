@@ -1,22 +1,24 @@
 """Reprojection adjustment: X and Z from the corners in the images, with the errors of robot, board and camera."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import fdtri
 
-from stcal.adjust.blocks import Vector
-from stcal.adjust.engine import Solution
+from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.engine import Adjustment, Solution
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid, by_pose
+from stcal.geometry.robust import length_limit
 from stcal.handeye.data.corner_views import Views, resect, whitened
 from stcal.handeye.data.pose_pairs import Loop, LoopState
-from stcal.handeye.methods.bundle import ROBOT, Bundle, Corners, camera_parts, errors
 from stcal.handeye.methods.pose_adjustment import (
     CAUTION,
     FALSE_ALARM,
@@ -28,6 +30,9 @@ from stcal.handeye.methods.pose_adjustment import (
 )
 from stcal.io.cameras.camera_model import CameraPrior
 
+CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
+"""Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""
+ROBOT = ("robot_rad", "robot_mm")  # kinds of the robot's errors: of its rotations and of its translations
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """Residuals (rotation; translation as share of the distance) above which a pose is wrong from the start. No error of
 the camera file, which is solved for here, makes so much."""
@@ -35,8 +40,7 @@ UNKNOWN_LENS = intrinsic_basis("OPENCV"), 1e-12 * np.eye(intrinsic_basis("OPENCV
 """Basis of the intrinsics in which errors of the camera file are looked for, and their negligible information, px⁻²."""
 CAMERA_GAIN = 5.0
 """Gain in cost per intrinsic above which intrinsics are wrong. Eight right ones gain 8 ± 4 together, 1 ± 0.5 each."""
-SAME_DIGITS = 6
-"""Decimals of a millimetre to which two places on the board agree that are one corner."""
+SAME_DIGITS = 6  # decimals of a millimetre to which two places on the board agree that are one corner
 FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1}
 """First guesses of the σ that are estimated."""
 LEAST_SIGMA = {kind: {"px": 1e-6, "rad": 1e-8, "mm": 1e-5}[kind.rpartition("_")[2]] for kind in FIRST}
@@ -47,8 +51,7 @@ ADJUST_ROUNDS, ROUGHLY = 20, 1e-6
 """Rounds of σ, and relative fall of the cost below which the minimisation within a round ends."""
 INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
 """Steps from the solution of all poses to one without some; damping of directions that nothing determines."""
-SEEN = 1e-3
-"""Share of the robot's variance below which the corners tell nothing about the robot's error."""
+SEEN = 1e-3  # share of the robot's variance below which the corners tell nothing about the robot's error
 WORST = "check the poses that fit worst"
 
 
@@ -97,13 +100,157 @@ def resected(names: tuple[str, ...], views: Views, board: Reprojection) -> Poses
     return resect(Views(board.camera, seen), names)[0]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """The unknowns: X, Z, true base_from_flange (m), corners (K, 3), camera, and scale."""
+
+    mount_from_camera: Rigid
+    stand_from_board: Rigid
+    base_from_flange: Poses
+    corners: np.ndarray
+    camera: Camera
+    scale: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """The measurements and their precision: n corners in m views of a board with K corners.
+
+    ``loop`` : the m poses, as reported; ``xyz_board`` : (K, 3) as designed; ``view``, ``corner`` : (n,) view and corner
+    of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``sigma`` : σ of each kind, 0
+    where exact; ``basis`` : (16, q) of the intrinsics solved for; ``information`` : (q, q) of them about ``camera``, to
+    be divided by the squares of the factors; ``with_scale``.
+    """
+
+    loop: Loop
+    xyz_board: np.ndarray
+    view: np.ndarray
+    corner: np.ndarray
+    xy_px: np.ndarray
+    weight: np.ndarray
+    sigma: dict[str, float]
+    camera: Camera
+    basis: np.ndarray
+    information: np.ndarray
+    with_scale: bool
+
+    @property
+    def robot(self) -> np.ndarray | None:
+        """Whitening (m, 6, 6) of the robot's errors by their covariances, in place of σ; None where not stated."""
+        stated = self.loop.robot_covariance
+        return None if stated is None else np.linalg.inv(np.linalg.cholesky(stated))
+
+    def problem(self) -> Adjustment:
+        """Returns the adjustment: X, Z, the scale, and what else has a σ."""
+        a, one, true = Adjustment(sigma=dict(self.sigma)), Poses.of([Rigid()]), Poses.of([Rigid()] * len(self.loop))
+        on: list[tuple[Block, np.ndarray | None]] = [(a.block("x", one), None), (a.block("z", one), None)]
+        on.append((a.block("scale", Vector(np.ones((1, 1))), fixed=[] if self.with_scale else [0]), None))
+        if self.basis.shape[1]:
+            on.append((a.block("camera", Vector(np.zeros((1, self.basis.shape[1])))), None))
+            for name, rows in camera_parts(self.basis, self.information):
+                root = np.linalg.cholesky(self.information[np.ix_(rows, rows)]).T
+                off = partial(lambda root, rows, own: own.array[:, rows] @ root.T, root, rows)
+                a.factor(off, on[-1:], kind=name)
+        if (root := self.robot) is not None or self.sigma["robot_mm"]:
+            on.append((a.block("robot", true), self.view))
+            by_itself, each = np.tile(np.eye(6), (len(true), 1, 1)), [(on[-1][0], np.arange(len(true)))]
+            root, kind = (by_itself, [name for name in ROBOT for _ in "xyz"]) if root is None else (root, "")
+            a.factor(lambda own: own.difference(true), each, 1.0, lambda own: [by_itself], root, kind, loss=Huber(POSE))
+        if self.sigma["board_mm"]:
+            board = a.block("board", Vector(self.xyz_board), eliminate=True)
+            on.append((board, self.corner))
+            every, apart = np.arange(len(self.xyz_board)), np.tile(np.eye(3), (len(self.xyz_board), 1, 1))
+            a.factor(
+                lambda own: own.array - self.xyz_board, [(board, every)], 1.0, lambda own: [apart], kind="board_mm"
+            )
+        names = [block.name for block, _ in on]
+
+        def residuals(*own: Any) -> np.ndarray:
+            return self.residuals(self.bundle(dict(zip(names, own, strict=True))))
+
+        def slopes(*own: Any) -> list[np.ndarray]:
+            by = self.slopes(self.bundle(dict(zip(names, own, strict=True))))
+            return [by[name] for name in names]
+
+        a.factor(residuals, on, derivatives=slopes, root=self.weight, kind="corner_px", loss=Huber(CORNER))
+        return a
+
+    def start(self, first: LoopState) -> dict[str, Any]:
+        x, z, scale = first
+        given = {"x": Poses.of([x]), "z": Poses.of([z]), "scale": Vector(np.full((1, 1), scale))}
+        return {block.name: block.start for block in self.problem().blocks} | given
+
+    def bundle(self, values: Mapping[str, Any]) -> Bundle:
+        """Returns the unknowns, those that are not solved for included."""
+        flange, camera = self.loop.base_from_flange, self.camera
+        if "robot" in values:
+            off = values["robot"]
+            flange = Poses(off.rotation @ flange.rotation, off.translation + flange.translation)
+        if "camera" in values:
+            camera = camera.with_parameters(camera.parameters() + self.basis @ values["camera"].array[0])
+        corners = values["board"].array if "board" in values else self.xyz_board
+        x, z = values["x"][0], values["z"][0]
+        return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]))
+
+    def _placed(self, state: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns of each measured corner its place (n, 3) in the frames of the stand, the mount and the camera."""
+        x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
+        hand = hand if self.loop.inverted else hand.inverse()
+        stand = state.scale * state.corners[self.corner] @ z.rotation.T + z.translation
+        mount = np.einsum("nab,nb->na", hand.rotation[self.view], stand) + hand.translation[self.view]
+        return stand, mount, (mount - x.translation) @ x.rotation
+
+    def residuals(self, state: Bundle) -> np.ndarray:
+        """Returns projected minus measured corners (n, 2), px; NaN behind the camera."""
+        return state.camera.project(self._placed(state)[2]) - self.xy_px
+
+    def slopes(self, state: Bundle) -> dict[str, np.ndarray]:
+        """Returns the derivatives (n, 2, ·) of :meth:`residuals` by each kind of unknown."""
+        x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
+        stand, mount, xyz_camera = self._placed(state)
+        turn, place = hand.rotation[self.view], hand.translation[self.view]
+        if self.loop.inverted:  # the flange is the stand, the base is the mount
+            mount_from_stand = turn
+            by_hand = by_pose(np.broadcast_to(np.eye(3), turn.shape), mount - place)
+        else:
+            mount_from_stand = np.swapaxes(turn, 1, 2)
+            by_hand = -by_pose(mount_from_stand, stand - place)
+        by_mount = state.camera.projection_jacobian(xyz_camera) @ x.rotation.T
+        by_stand = by_mount @ mount_from_stand
+        of_board = stand - z.translation
+        return {
+            "x": -by_pose(by_mount, mount - x.translation),
+            "z": by_pose(by_stand, of_board),
+            "camera": state.camera.parameter_jacobian(xyz_camera[:, :2] / xyz_camera[:, 2:]) @ self.basis,
+            "scale": np.einsum("nab,nb->na", by_stand, of_board / state.scale)[:, :, None],
+            "board": state.scale * by_stand @ z.rotation,
+            "robot": by_mount @ by_hand,
+        }
+
+    def only(self, keep: np.ndarray) -> "Corners":
+        """Returns the problem of the poses ``keep``, a mask (m,)."""
+        rows = np.flatnonzero(keep[self.view])
+        same = {name: getattr(self, name)[rows] for name in ("corner", "xy_px", "weight")}
+        return replace(self, loop=self.loop[keep], view=(np.cumsum(keep) - 1)[self.view[rows]], **same)
+
+    def factors(self) -> dict[str, float]:
+        """Returns a factor of 1 for each kind of the intrinsics solved for."""
+        return dict.fromkeys((name for name, _ in camera_parts(self.basis, self.information)), 1.0)
+
+
+def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Returns names and rows of the intrinsics with a factor on their prior σ: by kind, or all if they are correlated.
+    ``basis`` : (16, q) of the intrinsics; ``information`` : (q, q)."""
+    first = basis.argmax(0)
+    if np.count_nonzero(information - np.diag(np.diag(information))):
+        return [("camera_all", np.arange(len(first)))]
+    kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
+    parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
+    return [(name, rows) for name, rows in parts if len(rows)]
+
+
 def problem(
-    loop: Loop,
-    base_from_flange: Poses,
-    views: Views,
-    noise: Noise,
-    intrinsics: CameraPrior | None = None,
-    with_scale: bool = False,
+    loop: Loop, views: Views, noise: Noise, intrinsics: CameraPrior | None = None, with_scale: bool = False
 ) -> tuple[Corners, tuple[str, ...]]:
     """Returns the problem, and the groups whose σ are to be estimated, from :data:`FIRST`."""
     seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
@@ -113,47 +260,16 @@ def problem(
     free = [name for name, value in stated.items() if value is None]
     if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of them only: tiny σ there
         sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
-    robot = None
     if loop.robot_covariance is not None:
-        robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))
         free = [name for name in free if not name.startswith("robot")]
     basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
     information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
-    corners = Corners(
-        inverted=loop.inverted,
-        base_from_flange=base_from_flange,
-        xyz_board=designed,
-        view=np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
-        corner=corner.ravel(),
-        xy_px=np.concatenate([view.xy_px for view in views.views]),
-        weight=np.concatenate([view.whitening() for view in views.views]),
-        robot=robot,
-        sigma=sigma,
-        camera=views.camera,
-        basis=basis,
-        information=information,
-        with_scale=with_scale,
-    )
+    view = np.repeat(np.arange(len(views)), [len(each) for each in views.views])
+    xy_px = np.concatenate([each.xy_px for each in views.views])
+    measured = view, corner.ravel(), xy_px, np.concatenate([each.whitening() for each in views.views])
+    corners = Corners(loop, designed, *measured, sigma, views.camera, basis, information, with_scale)
     factors = corners.factors()
     return replace(corners, sigma=sigma | factors), (*free, *factors)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraError:
-    """``slope`` : (12, q) derivative of the gradient of X and Z by the intrinsics; ``moment`` : (q, q) second moment of
-    the intrinsics' error about zero, from the prior and from the corners; ``noise`` : (12, 12) covariance of the
-    gradient by all other errors, None where it equals the normal matrix. With the scale among the unknowns, 13 replaces
-    12."""
-
-    slope: np.ndarray
-    moment: np.ndarray
-    noise: np.ndarray | None = None
-
-    def covariance(self, inverse: np.ndarray) -> np.ndarray:
-        """Returns the covariance (12, 12) of X and Z, given their inverse normal matrix (12, 12)."""
-        moved = inverse @ self.slope
-        without_camera = inverse if self.noise is None else inverse @ self.noise @ inverse
-        return without_camera + moved @ self.moment @ moved.T
 
 
 def adjust(corners: Corners, values: dict[str, Any], free: tuple[str, ...]) -> tuple[Corners, Solution, bool]:
@@ -183,61 +299,32 @@ def estimated(corners: Corners, solution: Solution, free: tuple[str, ...]) -> di
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(present, best, strict=True)}
 
 
-def considered(wider: Corners, values: dict[str, Any], free: tuple[str, ...]) -> CameraError:
-    """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``: they are
-    *considered* (Schmidt 1966; Bierman 1977, ch. VIII), that is, their prior covariance is carried through. ``free`` σ,
-    too large by the camera's error, are estimated again with them, linear about the state."""
-    values = values | {"camera": Vector(np.zeros((1, wider.basis.shape[1])))}
-    factors, linear = wider.factors(), wider.problem().at(values)
-    sigma = wider.sigma | estimated(wider, linear, (*free, *factors))
-    again = replace(wider, sigma=sigma).problem().at(values)
-    covariance = generalised_inverse(again.normal)
-    camera = np.arange(covariance.shape[0])[linear.places["camera"]]
-    error = covariance[camera] @ again.right
-    # What each kind of observation tells, in units of the σ that weighted the solution.
-    kinds = {kind for factor in linear.problem.factors for kind in factor.kinds} - set(factors)
-    told = {kind: linear.equations((kind,)).told(linear.reduction.from_kept) for kind in kinds}
-    normal = np.sum(list(told.values()), axis=0)
-    scattered = sum((sigma[kind] / wider.sigma[kind]) ** 2 * own if kind in free else own for kind, own in told.items())
-    others = np.setdiff1d(np.arange(len(normal)), camera)
-    poses, eliminated = others[:UNKNOWNS], others[UNKNOWNS:]
-    reduced = np.zeros((UNKNOWNS, len(normal)))
-    reduced[:, poses] = np.eye(UNKNOWNS)
-    inverse = generalised_inverse(normal[np.ix_(eliminated, eliminated)])
-    reduced[:, eliminated] = -normal[np.ix_(poses, eliminated)] @ inverse
-    second_moment = covariance[np.ix_(camera, camera)] + np.outer(error, error)
-    return CameraError(reduced @ normal[:, camera], second_moment, reduced @ scattered @ reduced.T)
-
-
-def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior) -> CameraError:
-    """Returns the error of intrinsics as filed, by which the board's poses were computed from ``views``."""
+def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior, inverse: np.ndarray) -> np.ndarray:
+    """Returns the covariance (k, k) that intrinsics as filed, by which the board's poses were computed from ``views``,
+    add to the ``inverse`` normal matrix (k, k) of X, Z (and the scale)."""
     basis = intrinsic_basis(prior.colmap_model)
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
     for view, pose in zip(views.views, loop.camera_from_board, strict=True):
-        white, by_pose = whitened(view, views.camera, pose)
+        white, by_board = whitened(view, views.camera, pose)
         point = pose @ view.xyz_board
         by_own = view.whitening() @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis
         by_own = by_own.reshape(-1, q)
-        slopes.append(-np.linalg.lstsq(by_pose, by_own)[0])
-        reduced = by_own + by_pose @ slopes[-1]
+        slopes.append(-np.linalg.lstsq(by_board, by_own)[0])
+        reduced = by_own + by_board @ slopes[-1]
         information += reduced.T @ reduced
         gradient += reduced.T @ white
         cost += float(white @ white)
     gain = float(gradient @ generalised_inverse(information) @ gradient)
     redundancy = 2 * views.corners() - 6 * len(views) - q
     variance = (cost - gain) / redundancy if redundancy > 0 else 1.0
-    second_moment = moment(information / variance, gradient / variance, basis, prior)
-    return CameraError(_slope(loop, solution, np.array(slopes)), second_moment)
+    moved = inverse @ slope(loop, solution, np.array(slopes))
+    return moved @ moment(information / variance, gradient / variance, basis, prior) @ moved.T
 
 
-def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraError:
-    """Returns the effect of errors (m, 6, k) that the board's poses have in common; they were weighed by the others."""
-    return CameraError(_slope(loop, solution, common), np.eye(common.shape[2]))
-
-
-def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
-    """Returns the derivative (12, q), or (13, q) with the scale, of the gradient, from the board's poses (m, 6, q)."""
+def slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
+    """Returns the derivative (k, q) of the gradient of X, Z (and the scale) by what moves the board's poses (m, 6, q),
+    which were weighed by their other errors."""
     used = np.flatnonzero(~solution.outliers)
     x, _, scale = solution.state
     jacobian, moves = loop.jacobian(x, scale, len(solution.normal)), loop.by_camera(x, scale) @ by_unknown
@@ -266,30 +353,26 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, pri
     return second
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class AdjustedCorners:
     """An adjustment of corners.
 
     ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses,
-    ``solution`` : its solution, ``state`` : the same as what is sought; ``covariance`` : (12, 12) of X and Z;
-    ``camera_error`` : error of the intrinsics as filed, which it does not hold, where their prior is known;
-    ``estimated`` : kinds whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its σ;
-    ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for; ``settled`` : whether σ settled.
+    ``solution`` : its solution; ``inverse`` : covariance of its kept unknowns; ``estimated`` : kinds whose σ were
+    estimated; ``settled`` : whether σ settled.
     """
 
     loop: Loop
     used: np.ndarray
     corners: Corners
     solution: Solution
-    state: Bundle
-    covariance: np.ndarray
-    camera_error: CameraError | None
-    sigma_scale: float | None
+    inverse: np.ndarray
     estimated: tuple[str, ...]
-    scale_hint: tuple[float, float]
-    camera_gain: float
-    found: Reprojection
     settled: bool
+
+    @cached_property
+    def state(self) -> Bundle:
+        return self.corners.bundle(self.solution.values)
 
     @property
     def sigma(self) -> dict[str, float]:
@@ -297,13 +380,74 @@ class AdjustedCorners:
         return {name: float(value) for name, value in self.corners.sigma.items() if value}
 
     @property
+    def sigma_scale(self) -> float | None:
+        """σ of the scale, if it was solved for."""
+        at = self.solution.places["scale"]
+        return float(np.sqrt(self.inverse[at, at].item())) if self.corners.with_scale else None
+
+    @property
     def outliers(self) -> np.ndarray:
-        """The poses (m,) that were not used."""
         return ~self.used
+
+    @cached_property
+    def found(self) -> Reprojection:
+        state, corners, at = self.state, self.corners, self.solution.places.get("camera")
+        true, rows = list(self.loop.base_from_flange), np.flatnonzero(self.used)
+        for row, pose in zip(rows, state.base_from_flange, strict=True):
+            true[row] = pose
+        covariance, seen = None if at is None else self.inverse[at, at], (rows[corners.view], corners.corner)
+        board = corners.xyz_board, state.scale * state.corners
+        return Reprojection(state.camera, covariance, Poses.of(true), *board, *seen, corners.residuals(state))
+
+    @property
+    def scale_hint(self) -> tuple[float, float]:
+        """The scale, one step from the solution, if it were solved for, and its σ."""
+        wider = replace(self.corners, with_scale=True).problem().at(self.solution.values)
+        inverse, at = generalised_inverse(wider.normal), wider.places["scale"].start
+        return self.state.scale + float(inverse[at] @ wider.right), float(np.sqrt(inverse[at, at]))
+
+    def camera_gain(self) -> float:
+        """Returns the fall of the cost per intrinsic if these were solved for by one step: 1 if the camera is right."""
+        _, wider = self._with_intrinsics(*UNKNOWN_LENS)
+        gain = float(wider.right @ generalised_inverse(wider.normal) @ wider.right) + wider.reduction.gain
+        return gain / UNKNOWN_LENS[0].shape[1]
+
+    def considering(self, prior: CameraPrior, inverse: np.ndarray) -> np.ndarray:
+        """Returns the covariance (12, 12) of X and Z with the errors of the intrinsics as filed, which are *considered*
+        (Schmidt 1966; Bierman 1977, ch. VIII): their ``prior`` covariance is carried through. Estimated σ, too large by
+        the camera's error, are estimated again with them, linear about the state. ``inverse`` : without them."""
+        lens = intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
+        free, (wider, linear) = self.estimated, self._with_intrinsics(*lens)
+        factors = wider.factors()
+        sigma = wider.sigma | estimated(wider, linear, (*free, *factors))
+        again = replace(wider, sigma=sigma).problem().at(linear.values)
+        covariance = generalised_inverse(again.normal)
+        camera = np.arange(len(covariance))[linear.places["camera"]]
+        error = covariance[camera] @ again.right
+        # What each kind of observation tells, in units of the σ that weighted the solution.
+        kinds = {kind for factor in linear.problem.factors for kind in factor.kinds} - set(factors)
+        told = {kind: linear.equations((kind,)).told(linear.reduction.from_kept) for kind in kinds}
+        normal = np.sum(list(told.values()), axis=0)
+        share = {kind: (sigma[kind] / wider.sigma[kind]) ** 2 if kind in free else 1.0 for kind in kinds}
+        scattered = sum(share[kind] * own for kind, own in told.items())
+        eliminated = np.setdiff1d(np.arange(UNKNOWNS, len(normal)), camera)
+        reduced = np.eye(UNKNOWNS, len(normal))
+        held = generalised_inverse(normal[np.ix_(eliminated, eliminated)])
+        reduced[:, eliminated] = -normal[:UNKNOWNS, eliminated] @ held
+        second_moment = covariance[np.ix_(camera, camera)] + np.outer(error, error)
+        moved = inverse @ reduced  # X and Z by the gradient of all other unknowns
+        by_camera = moved @ normal[:, camera]
+        return moved @ scattered @ moved.T + by_camera @ second_moment @ by_camera.T
+
+    def _with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> tuple[Corners, Solution]:
+        """Returns the problem with intrinsics among the unknowns, factors of their σ at 1, and it about the state."""
+        wider = replace(self.corners, basis=basis, information=information)
+        wider = replace(wider, sigma=wider.sigma | wider.factors())
+        return wider, wider.problem().at(self.solution.values | {"camera": Vector(np.zeros((1, basis.shape[1])))})
 
     def normal(self) -> np.ndarray:
         """Returns the normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
-        normal, k = self.solution.normal, len(self.covariance)
+        normal, k = self.solution.normal, UNKNOWNS
         return normal[:k, :k] - normal[:k, k:] @ generalised_inverse(normal[k:, k:]) @ normal[k:, :k]
 
     def without(self, out: np.ndarray) -> Bundle:
@@ -322,22 +466,14 @@ class AdjustedCorners:
 
 
 def adjust_views(
-    loop: Loop,
-    base_from_flange: Poses,
-    views: Views,
-    first: LoopState,
-    noise: Noise,
-    intrinsics: CameraPrior | None = None,
-    with_scale: bool = False,
-    camera: CameraPrior | None = None,
+    loop: Loop, views: Views, first: LoopState, noise: Noise, intrinsics: CameraPrior | None, with_scale: bool
 ) -> AdjustedCorners:
     """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
 
     ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
     their σ, the true poses of the robot and the true places of the board's corners. Intrinsics about ``intrinsics``
-    (whose σ are widened where the corners contradict them) and the board's scale are unknowns on demand. Errors of
-    intrinsics that are not solved for are considered by their prior, ``camera``. Corners and poses have Huber's
-    weights; poses that contradict the others are then left out.
+    (whose σ are widened where the corners contradict them) and the board's scale are unknowns on demand. Corners and
+    poses have Huber's weights; poses that contradict the others are then left out.
 
     Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
     """
@@ -348,52 +484,25 @@ def adjust_views(
             said = f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
             said += "belong together, and the conventions of both"
             raise DegenerateError("E-HANDEYE-DISAGREE", said)
-        corners, free = problem(loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
-        corners, solution, settled = adjust(corners, corners.start(*first), free)
+        corners, free = problem(loop[rows], views[rows], noise, intrinsics, with_scale)
+        corners, solution, settled = adjust(corners, corners.start(first), free)
         inverse = generalised_inverse(solution.normal)
         bad = contradicting(corners, solution, inverse)
         if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
             break
         used[rows[bad]] = False
         good -= int(bad.sum())
-    state = corners.bundle(solution.values)
-    values, camera_error, gain = solution.values, None, 1.0
-    if intrinsics is None:
-        if camera is not None:
-            known = intrinsic_basis(camera.colmap_model), np.linalg.inv(camera.covariance)
-            camera_error = considered(corners.with_intrinsics(*known), values, free)
-        # By one step from the solution; about 1 where the camera is right.
-        wider, unknown = corners.with_intrinsics(*UNKNOWN_LENS), UNKNOWN_LENS[0].shape[1]
-        step = wider.problem().at(values | {"camera": Vector(np.zeros((1, unknown)))})
-        gain = (float(step.right @ generalised_inverse(step.normal) @ step.right) + step.reduction.gain) / unknown
-    covariance, true = {name: inverse[at, at] for name, at in solution.places.items()}, list(base_from_flange)
-    for row, pose in zip(rows, state.base_from_flange, strict=True):
-        true[row] = pose
-    found = Reprojection(
-        state.camera,
-        covariance.get("camera"),
-        Poses.of(true),
-        corners.xyz_board,
-        state.scale * state.corners,
-        rows[corners.view],
-        corners.corner,
-        corners.residuals(state),
-    )
-    sigma_scale = float(np.sqrt(covariance["scale"].item())) if with_scale else None
-    hint, of_loop = _scale_hint(corners, values), inverse[:UNKNOWNS, :UNKNOWNS]
-    more = (camera_error, sigma_scale, free, hint, gain, found, settled)
-    return AdjustedCorners(loop, used, corners, solution, state, of_loop, *more)
+    return AdjustedCorners(loop, used, corners, solution, inverse, free, settled)
 
 
 def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> np.ndarray:
     """Returns which poses (m,) have a robot error that is not by chance, by the variance of its estimate."""
-    m, at = len(corners.base_from_flange), solution.places.get("robot")
+    m, at = len(corners.loop), solution.places.get("robot")
     if at is None:
         return np.zeros(m, bool)
-    weight = corners.robot
-    if weight is None:
+    if (weight := corners.robot) is None:
         weight = np.tile(np.diag(1 / np.repeat([corners.sigma[name] for name in ROBOT], 3)), (m, 1, 1))
-    white = np.einsum("mab,mb->ma", weight, errors(solution.values["robot"]))
+    white = np.einsum("mab,mb->ma", weight, solution.values["robot"].difference(Poses.of([Rigid()] * m)))
     covariance = inverse[at, at].reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
     # For Gaussian knowledge δ ~ N(0, Σ) with posterior covariance C, the estimate of δ scatters by Σ − C.
     value, vector = np.linalg.eigh(np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2))
@@ -401,14 +510,6 @@ def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> 
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
     redundancy = max(6 * (m - 1) - at.start + (not corners.with_scale), 6)
     return squared > 6 * fdtri(6, redundancy, 1 - FALSE_ALARM / m)
-
-
-def _scale_hint(corners: Corners, values: dict[str, Any]) -> tuple[float, float]:
-    """Returns the scale, one step from the solution, if it were solved for, and its σ."""
-    wider = replace(corners, with_scale=True).problem().at(values)
-    inverse, at = generalised_inverse(wider.normal), wider.places["scale"].start
-    step = float(inverse[at] @ wider.right)
-    return float(values["scale"].array[0, 0]) + step, float(np.sqrt(inverse[at, at]))
 
 
 def _near(loop: Loop, first: LoopState) -> np.ndarray:

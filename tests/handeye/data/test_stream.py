@@ -46,17 +46,19 @@ def test_samples_in_any_order_and_at_both_ends():
 
 def test_what_is_taken_is_said():
     times = np.concatenate([EVERY[:100], EVERY[120:]])
-    taken = taken_at(stream(times), np.array([0.05, 1.234, 4.96, 5.4, -0.015, 9.98, 12.0]))
-    assert taken.kept.tolist() == [True, True, True, False, True, False, False]
+    taken = taken_at(stream(times), np.array([0.05, 1.234, 4.96, 5.4, -0.015, 9.98, 12.0]), "abcdefg")
+    assert taken.rows == [0, 1, 2, 4]
+    why = dict(taken.left_out)
+    assert list(why) == ["d", "f", "g"]
     for part in ("7 times in 180 samples of robot.csv", "1 at a sample", "1 interpolated", "2 by the nearest sample"):
         assert part in taken.said
     assert "3 left out" in taken.said
-    assert taken.why[3] == (
+    assert why["d"] == (
         "in a gap of 1.05 s of robot.csv, 0.25 s allowed; the nearest sample is 0.45 s away, 0.02 s allowed "
         "(--time-tolerance)"
     )
-    assert taken.why[5] == "0.03 s after the samples of robot.csv, 0.02 s allowed (--time-tolerance)"
-    assert taken_at(stream(times), np.array([5.4]), 0.5).kept.all()
+    assert why["f"] == "0.03 s after the samples of robot.csv, 0.02 s allowed (--time-tolerance)"
+    assert taken_at(stream(times), np.array([5.4]), "d", 0.5).rows == [0]
     nearest = taken.base_from_flange[3]
     assert np.abs(Poses.of([nearest]).difference(trajectory(np.zeros(1), PHASE))).max() < 1e-12
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
-from stcal.handeye.data.pose_pairs import SETUPS, Loop
+from stcal.handeye.data.pose_pairs import SETUPS, Loop, LoopState
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from tests.outcome import refuses
@@ -27,9 +27,9 @@ def test_derivatives_of_the_corners(setup):
     truth = simulated_views(np.random.default_rng(5), 4, setup)
     loop = Loop.of(truth.pairs, setup)
     noise = Noise(1e-3, 0.5, corner_px=0.2, board_mm=0.1)
-    flange = truth.pairs.base_from_flange
-    corners, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
-    adjustment, values = corners.problem(), corners.start(truth.mount_from_camera, truth.stand_from_board, 1.0)
+    corners, _ = problem(loop, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
+    adjustment = corners.problem()
+    values = corners.start(LoopState(truth.mount_from_camera, truth.stand_from_board))
     kinds = {kind for factor in adjustment.factors for kind in factor.kinds}
     camera = {f"camera_{kind}" for kind in ("focal", "centre", "radial", "tangential")}
     assert kinds == {"corner_px", "board_mm", "robot_rad", "robot_mm"} | camera
