@@ -20,8 +20,7 @@ from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.robot.axes.axes_model import robot_from_sweeps
-from stcal.robot.identification.adjustment import jacobian as jacobian_of
-from stcal.robot.identification.adjustment import observed, residuals
+from stcal.robot.identification.adjustment import observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.forward import forward, jacobian
@@ -244,8 +243,8 @@ def squared_error(found: Identified, arm: Arm, q: np.ndarray) -> float:
     """eᵀC⁻¹e over its degrees of freedom, of all parameters that such poses tell of the arm."""
     poses, m = arm.poses(q), len(q)
     exact = observed(Measurements("truth", range(m), q, ("",) * m, poses.translation, poses.rotation))
-    slope = jacobian_of(found.state, exact).reshape(6 * m, -1)
-    error = np.linalg.lstsq(slope, residuals(found.state, exact).ravel())[0]
+    slope = found.state.jacobian(exact).reshape(6 * m, -1)
+    error = np.linalg.lstsq(slope, found.state.residuals(exact).ravel())[0]
     return float(error @ np.linalg.solve(found.covariance, error)) / len(error)
 
 

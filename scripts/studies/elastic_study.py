@@ -17,7 +17,7 @@ import numpy as np
 
 from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
+from stcal.robot.identification.adjustment import State, observed, parameter_units
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import Deviations, NominalRows
 from stcal.robot.identification.result import IdentifyOptions
@@ -66,11 +66,11 @@ def draw(case: Case, seed: int) -> tuple[bool, np.ndarray, float]:
     q = joint_vectors(true, NEW_POSES, rng)
     found = {model: identify(mh80(), data, IdentifyOptions(model=model, folds=0)) for model in ("rigid", "elastic")}
     found["auto"] = identify(mh80(), data, IdentifyOptions(model="auto", repeats=1))
-    real = tips(State(true.chain(), dict(true.tools)), q, TARGETS).translation
-    off = {model: tips(each.state, q, TARGETS).translation - real for model, each in found.items()}
+    real = State(true.chain(), dict(true.tools)).tips(q, TARGETS).translation
+    off = {model: each.state.tips(q, TARGETS).translation - real for model, each in found.items()}
     squares = [(each**2).sum(1).mean() for each in off.values()]
     best = found["elastic"]
-    place = tip_jacobian(best.state, q, TARGETS, best.seen.kind)[1][:, 3:]
+    place = best.state.tip_jacobian(q, TARGETS, best.seen.kind)[1][:, 3:]
     variances = np.einsum("rik,kl,ril->ri", place, best.adjustment.spread.covariance(), place)
     squares.append(possible(true, data, case, q))
     return found["auto"].model == "elastic", np.array(squares), (off["elastic"] ** 2 / variances).mean()
@@ -80,7 +80,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray) -> floa
     """Mean square error, mm², of the best estimate: σ known, linear about the true arm."""
     state = State(true.chain(), dict(true.tools), elastic=bool(case.share))
     seen = observed(data)
-    derivative = jacobian(state, seen)
+    derivative = state.jacobian(seen)
     rows = NominalRows.about(state, parameter_units(derivative), mh80(), carried=data.conditions.loaded)
     usual = Deviations()
     known = replace(
@@ -95,7 +95,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray) -> floa
     normal = white.T @ white + held.T @ held
     units = 1 / np.sqrt(np.diag(normal))  # by what is seen and held of each: moments span ten decades of others
     covariance = np.linalg.pinv(normal * units[:, None] * units, hermitian=True) * units[:, None] * units
-    place = tip_jacobian(state, q, TARGETS, seen.kind)[1][:, 3:]
+    place = state.tip_jacobian(q, TARGETS, seen.kind)[1][:, 3:]
     return float(np.einsum("rik,kl,ril->r", place, covariance, place).mean())
 
 

@@ -33,7 +33,6 @@ from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Poses, skew
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.io.cameras.read import load_camera
-from stcal.robot.identification.adjustment import tip_jacobian
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.measurements import read_measurements
@@ -185,7 +184,7 @@ def of_use(draws: int) -> None:
                 ends = []
                 for own in parts:
                     found = identify(robot, data[own], IdentifyOptions(kind, folds=0, partial=True))
-                    at, motion = tip_jacobian(found.state, data.q, data.targets, found.seen.kind)
+                    at, motion = found.state.tip_jacobian(data.q, data.targets, found.seen.kind)
                     motion = motion[:, 3:, : len(found.names)]
                     ends.append((at.translation, motion @ found.covariance @ np.swapaxes(motion, 1, 2)))
                 off, covariance = ends[0][0] - ends[1][0], ends[0][1] + ends[1][1]

@@ -18,7 +18,7 @@ import numpy as np
 
 from scripts.runner import executor_of, script
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
+from stcal.robot.identification.adjustment import Observed, State, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.inverse import inverse
@@ -126,7 +126,7 @@ def own_covariances(rng: np.random.Generator, q: np.ndarray) -> np.ndarray:
 
 def distances(true: Robot, q: np.ndarray, rng: np.random.Generator) -> Measurements:
     """Of every position from one of the first four (of these, from the first), as a telescopic bar gives them."""
-    tip = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q)).translation
+    tip = State(true.chain(), dict(true.tools)).tips(q, ("",) * len(q)).translation
     start = np.where(np.arange(len(q)) < 4, 0, np.arange(len(q)) % 4)
     length = np.linalg.norm(tip - tip[start], axis=1) + rng.normal(0, SIGMA_MM, len(q)) * (start != np.arange(len(q)))
     return Measurements("simulated", range(2, len(q) + 2), q, ("",) * len(q), distances=length, from_row=start)
@@ -145,8 +145,8 @@ def errors(case: Case, seed: int) -> tuple[float, float]:
 def predicted(case: Case, found: Identified, true: Robot, rng: np.random.Generator) -> float:
     """Mean of eᵀC⁻¹e over its width at new joint vectors."""
     exact = without_noise(case, true, NEW_POSES, rng, found.seen.used)
-    error = residuals(found.state, exact)[:, -3:]
-    slope = jacobian(found.state, exact)[:, -3:]
+    error = found.state.residuals(exact)[:, -3:]
+    slope = found.state.jacobian(exact)[:, -3:]
     covariance = slope @ found.covariance @ np.swapaxes(slope, 1, 2)
     return float(np.mean(np.einsum("ri,rij,rj->r", error, np.linalg.inv(covariance), error))) / error.shape[1]
 
@@ -155,10 +155,10 @@ def parameters(case: Case, found: Identified, true: Robot, rng: np.random.Genera
     """eᵀC⁻¹e over the degrees of freedom, e being the errors of all combinations of parameters that such observations
     tell, from what they tell of the true arm."""
     exact = without_noise(case, true, 200, rng, found.seen.kind)
-    slope, sigma = jacobian(found.state, exact), np.maximum(np.sqrt(np.diag(found.covariance)), 1e-12)
+    slope, sigma = found.state.jacobian(exact), np.maximum(np.sqrt(np.diag(found.covariance)), 1e-12)
     freedom = len(sigma) - 6 * (found.seen.kind == "distance") - len(found.undetermined)
     u, s, vt = np.linalg.svd(slope.reshape(-1, len(sigma)) * sigma, full_matrices=False)
-    error = u[:, :freedom].T @ residuals(found.state, exact).ravel() / s[:freedom]
+    error = u[:, :freedom].T @ found.state.residuals(exact).ravel() / s[:freedom]
     covariance = vt[:freedom] @ (found.covariance / sigma[:, None] / sigma) @ vt[:freedom].T
     return float(error @ np.linalg.solve(covariance, error)) / freedom
 
@@ -166,7 +166,7 @@ def parameters(case: Case, found: Identified, true: Robot, rng: np.random.Genera
 def without_noise(case: Case, true: Robot, count: int, rng: np.random.Generator, kind: str) -> Observed:
     """What a perfect instrument sees at new joint vectors."""
     q, targets = drawn(case, count, rng)
-    tip = tips(State(true.chain(), dict(true.tools)), q, targets)
+    tip = State(true.chain(), dict(true.tools)).tips(q, targets)
     data = Measurements("", range(len(q)), q, targets, tip.translation, tip.rotation)
     if kind != "distance":
         return observed(in_stations(data) if case.which == STATIONS else data, kind)

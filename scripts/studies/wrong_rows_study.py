@@ -15,7 +15,7 @@ import numpy as np
 
 from scripts.runner import executor_of, head, row, script
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, observed, residuals, tips
+from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements
@@ -94,13 +94,13 @@ def without(data: Measurements, bad: np.ndarray) -> Measurements:
 def error(found: Identified, true: Robot, seed: int) -> float:
     """RMS error of positions (of distances from the first, where these were measured) at new joint vectors, mm."""
     q = joint_vectors(true, NEW_POSES, np.random.default_rng([seed]))
-    tip = tips(State(true.chain(), dict(true.tools)), q, ("",) * len(q)).translation
+    tip = State(true.chain(), dict(true.tools)).tips(q, ("",) * len(q)).translation
     exact = Measurements("", range(len(q)), q, ("",) * len(q), tip)
     if found.seen.kind == "distance":
         apart, start = np.linalg.norm(tip - tip[0], axis=1), np.zeros(len(q), int)
         exact = replace(exact, positions=None, distances=apart, from_row=start)
     kind = "distance" if found.seen.kind == "distance" else "position"
-    return float(np.sqrt((residuals(found.state, observed(exact, kind)) ** 2).sum(1).mean()))
+    return float(np.sqrt((found.state.residuals(observed(exact, kind)) ** 2).sum(1).mean()))
 
 
 @script(draws=200, only="", scheduler=str, limited=True)

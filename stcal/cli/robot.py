@@ -1,6 +1,7 @@
 """Commands of robots."""
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -71,10 +72,8 @@ def convert(
         tool = robot.tools.get("")
         if tool is not None and max(*map(abs, tool.translation.tolist()), tool.angle_rad()) > 1e-6:
             at = ", ".join(f"{value:.4g}" for value in tool.translation)
-            say(
-                f"note: {urdf.to_link} is not the frame of the last row but [tool] of the robot file: {at} mm from it, "
-                f"turned by {math.degrees(tool.angle_rad()):.4g}°"
-            )
+            place = f"{at} mm from it, turned by {math.degrees(tool.angle_rad()):.4g}°"
+            say(f"note: {urdf.to_link} is not the frame of the last row but [tool] of the robot file: {place}")
     else:
         if convention != "standard":
             raise InputError("E-OPTION-NEEDS", "--convention: only for reading a URDF; leave it out")
@@ -83,10 +82,8 @@ def convert(
         ends = f"flange, and {tools}" if robot.tree is None else f"{tools} on branches"
         say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
         if coupled(robot):
-            say(
-                "note: URDF has no coupling; its joint values are the coupling times the controller's, with wider "
-                "limits"
-            )
+            meant = "its joint values are the coupling times the controller's, with wider limits"
+            say(f"note: URDF has no coupling; {meant}")
     if to_xml:
         write(out, robot_urdf(robot))
         require_urdf_written(out, robot)
@@ -179,13 +176,12 @@ def _length(text: str, data: "Measurements") -> float | None:
 
 
 Model = Literal["rigid", "elastic", "auto"]  # model of the arm
+DataFile = Annotated[Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")]
 
 
 def identify(
     robot_file: shared.RobotFile,
-    data_file: Annotated[
-        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
-    ] = None,
+    data_file: DataFile = None,
     out: Annotated[Path | None, "Write the identified robot to this file (TOML).", WRITES] = None,
     offsets: Annotated[
         Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
@@ -254,9 +250,7 @@ def evaluate(
     robot_files: Annotated[
         list[Path], "Read a robot from this file (TOML); repeat it for more robots.", Opt("--robot")
     ],
-    data_file: Annotated[
-        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
-    ] = None,
+    data_file: DataFile = None,
     refit: Annotated[
         Literal["none", "base", "tool", "base-tool"],
         "Fit this to the data, keeping each robot's own axes; everything else comes from its file.",
@@ -276,9 +270,8 @@ def evaluate(
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
     source = joined.table(data_file, "DATA", quaternions=quaternions)
-    data = [  # within reach of each
-        read_measurements(source, robot, quaternions, payload_kg=payload_kg) for robot in robots.values()
-    ]
+    read = partial(read_measurements, source, quaternions=quaternions, payload_kg=payload_kg)
+    data = [read(robot) for robot in robots.values()]  # within reach of each
     result = evaluated(robots, data[0], refit)
     document = shown.evaluation_report(result)
     say(document.text())
@@ -378,9 +371,8 @@ def design(
     from stcal.robot.robot_report import design_report
     from stcal.robot.use import pose_design as pose_design
 
-    options = pose_design.DesignOptions(
-        count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
-    )
+    inside = _box(box) if box else None
+    options = pose_design.DesignOptions(count, seed, observe, candidates, sigma_mm, sigma_rad, inside, target)
     robot = load_robot(robot_file)
     result = pose_design.design(robot, options)
     document = design_report(result, robot)

@@ -29,10 +29,8 @@ from stcal.robot.kinematics.robot_model import Chain, Convention, DHRow, Joint, 
 
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
 """Names of links; other tools are ``tool_NAME``."""
-UNLIMITED = 1e6
-"""Value in rad or m beyond which a limit counts as unlimited; URDF cannot state only one of two limits."""
-PLACED_BY = {"origin": ("xyz", "rpy"), "axis": ("xyz",)}
-"""Elements of a joint that place it, and their attributes."""
+UNLIMITED = 1e6  # value in rad or m beyond which a limit counts as unlimited; URDF cannot state only one of two limits
+PLACED_BY = {"origin": ("xyz", "rpy"), "axis": ("xyz",)}  # elements of a joint that place it, and their attributes
 MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 SAME_MM, SAME_RAD = 1e-9, 1e-12
 """Largest difference between the poses of the Denavit–Hartenberg rows and those of the joints as read."""
@@ -81,6 +79,11 @@ class UrdfJoint:
         """True if it is not fixed."""
         return self.kind != "fixed"
 
+    @property
+    def unit(self) -> float:
+        """Of its value in the file, in mm or rad."""
+        return METRE_MM if self.kind == "prismatic" else 1.0
+
 
 @require_arguments
 def load_urdf(
@@ -119,17 +122,14 @@ def load_urdf(
         if name and name not in links:
             raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {few(links)}")
     for joint in joints.values():
-        far = float(np.linalg.norm(joint.parent_from_child.translation))
-        if far > MOST_LINK_MM:
-            raise InputError(
-                "E-LENGTH-UNIT",
-                f"{where}: joint {joint.name}: origin {far / METRE_MM:g} m from its parent, up to "
-                f"{MOST_LINK_MM / METRE_MM:g} possible: URDF is in metres; divide lengths in mm by 1000",
-            )
+        far, most = (mm / METRE_MM for mm in (np.linalg.norm(joint.parent_from_child.translation), MOST_LINK_MM))
+        if far > most:
+            fault = f"{where}: joint {joint.name}: origin {far:g} m from its parent, up to {most:g} possible"
+            raise InputError("E-LENGTH-UNIT", f"{fault}: URDF is in metres; divide lengths in mm by 1000")
     roots = [link for link in links if link not in joints]
     if not from_link and len(roots) != 1:
-        said = f"{len(roots)} links are no joint's child; one root needed, or --from-link"
-        raise InputError("E-URDF-LINKS", f"{where}: {said}")
+        fault = f"{where}: {len(roots)} links are no joint's child"
+        raise InputError("E-URDF-LINKS", f"{fault}; one root needed, or --from-link")
     start = from_link or roots[0]
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
@@ -150,11 +150,8 @@ def require_near(found: Poses, wanted: Poses) -> None:
     off = np.abs(found.difference(wanted)).max(axis=0)
     far = max(SAME_MM, 1e-12 * float(np.abs(wanted.translation).max()))
     if off[3:].max() > far or off[:3].max() > SAME_RAD:
-        raise StcalError(
-            "E-ROBOT-READ-BACK",
-            f"URDF: the rows lead elsewhere, by {off[3:].max():.2g} mm and {off[:3].max():.2g} rad; {far:.2g} mm and "
-            f"{SAME_RAD:g} rad allowed",
-        )
+        fault = f"URDF: the rows lead elsewhere, by {off[3:].max():.2g} mm and {off[:3].max():.2g} rad"
+        raise StcalError("E-ROBOT-READ-BACK", f"{fault}; {far:.2g} mm and {SAME_RAD:g} rad allowed")
 
 
 def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
@@ -180,7 +177,7 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
     joints, n, placed = [], len(moving), Poses.of(gaps)
     for each in moving:
         kind, (low, high) = MOVING[each.kind], each.limit or (-np.inf, np.inf)
-        most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
+        most = UNLIMITED * each.unit
         joints.append(Joint(kind, low if low > -most else -np.inf, high if high < most else np.inf))
     sliding = np.array([joint.type == "prismatic" for joint in joints])
     ends, tree = (*(Rigid(),) * (n - 1), flange), None if "" in paths else Tree(mounts, carriers)
@@ -243,12 +240,11 @@ def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     length = float(np.linalg.norm(axis))
     if not length > 1e-9:
         raise wrong("its axis has no direction; correct it")
-    limit = None
+    limit, unit = None, METRE_MM if kind == "prismatic" else 1.0
     if "limit" in parts and kind != "continuous":
         low, high = numbers(" ".join(parts["limit"].get(end, "0") for end in ("lower", "upper")), 2).tolist()
         if low > high:
             raise wrong(f"lower limit {low:g} is above upper {high:g}; swap or correct them", "E-URDF-LIMITS")
-        unit = METRE_MM if kind == "prismatic" else 1.0
         limit = (low * unit, high * unit) if low < high else None
     pose = Rigid(from_roll_pitch_yaw(turn), METRE_MM * place)
     return UrdfJoint(name, kind, parent, child, pose, axis / length, limit, parts.get("mimic", {}).get("joint", ""))
@@ -293,13 +289,13 @@ def _path(joints: dict[str, UrdfJoint], start: str, end: str, where: str) -> lis
     at = end
     while at != start:
         if at not in joints:
-            said = f"no joints lead from link {start} to the tool; other --from-link, --to-link needed"
-            raise InputError("E-URDF-LINKS", f"{where}: {said}")
+            fault = f"{where}: no joints lead from link {start} to the tool"
+            raise InputError("E-URDF-LINKS", f"{fault}; other --from-link, --to-link needed")
         path.insert(0, joints[at])
         at = path[0].parent
     if not any(joint.moves for joint in path):
-        said = f"no joint from {start} to {end} moves; other --from-link or --to-link needed"
-        raise InputError("E-URDF-LINKS", f"{where}: {said}")
+        fault = f"{where}: no joint from {start} to {end} moves"
+        raise InputError("E-URDF-LINKS", f"{fault}; other --from-link or --to-link needed")
     for joint in path:
         reason = f"mimics {joint.mimics}; joints of their own needed" if joint.mimics else ""
         if joint.kind not in MOVING:
@@ -322,11 +318,9 @@ def robot_urdf(robot: Robot) -> str:
         if not name.isprintable():
             raise InputError("E-ROBOT-NAME", f"robot: name {name!r} has control characters; give a name in letters")
     if robot.elasticity is not None:
-        raise InputError(
-            "E-ROBOT-ELASTICITY",
-            f"robot {robot.name}: a URDF cannot hold its elasticity; remove [elasticity] for the axes alone, or "
-            "export compensated points (`stcal robot compensate --export`)",
-        )
+        fault = f"robot {robot.name}: a URDF cannot hold its elasticity; remove [elasticity] for the axes alone"
+        other = "export compensated points (`stcal robot compensate --export`)"
+        raise InputError("E-ROBOT-ELASTICITY", f"{fault}, or {other}")
     chain = replace(robot, world_from_base=Rigid()).chain()
     root = ElementTree.Element("robot", name=robot.name)
     root.append(ElementTree.Comment(" effort and velocity are not known: 0 "))
@@ -402,12 +396,10 @@ def require_urdf_written(path: str | Path, robot: Robot) -> None:
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 JOINTS, NAME = 6, "ur"
-LEAST_OFF_MM = 1e-3
-"""A micrometre: what angles of few digits round off."""
+LEAST_OFF_MM = 1e-3  # a micrometre: what angles of few digits round off
 DELTAS = {"theta": 1.0, "a": METRE_MM, "d": METRE_MM, "alpha": 1.0}
 """Dimensions that a controller corrects, with the factors of their units."""
-_DELTA = re.compile(r"^\s*delta_(theta|a|d|alpha)\s*=", re.MULTILINE)
-"""A key of a calibration.conf."""
+_DELTA = re.compile(r"^\s*delta_(theta|a|d|alpha)\s*=", re.MULTILINE)  # a key of a calibration.conf
 _LIST = re.compile(r"^\s*(?P<key>\w+)\s*=\s*\[(?P<values>[^\]]*)\]", re.MULTILINE)
 Number = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 
@@ -439,16 +431,14 @@ def _of_kinematics(content: dict, where: str, convention: Convention) -> Univers
     held = content["kinematics"]
     if isinstance(held, Mapping):  # the hash of the robot stands among the links
         if missing := [name for name in LINKS if name not in held]:
-            raise InputError(
-                "E-KEY-MISSING",
-                f"{where}: kinematics without {', '.join(missing)}; an arm of Universal Robots has six links, "
-                f"{', '.join(LINKS)}: extract its calibration anew with ur_calibration, or copy the whole file",
-            )
+            fault = f"{where}: kinematics without {', '.join(missing)}"
+            needed = f"an arm of Universal Robots has six links, {', '.join(LINKS)}"
+            remedy = "extract its calibration anew with ur_calibration, or copy the whole file"
+            raise InputError("E-KEY-MISSING", f"{fault}; {needed}: {remedy}")
         content = {**content, "kinematics": {name: held[name] for name in LINKS}}
     joints, flange, as_urdf, z = [], Rigid(), Rigid(), np.array([0.0, 0.0, 1.0])
-    for parent, (name, link) in zip(
-        ("base", *LINKS), validated(content, _UrFile, where).kinematics.items(), strict=False
-    ):
+    links = validated(content, _UrFile, where).kinematics
+    for parent, (name, link) in zip(("base", *LINKS), links.items(), strict=False):
         place, angles = METRE_MM * np.array([link.x, link.y, link.z]), [link.roll, link.pitch, link.yaw]
         pose = Rigid(Rotation.from_euler("XYZ", angles), place)
         flange, as_urdf = flange @ pose, as_urdf @ Rigid(from_roll_pitch_yaw(angles), place)
@@ -475,30 +465,22 @@ def _of_conf(text: str, where: str, nominal: Robot | None, convention: Conventio
         except ValueError:
             values = np.zeros(0)
         if values.shape != (JOINTS,) or not np.isfinite(values).all():
-            said = f"{where}: {key}: a list of six numbers needed; give the controller's file"
-            raise InputError("E-ROBOT-ENTRIES", said)
+            fault = f"{where}: {key}: a list of six numbers needed"
+            raise InputError("E-ROBOT-ENTRIES", f"{fault}; give the controller's file")
         return values
 
     deltas = {name: unit * six(f"delta_{name}") for name, unit in DELTAS.items()}
     joints = (Joint(),) * JOINTS if nominal is None else nominal.joints
     if all(name in lists for name in ("a", "d", "alpha")):
-        columns = METRE_MM * six("a"), six("alpha"), METRE_MM * six("d")
-        rows = tuple(
-            DHRow(a, alpha, d, 0.0) for a, alpha, d in zip(*(column.tolist() for column in columns), strict=True)
-        )
-        arm = Robot(NAME, "standard", rows, joints, unusual_size=True)
+        table = np.column_stack([METRE_MM * six("a"), six("alpha"), METRE_MM * six("d"), np.zeros(JOINTS)])
+        arm = Robot(NAME, "standard", tuple(DHRow(*row) for row in table.tolist()), joints, unusual_size=True)
     elif nominal is None:
-        raise InputError(
-            "E-ROBOT-NOMINAL",
-            f"{where}: deviations from a nominal arm, which it does not state; give --nominal robot.toml with the rows "
-            "of the model, or add [DH] with a, d and alpha of urcontrol.conf",
-        )
+        remedy = "give --nominal robot.toml with the rows of the model"
+        fault = f"{where}: deviations from a nominal arm, which it does not state; {remedy}"
+        raise InputError("E-ROBOT-NOMINAL", f"{fault}, or add [DH] with a, d and alpha of urcontrol.conf")
     elif len(nominal.rows) != JOINTS or nominal.convention != "standard" or nominal.prismatic.any():
-        raise InputError(
-            "E-ROBOT-NOMINAL",
-            f"{where}: --nominal: {len(nominal.rows)} joints, convention {nominal.convention}; six that turn, "
-            "standard, needed",
-        )
+        fault = f"{where}: --nominal: {len(nominal.rows)} joints, convention {nominal.convention}"
+        raise InputError("E-ROBOT-NOMINAL", f"{fault}; six that turn, standard, needed")
     else:
         arm = nominal
     corrected = tuple(
@@ -526,10 +508,8 @@ def load_universal(
     """
     found = read_universal(Path(path), nominal, convention)
     if found is None:
-        raise InputError(
-            "E-ROBOT-FORM",
-            f"robot {path}: no calibration of Universal Robots; ur_calibration's YAML needed, or its calibration.conf",
-        )
+        fault = f"robot {path}: no calibration of Universal Robots"
+        raise InputError("E-ROBOT-FORM", f"{fault}; ur_calibration's YAML needed, or its calibration.conf")
     return found
 
 

@@ -23,7 +23,7 @@ from stcal.report.document import (
 )
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
-from stcal.robot.identification.adjustment import MEANING, Observed, State, as_seen, tips_of
+from stcal.robot.identification.adjustment import MEANING, Observed, State
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS
 from stcal.robot.identification.result import ERRORS, Identified
@@ -33,26 +33,20 @@ from stcal.robot.kinematics.robot_model import Robot
 
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 MDEG = 1000 * 180 / np.pi
-DEVIATIONS = (
-    " mm in lengths",
-    " in twists",
-    " in zero positions",
-    " by gravity about axes",
-    " across them",
-    " by gears",
-    " by hysteresis",
-)
-"""What each σ of :class:`Deviations` is of."""
+DEVIATIONS = (" mm in lengths", " in twists", " in zero positions")
+DEVIATIONS += (" by gravity about axes", " across them", " by gears", " by hysteresis")  # of each σ of `Deviations`
 
 
 def identified_report(result: Identified) -> Document:
     """Returns the report of ``identify``."""
     seen = result.seen
     kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
+    names = ERRORS
+    if result.held_out:
+        names = ERRORS | {"held_out": f"{ERRORS['held_out']}, {result.held_out.folds} folds"}
     errors = [
-        [f"{ERRORS[key]}{folds}", *(number(v, 4) for v in (each.mean, each.rms, each.max))]
+        [names[key], *(number(value, 4) for value in (each.mean, each.rms, each.max))]
         for key, each in result.errors.items()
-        for folds in (f", {result.held_out.folds} folds" if key == "held_out" and result.held_out else "",)
     ]
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
     indices = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
@@ -60,11 +54,9 @@ def identified_report(result: Identified) -> Document:
     gain, model = result.gain, "model: elastic" if result.model == "elastic" else ""
     if gain is not None:
         less, beyond = "less" if gain.gain_mm > 0 else "more", "" if gain.beyond_chance else "not "
-        model = (
-            f"model: {result.model}; rows held out err by {gain.rigid_mm:.3g} mm RMS of a rigid arm and "
-            f"{gain.elastic_mm:.3g} of an elastic one, {abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, "
-            f"{beyond}beyond chance"
-        )
+        errs = f"{gain.rigid_mm:.3g} mm RMS of a rigid arm and {gain.elastic_mm:.3g} of an elastic one"
+        by = f"{abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, {beyond}beyond chance"
+        model = f"model: {result.model}; rows held out err by {errs}, {by}"
     adjusted = f"adjusted: base, tools and {(rows.free & ~rows.fixed).sum()} of {rows.free.sum()} dimensions"
     accuracy = [
         _noise(result),
@@ -89,23 +81,18 @@ def identified_report(result: Identified) -> Document:
         listed("kept nominal, as the data do not determine it", result.undetermined),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
-    drawn = result.state, seen, result.residuals, result.weights >= GROSS
+    drawn = result.state, seen, result.residuals, result.weights >= GROSS, result.left or ()
+    weak = Table(["<Where", "error mm", "weight"], outliers)
+    data = f"{len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from {seen.data.where}"
     return Document(
         f"{result.nominal.name}: identified",
-        f"robot {result.nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
-        f"{seen.data.where}, {result.rank} parameters determined",
+        f"robot {result.nominal.name}: {data}, {result.rank} parameters determined",
         [
             Section("Accuracy", accuracy, terminal=True),
             Section("Denavit–Hartenberg rows", rows, terminal=True),
             Section("What the data determine", determined, terminal=True),
-            Section(
-                "What the model leaves",
-                [*left_lines(result.left), residual_plot(*drawn, result.left or ())],
-                name="left",
-            ),
-            Section(
-                "Outliers, of less than half weight", [Table(["<Where", "error mm", "weight"], outliers)], terminal=True
-            ),
+            Section("What the model leaves", [*left_lines(result.left), residual_plot(*drawn)], name="left"),
+            Section("Outliers, of less than half weight", [weak], terminal=True),
         ],
         [_verdict(result)],
     )
@@ -164,11 +151,10 @@ def _elastic_blocks(result: Identified) -> list[Block]:
 
 def placed_table(placed: Iterable[PlacedFrame]) -> Table:
     """Returns value ± σ of translation, mm, and rotation vector, deg, of base and tools; no σ where none is known."""
-    rows = []
+    rows, unit = [], np.repeat([np.degrees(1.0), 1.0], 3)
     for each in placed:
-        values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
-        sigma = np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
-        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(values, sigma, strict=True))
+        pairs = zip(np.roll(each.pose.log() * unit, 3), np.roll(each.sigma * unit, 3), strict=True)
+        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in pairs)
         rows.append([each.name, *cells])
     over = [("", 1), ("translation ± σ", 3), ("rotation vector ± σ about the axes", 3)]
     return Table(["<", "x mm", "y mm", "z mm", "x °", "y °", "z °"], rows, over)
@@ -207,11 +193,11 @@ def _noise(result: Identified) -> str:
 
 
 def _place(result: Identified, row: int) -> str:
-    seen = result.seen
+    seen, lines = result.seen, result.seen.data.lines
     if seen.kind == "distance":
-        return f"lines {seen.data.lines[seen.second[row]]} – {seen.data.lines[seen.first[row]]}"
+        return f"lines {lines[seen.second[row]]} – {lines[seen.first[row]]}"
     target = seen.data.targets[row]
-    return f"line {seen.data.lines[row]}" + (f", target {target}" if target else "")
+    return f"line {lines[row]}" + (f", target {target}" if target else "")
 
 
 HEAD = ("joint", "parameter", "nominal", "identified", "difference", "sigma", "unit", "determined")
@@ -246,24 +232,20 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
     str : CSV in mm and degrees, with σ (form: ``data_layout.md``).
     """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
-    unit = np.where(nominal.prismatic, 1.0, np.degrees(1.0))
     change, change_sigma, known = zeros(result, nominal)
+    unit, of_zeros = np.where(nominal.prismatic, "mm", "deg"), (nominal.shown * change, nominal.shown * change_sigma)
     rows: list[Sequence] = [HEAD]
-    for i, slides in enumerate(nominal.prismatic):
-        told = sigma[i] > 0
-        cells = [*zip(DIMENSIONS, UNITS, before[i], values[i], sigma[i], told, strict=True)]
-        of_zero = unit[i] * change[i], unit[i] * change_sigma[i], bool(known[i])
-        for name, of, old, new, deviation, yes in (*cells, (ZERO, "mm" if slides else "deg", 0.0, *of_zero)):
+    for i, (*zero, told) in enumerate(zip(*of_zeros, known, strict=True)):
+        cells = [*zip(DIMENSIONS, UNITS, before[i], values[i], sigma[i], sigma[i] > 0, strict=True)]
+        for name, of, old, new, deviation, yes in (*cells, (ZERO, unit[i], 0.0, *zero, told)):
             shown = [fixed(v, DIGITS[of]) for v in (old, new, new - old)]
             text = fixed(deviation, DIGITS[of]) if yes else ""
             rows.append([i + 1, name, *shown, text, of, "yes" if yes else "no"])
     return csv_text(rows)
 
 
-LEAST_MOTION = 1e-6
-"""Share of the largest motion of the tool below which a joint counts as not moving it."""
-FEW = 200
-"""Number of rows beyond which points are drawn small."""
+LEAST_MOTION = 1e-6  # share of the largest motion of the tool below which a joint counts as not moving it
+FEW = 200  # number of rows beyond which points are drawn small
 
 
 def joints_figure(
@@ -277,14 +259,14 @@ def joints_figure(
     """Returns a figure of residuals (r, w) of good rows (r,), in the world's axes, along each joint's motion by its
     value, with the findings' curves."""
     data, chain = seen.data, state.chain
-    tip = tips_of(state, data)
+    tip = state.tips_of(data)
     twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]
     values, errors = data.q @ chain.coupling.T, residuals[:, -3:]
     across = min(len(chain), 3)
     turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
     points = []
     for i, (twist, sliding) in enumerate(zip(twists, chain.prismatic, strict=True)):
-        motion = as_seen(state, seen, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
+        motion = state.as_seen(seen, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
         moves = good & (size > LEAST_MOTION * max(size.max(), 1e-300))
         along = np.einsum("rw,rw->r", motion[moves], errors[moves]) / size[moves]

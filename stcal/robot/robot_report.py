@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 from itertools import cycle
 from pathlib import Path
 
@@ -27,7 +28,8 @@ from stcal.report.svg import AXIS_COLOURS, COLOURS, DASH, INK, Axes, Drawing, co
 from stcal.report.text import NONE, number
 from stcal.robot.axes.axes_model import AxesResult
 from stcal.robot.axes.fit import called
-from stcal.robot.identification.adjustment import MEANING, tips_of
+from stcal.robot.descriptions import few
+from stcal.robot.identification.adjustment import MEANING
 from stcal.robot.identification.prior import SHOWN
 from stcal.robot.identification.result import Figures
 from stcal.robot.identified_report import left_lines, placed_table, residual_plot
@@ -180,10 +182,9 @@ def verification_report(result: Verification) -> Document:
 def compensation_report(result: Compensated) -> Document:
     """Returns the report of ``compensate``: nominal and compensated joint values of each pose."""
     robot, found, named = result.identified, result.found, any(result.targets.tools)
-    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
 
     def values(inverse: Inverse, i: int, error_mm: np.ndarray) -> list[str]:
-        shown = [number(v, 5) for v in inverse.q[i] * unit] if inverse.usable[i] else [NONE] * len(unit)
+        shown = [number(v, 5) if inverse.usable[i] else NONE for v in inverse.q[i] * robot.shown]
         return [*shown, number(error_mm[i], 4) if inverse.usable[i] or inverse is found else NONE]
 
     rows = []
@@ -193,7 +194,7 @@ def compensation_report(result: Compensated) -> Document:
         if result.nominal:
             rows.append([*[""] * len(name), "nominal", *values(result.nominal, i, result.before_mm)])
     counts = ", ".join(f"{s} {found.status.count(s)}" for s in dict.fromkeys(found.status))
-    joints = [name.replace("_", " ") for name in joint_columns(robot)]
+    joints = (name.replace("_", " ") for name in joint_columns(robot))
     heads = ["line", *(["<target"] if named else []), "<status", "<", *joints, "error mm"]
     reached, *summary = compensated_summary(result)
     answer = Answer("yes" if found.usable.all() else "part" if found.usable.any() else "no", reached)
@@ -213,15 +214,12 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
     """Returns the report of ``design``: indices of the chosen poses against random ones, places, joint values."""
     sigma_sentence = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
     if np.isfinite(result.random_sigma_mm):
-        sigma_sentence += (
-            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good, these would have to be "
-            f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
-        )
+        times = f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
+        of_random = f"of random poses {1000 * result.random_sigma_mm:.1f} µm"
+        sigma_sentence += f", {of_random}; to be as good, these would have to be {times}"
     unseen = result.parameters - result.seen
-    left_out = (
-        f"{unseen} of {result.parameters} combinations of parameters move nothing that is measured, in any pose (as "
-        "with a tool on the last axis), and are left out"
-    )
+    still = f"{unseen} of {result.parameters} combinations of parameters move nothing that is measured"
+    left_out = f"{still}, in any pose (as with a tool on the last axis), and are left out"
     indices, median = [], result.median()
     for name, value in result.chosen.values().items():
         every = [each.values()[name] for each in result.random]
@@ -233,7 +231,6 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
         [str(i), *(number(float(v), 3) for v in (*joint_cells(robot, q), *pose.translation))]
         for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1)
     ]
-    joints = [name.replace("_", " ") for name in joint_columns(robot)]
     against = [
         sigma_sentence,
         left_out if unseen else "",
@@ -244,6 +241,7 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
         ),
         "collisions are not checked: only joint limits and the box of the tool",
     ]
+    joints = (name.replace("_", " ") for name in joint_columns(robot))
     chosen = Table(["pose", *joints, "x mm", "y mm", "z mm"], poses)
     return Document(
         f"Measurement poses for {robot.name}",
@@ -255,27 +253,22 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
     )
 
 
-MOST_NOTES = 500
-"""Largest number of notes on single poses on a page."""
-MOST_WRONG = 10
-"""Largest number of wrong rows that are named in the terminal."""
-FAR_APART = 5
-"""Ratio of robots' median errors above which the axis is logarithmic."""
+MOST_NOTES = 500  # largest number of notes on single poses on a page
+MOST_WRONG = 10  # largest number of wrong rows that are named in the terminal
+FAR_APART = 5  # ratio of robots' median errors above which the axis is logarithmic
 FITTED = {
     "none": "base and tool as the files have them",
     "base": "base fitted, tool as the files have it",
     "tool": "tool fitted, base as the files have it",
     "base-tool": "base and tool fitted by each robot's own axes",
 }
-FIGURES = ("mean", "median", "rms", "p95", "max")
 HEADS = ("rows", "mean", "median", "RMS", "95 %", "max")
 
 
 def names_of(files: Sequence[Path]) -> list[str]:
     """Returns names of robots by their files. An identified robot keeps the name of the nominal one."""
     stems, whole = [file.stem for file in files], [str(file) for file in files]
-    again = next((name for name in whole if whole.count(name) > 1), "")
-    if again:
+    for again in (name for name in whole if whole.count(name) > 1):
         raise InputError("E-OPTION-REPEATED", f"--robot {again}: given twice; give each file once")
     return stems if len(set(stems)) == len(stems) else whole
 
@@ -287,10 +280,11 @@ def _errors(result: Evaluation) -> Table:
     for each in result.robots:
         parts = {"": np.ones_like(each.good)} | ({", without unexplained": each.good} if result.wrong.any() else {})
         for said, taken in parts.items():
-            figures = Figures.of(each.errors_mm[taken])
-            cells = [each.name + said, str(figures.rows), *(number(getattr(figures, f), 4) for f in FIGURES)]
-            rotation = Figures.of(np.degrees(each.rotation_rad[taken])) if turned else None
-            rows.append(cells + ([number(rotation.rms, 4), number(rotation.max, 4)] if rotation else []))
+            count, *figures = astuple(Figures.of(each.errors_mm[taken]))
+            if turned:
+                rotation = Figures.of(np.degrees(each.rotation_rad[taken]))
+                figures += [rotation.rms, rotation.max]
+            rows.append([each.name + said, str(count), *(number(value, 4) for value in figures)])
     return Table(heads, rows)
 
 
@@ -306,16 +300,12 @@ def _verdicts(result: Evaluation) -> list[str]:
     if result.best and len(result.robots) > 2:
         found.append(f"best: {result.best}")
     least = np.min([each.errors_mm for each in result.robots], axis=0)
-    at = np.flatnonzero(result.wrong)
-    at = at[np.argsort(-least[at])].tolist()
+    at = sorted(np.flatnonzero(result.wrong).tolist(), key=lambda row: -least[row])
     if at:
-        named = ", ".join(f"line {result.lines[i]} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG])
-        more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
+        named = few([f"line {result.lines[i]} ({least[i]:.3g} mm)" for i in at], MOST_WRONG)
         fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
-        found.append(
-            f"rows that no robot explains (the least error that any of them leaves): {named}{more}{fitted}; the rows "
-            "are wrong, or all models lack something"
-        )
+        which = f"rows that no robot explains (the least error that any of them leaves): {named}{fitted}"
+        found.append(f"{which}; the rows are wrong, or all models lack something")
     return found
 
 
@@ -359,7 +349,7 @@ def evaluated_csv(result: Evaluation) -> str:
         residuals[seen] = each.residuals
         if data.positions is not None:
             place = "commanded" if len(robots) == 1 else name
-            columns += places(f"{place}_{{}}_mm", tips_of(each.state, data).translation)
+            columns += places(f"{place}_{{}}_mm", each.state.tips_of(data).translation)
             columns += places(f"{name}_residual_{{}}_mm", residuals)
         else:
             columns.append((f"{name}_residual_mm", cells(residuals[:, 0])))

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, tips
+from stcal.robot.identification.adjustment import State
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot
 
@@ -17,10 +16,10 @@ from stcal.robot.kinematics.robot_model import USUAL, Conditions, Robot
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:
     """Returns the robot as made: axes shifted and tilted, zero positions off, by normal errors of these σ."""
     chain = robot.chain()
-    kinds = chain_parameters(chain)
+    kinds = chain.parameters()
     step = np.array([rng.normal(0, sigma_rad if c < 3 else sigma_mm) for _, c in kinds])
     step[: sum(i == 0 for i, _ in kinds)] = 0  # the first axis defines the base
-    shifted = robot_from_chain(moved_chain(chain, step), robot.tools, robot)
+    shifted = robot_from_chain(chain.moved(step), robot.tools, robot)
     rows = [shifted.rows[0]]
     rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in shifted.rows[1:]]
     return replace(shifted, rows=tuple(rows), tools=dict(robot.tools), unusual_size=True)
@@ -56,7 +55,7 @@ def measured(
     are of tool ``""``, or of each row's ``targets``, and under the rows' ``conditions``.
     """
     targets = tuple(targets) or ("",) * len(q)
-    tip = tips(State(robot.chain(), dict(robot.tools)), q, targets, conditions)
+    tip = State(robot.chain(), dict(robot.tools)).tips(q, targets, conditions)
     noise = rng.normal(0, 1, (len(q), 6))
     if covariance is None:
         noise = noise * np.repeat([sigma_rad, sigma_mm], 3)

@@ -129,15 +129,10 @@ def story(result: FromPhotos) -> list[str]:
             f"rows {rms(predicted.here_mm):.2g} mm RMS"
         )
     if len(moved):
-        most = zip(_shown(result, np.abs(moved).max(axis=0)), result.nominal.prismatic, strict=True)
+        most = zip(np.abs(moved).max(axis=0) * result.nominal.shown, result.nominal.prismatic, strict=True)
         motions = ", ".join(f"{v:.4f} mm" if slides else f"{v:.4f}°" for v, slides in most)
         sentences.append(f"joints move by up to {motions}")
     return sentences
-
-
-def _shown(result: FromPhotos, values: np.ndarray) -> np.ndarray:
-    """Returns joint values (…, n) in degrees or mm."""
-    return np.where(result.nominal.prismatic, values, np.degrees(values))
 
 
 def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
@@ -154,7 +149,7 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         for name, entry in result.errors.items()
     ]
     if compensated is not None:
-        values = np.column_stack([compensated.before_mm, result.sigma_mm(), _shown(result, result.moves())])
+        values = np.column_stack([compensated.before_mm, result.sigma_mm(), result.moves() * result.nominal.shown])
         rows = zip(compensated.targets.lines, compensated.found.status, values.tolist(), strict=True)
         targets = [[str(line), status, *(number(v, 4) for v in row)] for line, status, row in rows]
     joints = [f"J{i}, {'mm' if slides else '°'}" for i, slides in enumerate(result.nominal.prismatic, 1)]
@@ -304,9 +299,8 @@ def from_measured(
     models = {DRAWING: nominal} if axes is None else {DRAWING: nominal, AXES: axes.robot}
     evaluation = evaluate(models, data)
     good = ~evaluation.wrong
-    errors = {each.name: each.good_mm for each in evaluation.robots} | {
-        SAME_ROWS: Figures.of(identified.fitted_mm[good])
-    }
+    errors = {each.name: each.good_mm for each in evaluation.robots}
+    errors[SAME_ROWS] = Figures.of(identified.fitted_mm[good])
     if identified.held_out is not None:
         name = f"identified, {identified.held_out.folds} folds held out"
         errors[name] = Figures.of(identified.held_out.position_mm[:, good])

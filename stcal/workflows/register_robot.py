@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import length_limit
 from stcal.io.table import Table, read_table
@@ -21,7 +21,7 @@ from stcal.register.registration import Liu2017Options
 from stcal.register.registration_report import error_table, matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
-from stcal.robot.identification.adjustment import State, tips
+from stcal.robot.identification.adjustment import State
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_conditions, targets_of
@@ -121,13 +121,10 @@ def register_with_robot(
         registration = findings(pairs, registration)
     found, data = registration, _measurements(pairs, joints, robot)
     if not len(found) == len(data) == len(pairs):
-        raise InputError(
-            "E-ARRAY-SHAPE",
-            f"{pairs.where}: {len(pairs)} point pairs, a registration of {len(found)}, {len(data)} joint vectors; as "
-            "many of each needed",
-        )
-    options: dict[str, Any] = {"model": found.model, "method": found.method, "seed": found.seed}
-    options |= {"threshold_mm": threshold_mm, "liu2017_options": liu2017_options}
+        given = f"{len(pairs)} point pairs, a registration of {len(found)}, {len(data)} joint vectors"
+        raise InputError("E-ARRAY-SHAPE", f"{pairs.where}: {given}; as many of each needed")
+    options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
+    options["liu2017_options"] = liu2017_options
     settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
     good = found.inliers.copy()
     if registration.field is not None:
@@ -147,7 +144,7 @@ def register_with_robot(
     parts = dealt(len(data), folds, np.random.default_rng([found.seed, 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
     nominal = positions(robot, data)
-    off_mm = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
+    off_mm = rms(np.linalg.norm(pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal, axis=1))
     wild = ~(found.inliers | used)[rows]
     return RegisteredRobot(robot, identified, found.model, pairs.lines, done, rows, by_one, by_both, wild, off_mm)
 
@@ -173,10 +170,10 @@ def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identify
     identified = identify(robot, data[good], settings)
     for _ in range(ROUNDS):
         error = np.linalg.norm(data.positions - positions(identified.robot, data), axis=1)
-        explained = good | (error < identified.weighting.sigma_mm * length_limit(3, CLEAN_SETS / len(data)))
-        if (explained == good).all():
+        before, limit = good, identified.weighting.sigma_mm * length_limit(3, CLEAN_SETS / len(data))
+        good = good | (error < limit)
+        if (good == before).all():
             break
-        good = explained
         identified = identify(robot, data[good], settings)
     used = good.copy()
     used[np.flatnonzero(good)[[row for row, _ in identified.outliers()]]] = False
@@ -186,33 +183,27 @@ def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: Identify
 def positions(robot: Robot, data: Measurements) -> np.ndarray:
     """Returns the positions (m, 3) of the targets, in the instrument's frame."""
     tools = {name: robot.tool(name if name in robot.tools else "") for name in data.targets}
-    return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
+    return State(robot.chain(), tools).tips(data.q, data.targets, data.conditions).translation
 
 
 def comparison_section(beside: RegisteredRobot) -> document.Section:
     """Returns the comparison as a section of the report."""
     outliers = f", without {beside.wild.sum()} outliers of both" if beside.wild.any() else ""
     identified, open_ones = beside.identified, beside.identified.undetermined
-    told = (
-        f"robot {beside.robot.name}: {identified.rank} of {len(identified.names)} parameters of axes, base and tool "
-        "determined, solved together from the joint values and the positions in b; the same rows are held out of both "
-        f"ways{outliers}"
-    )
+    determined = f"{identified.rank} of {len(identified.names)} parameters of axes, base and tool determined"
+    solved = "solved together from the joint values and the positions in b"
+    told = f"robot {beside.robot.name}: {determined}, {solved}; the same rows are held out of both ways{outliers}"
     ways = [(f"{beside.model} transform", beside.transform), ("base and kinematics together", beside.kinematics)]
     notes = []
     if open_ones:
         shown = ", ".join(open_ones[:FIRST_NAMES]) + ", …" * (len(open_ones) > FIRST_NAMES)
-        notes.append(
-            f"the points leave open: {shown}; b_from_base and the tool may be off along these; vary the orientation "
-            "more"
-        )
+        remedy = "b_from_base and the tool may be off along these; vary the orientation more"
+        notes.append(f"the points leave open: {shown}; {remedy}")
     if len(beside.rows) and not beside.better:
         notes.append("base and kinematics together are no better here: trust the transform near its points")
     if beside.off_mm > SAME_MM:
-        notes.append(
-            f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit: it comes from "
-            "another tool or other kinematics"
-        )
+        off = f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit"
+        notes.append(f"{off}: it comes from another tool or other kinematics")
     errors = error_table("held out, mm", ways) if len(beside.rows) else None
     matrix = matrix_table("b_from_base of the identified robot", beside.b_from_base.matrix())
     return document.Section("Base and kinematics together", [told, errors, matrix, *notes], terminal=True)

@@ -6,7 +6,6 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
-from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
@@ -28,7 +27,7 @@ def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0, heavier:
     values[known.group == MOMENT] *= heavier
     compliance, rest = np.abs(values[: 2 * n]), values[2 * n :]
     none = Elasticity(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 4)), DOWN)
-    return replace(robot, elasticity=with_values(none, np.append(compliance, rest)))
+    return replace(robot, elasticity=none.with_values(np.append(compliance, rest)))
 
 
 def seen_arm(rng: np.random.Generator, rows: int, share: float = 0.6) -> tuple[Robot, Measurements]:

@@ -44,8 +44,7 @@ USABLE_MM = 1.0
 """σ of a common normal's length or foot beyond which the Denavit–Hartenberg value is refused: arms repeat to 0.1 mm."""
 STEP_RAD, STEP_MM = 1e-7, 1e-4
 """Steps of central differences: far above rounding, and small against angles to which an axis is known."""
-EXACTLY = 1e-12
-"""Sine of the angle of two axes below which rounding alone decides where their common normal is."""
+EXACTLY = 1e-12  # sine of the angle of two axes below which rounding alone decides where their common normal is
 LIKELY, MANY = 2.0, 4
 """Factor by which a mirror may fit worse than reversed joints, and number of these from which on they are not tried."""
 LIKE_SIZE = 2.0
@@ -55,10 +54,8 @@ AGREES_RAD = np.radians(10.0)
 MOVED_SHARE = 0.5
 """Share of the squared residuals beyond which a move along the order of the rows is named: gear errors vary with the
 order too."""
-FEW = 3
-"""Largest number of outliers of a joint that are named one by one."""
-ONE_LINE_MM = 10.0
-"""Largest distance between axes that are meant to be one line, such as those of a SCARA's spindle."""
+FEW = 3  # largest number of outliers of a joint that are named one by one
+ONE_LINE_MM = 10.0  # largest distance between axes that are meant to be one line, such as those of a SCARA's spindle
 REFITTED = 200
 """Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
 
@@ -92,9 +89,7 @@ class LeaveOneOut:
     def spread(self, name: str) -> np.ndarray:
         """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""
         values = getattr(self, name)
-        known = np.isfinite(values)
-        high, low = np.where(known, values, -np.inf).max(axis=0), np.where(known, values, np.inf).min(axis=0)
-        return np.where(known.any(axis=0), high - low, np.nan)
+        return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)  # without nan, where there is any other
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -192,15 +187,11 @@ def robot_from_sweeps(
     2013.
     """
     if len(set(data.stations)) > 1:
-        raise InputError(
-            "E-STATION-SINGLE",
-            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
-        )
+        fault = f"{data.where}: stations {', '.join(data.by_station())}"
+        raise InputError("E-STATION-SINGLE", f"{fault}; sweeps are seen from one, so give one at a time")
     if nominal.tree is not None:
-        raise InputError(
-            "E-ROBOT-TREE",
-            f"robot {nominal.name} is a tree of joints; the axis method takes one arm at a time: give its file",
-        )
+        remedy = "the axis method takes one arm at a time: give its file"
+        raise InputError("E-ROBOT-TREE", f"robot {nominal.name} is a tree of joints; {remedy}")
     measured, virtual = data, None if places is None else virtual_reflectors(data, places)
     data = data if virtual is None else virtual.data
     arcs, notes = find_arcs(data, nominal, still_rad)
@@ -261,12 +252,11 @@ def _chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
 def slopes_of(frames: list[Rigid], nominal: Robot) -> np.ndarray:
     """Returns the derivative (v, p) of :func:`_values` by the parameters of the axes, each in its own frame."""
     columns = []
-    for i, sliding in enumerate(nominal.prismatic):
-        for component in (0, 1) if sliding else (0, 1, 3, 4):
-            step = STEP_RAD if component < 3 else STEP_MM
-            twists = (sign * step * np.eye(6)[component] for sign in (1, -1))
-            high, low = (_values([*frames[:i], frames[i] @ Rigid.exp(t), *frames[i + 1 :]], nominal) for t in twists)
-            columns.append((high - low) / (2 * step))
+    for i, component in _chain_through(frames, nominal).parameters():
+        step = STEP_RAD if component < 3 else STEP_MM
+        twists = (sign * step * np.eye(6)[component] for sign in (1, -1))
+        high, low = (_values([*frames[:i], frames[i] @ Rigid.exp(t), *frames[i + 1 :]], nominal) for t in twists)
+        columns.append((high - low) / (2 * step))
     return np.column_stack(columns)
 
 
@@ -312,13 +302,8 @@ def pairs_of(
         sigma = np.where(np.isfinite(value[3:]), _sigma_of(jacobian[3:], covariance), np.nan)
         numbers = np.column_stack([[*np.abs(value[3:5]), value[5]], sigma]).ravel().tolist()
         lengths: list[Any] = [number if np.isfinite(number) else None for number in numbers]
-        pair = Pair(
-            i + 1,
-            np.pi - acute if opposed else acute,
-            float(np.sqrt(max(variance, 0))),
-            bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
-            *lengths,
-        )
+        angle, parallel = np.pi - acute if opposed else acute, bool(np.sin(acute) < np.sin(PARALLEL_RAD))
+        pair = Pair(i + 1, angle, float(np.sqrt(max(variance, 0))), parallel, *lengths)
         pairs.append(replace(pair, refused=_refused(pair, acute, size)))
     return tuple(pairs)
 
@@ -329,12 +314,12 @@ def _refused(pair: Pair, acute: float, size: float) -> str:
         return ""
     if pair.normal_sigma_mm is None or pair.foot_mm is None or pair.foot_sigma_mm is None:
         return "the axes are parallel: every common normal is as good as any other"
-    foot_m, normal, foot_sigma_m = abs(pair.foot_mm) / 1e3, pair.normal_sigma_mm, pair.foot_sigma_mm / 1e3
+    foot, normal, foot_sigma = abs(pair.foot_mm), pair.normal_sigma_mm, pair.foot_sigma_mm
     reasons = []
-    if abs(pair.foot_mm) > size:
-        reasons.append(f"foot {foot_m:.4g} m away, the arm is {size / 1e3:.3g} m long")
-    if max(normal, pair.foot_sigma_mm) > USABLE_MM:
-        reasons.append(f"σ {normal:.3g} mm of a and {foot_sigma_m:.3g} m of the foot, {USABLE_MM:g} mm needed")
+    if foot > size:
+        reasons.append(f"foot {foot / 1e3:.4g} m away, the arm is {size / 1e3:.3g} m long")
+    if max(normal, foot_sigma) > USABLE_MM:
+        reasons.append(f"σ {normal:.3g} mm of a and {foot_sigma / 1e3:.3g} m of the foot, {USABLE_MM:g} mm needed")
     if reasons:
         per_urad_m = pair.distance_mm / np.sin(acute) ** 2 * 1e-9
         reasons.append(f"axes {np.degrees(acute):.4f}° apart, 1 µrad moves the foot by {per_urad_m:.3g} m")
@@ -383,33 +368,22 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
     apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
     named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
-    checks = [
-        (
-            mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best],
-            "E-AXES-MIRRORED",
-            f"the axes are the mirror image of {robot}'s: positions of a left-handed frame (or joints that count the "
-            "other way); swap two columns of x, y, z or change the sign of one",
-        ),
-        (
-            reversed_[best] < as_it_is / 2,
-            "E-AXES-SIGN",
-            f"joint {named} counts against {robot}'s; correct alpha in the robot file or the sign of its values",
-        ),
-        (
-            right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE,
-            "E-AXES-UNITS",
-            f"the axes lie {apart / (right or 1.0):.3g} times as far apart as {robot}'s; check the unit of x, y, z, "
-            "and the lengths in the robot file",
-        ),
-    ]
+    if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
+        fault = f"{where}: the axes are the mirror image of {robot}'s: positions of a left-handed frame"
+        remedy = "swap two columns of x, y, z or change the sign of one"
+        raise InputError("E-AXES-MIRRORED", f"{fault} (or joints that count the other way); {remedy}")
+    if reversed_[best] < as_it_is / 2:
+        fault = f"{where}: joint {named} counts against {robot}'s"
+        raise InputError("E-AXES-SIGN", f"{fault}; correct alpha in the robot file or the sign of its values")
+    if right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
+        fault = f"{where}: the axes lie {apart / right:.3g} times as far apart as {robot}'s"
+        raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
     angles = [np.degrees(np.arccos(np.clip((z[:-1] * z[1:]).sum(1), -1, 1))) for z in (directions, wanted)]
     for i, (angle, nominal_angle) in enumerate(zip(*angles, strict=True), 1):
-        said = f"axes of joints {i} and {i + 1} are {angle:.1f}° apart, {nominal_angle:.1f}° in {robot}; correct its "
-        said += "alpha or theta, or the sign with which a joint counts"
-        checks.append((abs(angle - nominal_angle) > np.degrees(AGREES_RAD), "E-AXES-ANGLE", said))
-    for wrong, code, said in checks:
-        if wrong:
-            raise InputError(code, f"{where}: {said}")
+        if abs(angle - nominal_angle) > np.degrees(AGREES_RAD):
+            fault = f"axes of joints {i} and {i + 1} are {angle:.1f}° apart, {nominal_angle:.1f}° in {robot}"
+            remedy = "correct its alpha or theta, or the sign with which a joint counts"
+            raise InputError("E-AXES-ANGLE", f"{where}: {fault}; {remedy}")
 
 
 def _remarks(
@@ -421,41 +395,34 @@ def _remarks(
         for fit in fits
         if not fit.settled
     ]
+
+    def at(row: int) -> str:
+        return f"line {data.lines[row]}, {called(data.targets[row])}"
+
     for fit in fits:
-        off_arc, limit = fit.off_mm, f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
-        if len(off_arc) > FEW:
-            first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
-            notes.append(
-                f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, "
-                f"{limit}; the farthest are lines {first}; all are in --json"
-            )
-            off_arc = {}
-        notes += [
-            f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
-            f"{fit.joint + 1}, {limit}"
-            for row, size in off_arc.items()
-        ]
-        notes += [
-            f"line {data.lines[arc.rows[0]]}, {called(arc.target)}: too close to the axis of joint {fit.joint + 1} to "
-            "tell of it; its arc is not used"
-            for arc in fit.near
-        ]
+        joint, off, limit = f"joint {fit.joint + 1}", fit.off_mm, f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm"
+        if len(off) > FEW:
+            first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off.items())[:FEW])
+            rows = f"{len(off)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; left out"
+            notes.append(f"{joint}: {rows}; the farthest are lines {first}; all are in --json")
+        else:
+            sizes = off.items()
+            notes += [f"{at(row)}: {size:.3g} mm off its arc about {joint}, {limit}; left out" for row, size in sizes]
+        unused = f"too close to the axis of {joint} to tell of it; its arc is not used"
+        notes += [f"{at(arc.rows[0])}: {unused}" for arc in fit.near]
     swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
     for name in dict.fromkeys(each for each in data.targets if each not in swept):
-        rows = [i for i, target in enumerate(data.targets) if target == name]
+        line, count = data.lines[data.targets.index(name)], data.targets.count(name)
         what = called(name) if name else "rows without a target, beside rows with one"
-        notes.append(
-            f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on the "
-            "flange rests on these rows alone; name it like the others, or leave it out"
-        )
+        alone = "so that its place on the flange rests on these rows alone; name it like the others, or leave it out"
+        notes.append(f"line {line}: {what}: on no arc of any joint ({count} rows), {alone}")
     for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
         after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
         one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
         if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
-            notes.append(
-                f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
-                "file: its zero position differs"
-            )
+            theta, drawn = np.degrees([row.theta, wanted.theta])
+            said = f"theta is {theta:.2f}°, {drawn:.2f}° in the robot file: its zero position differs"
+            notes.append(f"joint {i + 1}: {said}")
     moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(measured, "position"), MOVED_SHARE)
     return notes if moved is None else [*notes, moved.sentence()]
 
@@ -469,11 +436,8 @@ def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slop
         groups[key, counts[key, target]].append(row)
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
-    every = (
-        _by_influence(instants, fits, nominal, slopes)
-        if len(instants) > REFITTED
-        else _refitted(data, instants, fits, nominal)
-    )
+    many = len(instants) > REFITTED
+    every = _by_influence(instants, fits, nominal, slopes) if many else _refitted(data, instants, fits, nominal)
     values = every[:, 5 * len(fits) :].reshape(len(instants), -1, 6)
     return LeaveOneOut(tuple(int(data.lines[rows[0]]) for rows in instants), values[:, :, 3], values[:, :, 4])
 
@@ -499,8 +463,7 @@ def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit]
 def _by_influence(instants: list[list[int]], fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> np.ndarray:
     """Returns :func:`_values` (r, v) without each instant's rows, to first order."""
     number = {row: i for i, rows in enumerate(instants) for row in rows}
-    changes = []
-    for fit in fits:
-        changes.append(np.zeros((len(instants), len(fit.gain))))
-        np.add.at(changes[-1], [number[row] for row in fit.rows.tolist()], fit.influence())
+    changes = [np.zeros((len(instants), len(fit.gain))) for fit in fits]
+    for change, fit in zip(changes, fits, strict=True):
+        np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
     return _values([fit.world_from_axis for fit in fits], nominal) + np.concatenate(changes, axis=1) @ slopes.T

@@ -24,14 +24,11 @@ DISTINCT = {"revolute": 3, "prismatic": 2}
 """Number of positions that give an arc its radius and height, or a line its direction."""
 STANDS_STILL_MM = 1.0
 """Motion of a reflector below which it stands still; sweeps move it by more, unless it is on the axis."""
-GROSS = 6.0
-"""Residual, in σ, beyond which a point is left out and named: 1 in 10⁷ of normal ones."""
+GROSS = 6.0  # residual, in σ, beyond which a point is left out and named: 1 in 10⁷ of normal ones
 NEAR_AXIS = 10.0
 """Radius, in σ of a point, below which an arc is of no use: noise biases radii by σ²/2r, a twentieth of σ here."""
-ROUNDING = 1e-12
-"""Relative size of the rounding error of coordinates."""
-WEAK_RAD = 0.02
-"""σ of a direction beyond which an axis is not known; its covariance is valid for small angles only."""
+ROUNDING = 1e-12  # relative size of the rounding error of coordinates
+WEAK_RAD = 0.02  # σ of a direction beyond which an axis is not known; its covariance is valid for small angles only
 MOTION = np.radians(2.0)
 """Largest difference of the observed motion from the joint's values, or share of a sliding joint's way."""
 QUIET = 1e-3
@@ -41,10 +38,8 @@ WEIGHTS_SETTLED = 1e-3
 """Change of the weights below which they have converged; it moves an axis by less than a thousandth of its σ."""
 SINGULAR, TINY = 1e-10, 1e-300
 """Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
-FIRST_SIZE = 0.05
-"""Size of an arc, as a share of the largest, from which on it is used for the first axis."""
-SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0
-"""Distances of virtual reflectors from the target that make sense."""
+FIRST_SIZE = 0.05  # size of an arc, as a share of the largest, from which on it is used for the first axis
+SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0  # distances of virtual reflectors from the target that make sense
 SEPARATOR = " point "
 
 
@@ -64,19 +59,16 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
     Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
     """
     if data.positions is None:
-        raise InputError(
-            "E-MEASURED-DISTANCES", f"{data.where}: distances only; columns x_mm, y_mm, z_mm needed for the axis method"
-        )
+        remedy = "columns x_mm, y_mm, z_mm needed for the axis method"
+        raise InputError("E-MEASURED-DISTANCES", f"{data.where}: distances only; {remedy}")
     names = np.array(data.targets)
     for target in dict.fromkeys(data.targets):
-        points = data.points()[names == target]
+        points = data.positions[names == target]
         far = float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
         if len(points) > 1 and far < STANDS_STILL_MM:
-            raise InputError(
-                "E-TARGET-STILL",
-                f"{data.where}: {called(target)} does not move: 90 % of its {len(points)} positions lie within "
-                f"{far:.3g} mm while the joints move; a reflector on the flange, and each row's own measurement needed",
-            )
+            near = f"90 % of its {len(points)} positions lie within {far:.3g} mm while the joints move"
+            remedy = "a reflector on the flange, and each row's own measurement needed"
+            raise InputError("E-TARGET-STILL", f"{data.where}: {called(target)} does not move: {near}; {remedy}")
     kinematic = data.q @ robot.coupling.T
     still = np.where(robot.prismatic, STILL_MM, still_rad)
     same = np.column_stack([_clusters(v, s) for v, s in zip(kinematic.T, still, strict=True)])
@@ -95,19 +87,14 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
             if distinct >= least:
                 arcs.append(Arc(j, target, np.array(rows)))
             elif distinct > 1:
-                notes.append(
-                    f"joint {j + 1}, {called(target)}, line {data.lines[rows[0]]}: an arc of {distinct} positions is "
-                    f"not used, {least} needed"
-                )
+                which = f"joint {j + 1}, {called(target)}, line {data.lines[rows[0]]}"
+                notes.append(f"{which}: an arc of {distinct} positions is not used, {least} needed")
     missing = sorted(set(range(len(robot.joints))) - {arc.joint for arc in arcs})
     if missing:
         names, least = ", ".join(str(j + 1) for j in missing), DISTINCT[robot.joints[missing[0]].type]
-        raise InputError(
-            "E-AXES-NO-SWEEP",
-            f"{data.where}: joint {names} is never swept: no rows of one reflector differ in that joint "
-            f"alone, {least} or more positions needed; measure its sweep, and if the controller couples joints, give "
-            "`coupling` in the robot file",
-        )
+        lacking = f"no rows of one reflector differ in that joint alone, {least} or more positions needed"
+        remedy = "measure its sweep, and if the controller couples joints, give `coupling` in the robot file"
+        raise InputError("E-AXES-NO-SWEEP", f"{data.where}: joint {names} is never swept: {lacking}; {remedy}")
     return arcs, notes
 
 
@@ -171,9 +158,8 @@ def ring(length_mm: float) -> np.ndarray:
     """Returns places (3, 3) at ``length_mm`` about the target's origin, in its XY plane; raises InputError: a length
     out of range."""
     if not SHORTEST_MM <= length_mm <= LONGEST_MM:
-        raise InputError(
-            "E-OPTION-RANGE", f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
-        )
+        needed = f"{SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
+        raise InputError("E-OPTION-RANGE", f"--orientations {length_mm:g}: {needed}")
     angles = 2 * np.pi / 3 * np.arange(3)
     return length_mm * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
 
@@ -182,28 +168,20 @@ def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflect
     """Returns reflectors carried at ``places`` (k, 3) of a target, mm; raises InputError if there are no
     orientations."""
     if data.rotations is None or data.positions is None:
-        raise InputError(
-            "E-MEASURED-NO-ORIENTATION",
-            f"{data.where}: no orientations; columns of a rotation needed for --orientations, or leave it out",
-        )
+        remedy = "columns of a rotation needed for --orientations, or leave it out"
+        raise InputError("E-MEASURED-NO-ORIENTATION", f"{data.where}: no orientations; {remedy}")
     m, k = len(data), len(places)
     about = places - places.mean(axis=0)
     lever = about / np.sqrt((about**2).sum(axis=1).mean())
     carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
     row = np.repeat(np.arange(m), k)
-    many = data[row]
-    virtual = replace(
-        many,
-        targets=tuple(f"{target}{SEPARATOR}{n % k + 1}" for n, target in enumerate(many.targets)),
-        positions=many.points() + carried,
-        rotations=None,
-        covariance=None,
-        common=None,
-    )
+    many = replace(data, rotations=None, covariance=None, common=None)[row]
+    names = tuple(f"{target}{SEPARATOR}{n % k + 1}" for n, target in enumerate(many.targets))
+    virtual = replace(many, targets=names, positions=many.points() + carried)
     return VirtualReflectors(virtual, places, row, lever)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class AxisFit:
     """The axis of one joint, by the distances of its arcs' points from circles or lines; p is 4 or, prismatic, 2.
 
@@ -335,11 +313,8 @@ class AxisFit:
         """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint, None
         if the axis is known nearly."""
         if self.redundancy < 1:
-            raise DegenerateError(
-                "E-AXES-FEW",
-                f"{self.where}: {len(self.rows)} positions on {len(self.used)} arcs leave no redundancy; another "
-                "position or a second reflector needed",
-            )
+            few = f"{len(self.rows)} positions on {len(self.used)} arcs leave no redundancy"
+            self._undetermined(f"{few}; another position or a second reflector needed", "E-AXES-FEW")
         fit = self
         if moved is not None:  # weights before the first step, which a gross error would lead astray
             fit = self._started(moved[self.rows])
@@ -438,9 +413,8 @@ class AxisFit:
 
         def linearise(frame: Rigid) -> NormalEquations:
             fit = replace(self, world_from_axis=frame)
-            return NormalEquations.of(
-                root * fit.residuals.ravel(), root[:, None] * fit._jacobian().reshape(len(root), -1)
-            )
+            slope = fit._jacobian().reshape(len(root), -1)
+            return NormalEquations.of(root * fit.residuals.ravel(), root[:, None] * slope)
 
         def moved(frame: Rigid, step: np.ndarray) -> Rigid:
             """Returns the moved frame with its origin at the foot of the points' centroid."""
@@ -461,15 +435,12 @@ class AxisFit:
         if direction <= WEAK_RAD and place <= most_mm:
             return
         if self.size < STANDS_STILL_MM:
-            self._undetermined(
-                f"its reflectors stay within {self.size:.3g} mm of one position while its values change; check that it "
-                "moved and that each position was measured again, or put a reflector off its axis",
-                "E-AXES-STILL",
-            )
-        self._undetermined(
-            f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm, "
-            f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed; sweep further, or with reflectors farther apart"
-        )
+            fault = f"its reflectors stay within {self.size:.3g} mm of one position while its values change"
+            remedy = "check that it moved and that each position was measured again, or put a reflector off its axis"
+            self._undetermined(f"{fault}; {remedy}", "E-AXES-STILL")
+        fault = f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm"
+        needed = f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed"
+        self._undetermined(f"{fault}, {needed}; sweep further, or with reflectors farther apart")
 
     def oriented(self, moved: np.ndarray) -> "AxisFit":
         """Returns the axis with z along positive motion; refuses motion that does not match the values (m,)."""
@@ -487,13 +458,12 @@ class AxisFit:
             deviation = np.abs(np.angle(back[int(turned)] * (self.member @ arms[int(turned)]).conj()))
             near = GROSS * self.sigma_mm / np.maximum(np.abs(place), TINY)
             allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
-        wrong = np.flatnonzero((deviation > allowed) & (self.weights > 0))
-        if len(wrong):
-            raise InputError(
-                "E-AXES-JOINT-VALUES",
-                f"{self.where}: the motion seen is off its values by up to {deviation[wrong].max() * shown:.3g} "
-                f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match",
-            )
+        wrong = (deviation > allowed) & (self.weights > 0)
+        if wrong.any():
+            most = f"{deviation[wrong].max() * shown:.3g} {unit}"
+            remedy = "check the column's unit, the coupling in the robot file, and that positions and rows match"
+            fault = f"{self.where}: the motion seen is off its values by up to {most}"
+            raise InputError("E-AXES-JOINT-VALUES", f"{fault}; {remedy}")
         axis = self.world_from_axis
         if turned:
             axis = Rigid(axis.rotation * [1, -1, -1], axis.translation)
@@ -527,18 +497,9 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     def of(use: np.ndarray, start: Rigid) -> AxisFit:
         """Returns the fit to these arcs at its start, with equal weights."""
         used = tuple(arcs[i] for i in np.flatnonzero(use))
-        rows = np.concatenate([arc.rows for arc in used])
-        return AxisFit(
-            where=where,
-            prismatic=prismatic,
-            used=used,
-            rows=rows,
-            points=points[rows],
-            member=np.repeat(np.eye(len(used)), [len(arc.rows) for arc in used], axis=0),
-            size=float(size[use].max()),
-            weights=np.ones(len(rows)),
-            world_from_axis=start,
-        )
+        rows, largest = np.concatenate([arc.rows for arc in used]), float(size[use].max())
+        member = np.repeat(np.eye(len(used)), [len(arc.rows) for arc in used], axis=0)
+        return AxisFit(where, prismatic, used, rows, points[rows], member, largest, np.ones(len(rows)), start)
 
     use = size >= FIRST_SIZE * size.max()
     fit = of(use, Rigid()).solved(moved)
@@ -575,10 +536,8 @@ def fit_axes(
         by_before[own, :begin] = np.einsum("pkc,kcq->pq", fit.gain, inherited[fit.rows])
         axis, (turn, after) = fit.world_from_axis, fit.unwound(points, kinematic[:, j])
         # The unwound points change with rx, ry, tx, ty of the axis: δ = D(U x) − U(D x).
-        of_after, of_points = (
-            _motions(xyz - axis.translation, axis.rotation, fit.prismatic) for xyz in (after, points)
-        )
-        inherited = np.concatenate([turn @ inherited, of_after - turn @ of_points], axis=2)
+        before, later = (_motions(xyz - axis.translation, axis.rotation, fit.prismatic) for xyz in (points, after))
+        inherited = np.concatenate([turn @ inherited, later - turn @ before], axis=2)
         fits.append(fit)
         points, turned = after, turn @ turned
     passed = np.linalg.inv(np.eye(count) - by_before)

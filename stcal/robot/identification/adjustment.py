@@ -9,16 +9,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import TWIST
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.robot.kinematics.forward import (
-    carried_poses,
-    chain_jacobian,
-    chain_parameters,
-    elasticity_curvature,
-    elasticity_jacobian,
-    elasticity_values,
-    moved_chain,
-    with_values,
-)
+from stcal.robot.kinematics.forward import carried_poses, chain_jacobian, elasticity_curvature, elasticity_jacobian
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Robot
@@ -47,10 +38,108 @@ class State:
         """Number of parameters of the elasticity."""
         return (10 if self.hysteresis else 9) * len(self.chain) if self.elastic else 0
 
+    def of(self, data: Measurements) -> "State":
+        """Returns the state without the tools and stations that ``data`` have not; the first station stays."""
+        shown = {*data.stations, next(iter(self.stations))}
+        tools = {name: tool for name, tool in self.tools.items() if name in data.targets}
+        return replace(self, tools=tools, stations={n: each for n, each in self.stations.items() if n in shown})
+
     def seen_from(self, names: Sequence[str]) -> Poses:
         """Returns station_from_world by the names (r,) of stations."""
         place = {name: i for i, name in enumerate(self.stations)}
         return Poses.of(self.stations.values())[[place[name] for name in names]]
+
+    def parameter_names(self, kind: Kind) -> list[str]:
+        """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools,
+        and ``station B rx`` … of stations but the first; r in rad, the others in mm."""
+        names = [f"J{i + 1} {TWIST[c]}" for i, c in self.chain.parameters()]
+        names += [f"{f'tool {name}'.rstrip()} {c}" for name in self.tools for c in TWIST[-TOOL_WIDTH[kind] :]]
+        return names + [f"station {name} {c}" for name in list(self.stations)[1:] for c in TWIST]
+
+    def tips(self, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
+        """Returns world_from_tool at joint vectors (m, n), with the tool and the load of each."""
+        place = {name: i for i, name in enumerate(self.tools)}
+        tool = Poses.of(self.tools.values())
+        return carried_poses(self.chain, q, targets, conditions) @ tool[[place[t] for t in targets]]
+
+    def tips_of(self, data: Measurements) -> Poses:
+        """Returns world_from_tool of m measurements."""
+        return self.tips(data.q, data.targets, data.conditions)
+
+    def residuals(self, measured: "Observed", tip: Poses | None = None) -> np.ndarray:
+        """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's
+        station; ``tip`` : world_from_tool (m,), where they are known."""
+        tip = self.tips_of(measured.data) if tip is None else tip
+        if len(self.stations) > 1:
+            tip = self.seen_from(measured.data.stations) @ tip
+        if measured.kind == "pose":
+            return measured.data.poses().difference(tip)
+        if measured.kind == "position":
+            return measured.data.points() - tip.translation
+        return (measured.values - np.linalg.norm(measured.between(tip.translation), axis=1))[:, None]
+
+    def jacobian(self, measured: "Observed") -> np.ndarray:
+        """Returns the derivative (r, 6 or 3 or 1, k) of the modelled values, by all parameters."""
+        return self.linear(measured)[1]
+
+    def linear(self, measured: "Observed") -> tuple[np.ndarray, np.ndarray]:
+        """Returns :meth:`residuals` and :meth:`jacobian`."""
+        tip, full = self.tip_jacobian(measured.data.q, measured.data.targets, measured.kind, measured.data.conditions)
+        if len(self.stations) > 1:
+            full, names = full.copy(), np.array(measured.data.stations)
+            begin = len(self.parameter_names(measured.kind)) - 6 * (len(self.stations) - 1)
+            for s, name in enumerate(list(self.stations)[1:]):
+                at = begin + 6 * s
+                full[names == name, :, at : at + 6] = frame_motions(tip[names == name], np.zeros(3))
+        return self.residuals(measured, tip), self.as_seen(measured, tip, full)
+
+    def curvature(self, measured: "Observed", pull: np.ndarray) -> np.ndarray:
+        """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` times values."""
+        tip, data = self.tips_of(measured.data), measured.data
+        moves = self.as_seen(measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
+        pulls = np.einsum("rw,rwk->rk", pull, moves)
+        return elasticity_curvature(self.chain, data.q, tip, data.targets, pulls, data.conditions)
+
+    def as_seen(self, measured: "Observed", tip: Poses, moves: np.ndarray) -> np.ndarray:
+        """Returns the effect (r, 6 or 3 or 1, k), in the station's axes, of motions (m, 6, k) of tools, rad over mm."""
+        if len(self.stations) > 1:
+            turn = self.seen_from(measured.data.stations).rotation[:, None]
+            moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
+        if measured.kind == "pose":
+            return moves
+        if measured.kind == "position":
+            return moves[:, 3:]
+        return np.einsum("ri,rik->rk", measured.along(tip), measured.between(moves[:, 3:]))[:, None]
+
+    def tip_jacobian(
+        self, q: np.ndarray, targets: Sequence[str], kind: Kind, conditions: Conditions = USUAL
+    ) -> tuple[Poses, np.ndarray]:
+        """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by parameters, rad over mm."""
+        tip = self.tips(q, targets, conditions)
+        axes_part = chain_jacobian(self.chain, q, tip, conditions)
+        if self.chain.tree is not None:
+            joint = [i for i, _ in self.chain.parameters()]
+            axes_part = axes_part * self.chain.carries(targets)[joint].T[:, None]
+        parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in self.tools)]
+        parts.append(np.zeros((len(tip), 6, 6 * (len(self.stations) - 1))))
+        if self.elastic:
+            parts.append(elasticity_jacobian(self.chain, q, tip, targets, conditions, self.hysteresis))
+        return tip, np.concatenate(parts, axis=2)
+
+    def moved(self, step: np.ndarray, kind: Kind) -> "State":
+        """Returns the state after small motions along the parameters, (k,)."""
+        later = list(self.stations)[1:]
+        sizes = [len(self.chain.parameters()), *[TOOL_WIDTH[kind]] * len(self.tools), *[6] * len(later)]
+        of_chain, *motions, of_elasticity = np.split(step, np.cumsum(sizes))
+        motions = [Rigid.exp(np.pad(each, (6 - len(each), 0))) for each in motions]
+        tools = {name: tool @ motion for (name, tool), motion in zip(self.tools.items(), motions, strict=False)}
+        stations = dict(self.stations)
+        stations |= {name: stations[name] @ motion for name, motion in zip(later, motions[len(tools) :], strict=True)}
+        chain = self.chain.moved(of_chain)
+        if self.elastic and chain.elasticity is not None:
+            values = chain.elasticity.values(self.hysteresis) + of_elasticity
+            chain = replace(chain, elasticity=chain.elasticity.with_values(values))
+        return replace(self, chain=chain, tools=tools, stations=stations)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +168,15 @@ class Observed:
         """Kind of observation for which the measurements are used."""
         return "distance" if self.frameless else self.kind
 
+    def between(self, values: np.ndarray) -> np.ndarray:
+        """Returns the differences (r, …) of values (m, …) at both ends of the distances."""
+        return values[self.first] - values[self.second]
+
+    def along(self, tip: Poses) -> np.ndarray:
+        """Returns the directions (r, 3) of the distances."""
+        apart = self.between(tip.translation)
+        return apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
+
     def __getitem__(self, keep: np.ndarray) -> "Observed":
         """Returns the observations at the indices, or of the mask (r,), ``keep``."""
         if self.kind == "distance":
@@ -89,13 +187,10 @@ class Observed:
 
     def require_more_than(self, seeks: int, what: str, advice: str) -> None:
         """Refuses observations that give no more numbers than ``seeks`` parameters."""
-        width = WIDTH[self.kind]
-        if width * len(self) <= seeks:
-            raise DegenerateError(
-                "E-IDENTIFY-FEW",
-                f"{self.data.where}: {len(self)} {self.kind}s give {width * len(self)} numbers for {seeks} {what}; "
-                f"{seeks // width + 1} or more needed, {advice}",
-            )
+        count, width = len(self), WIDTH[self.kind]
+        if width * count <= seeks:
+            fault = f"{self.data.where}: {count} {self.kind}s give {width * count} numbers for {seeks} {what}"
+            raise DegenerateError("E-IDENTIFY-FEW", f"{fault}; {seeks // width + 1} or more needed, {advice}")
 
 
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
@@ -105,86 +200,12 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     if WIDTH[kind] > WIDTH[richest]:
         raise InputError("E-MEASURED-KIND", f"{data.where}: {richest}s were measured; they do not give {kind}s")
     rows, none = np.arange(len(data)), np.zeros(0)
-    if kind != "distance":
-        return Observed(kind, data, rows, rows, none)
-    if richest == "distance":
-        distances, from_row = data.lengths()
-        real = rows[from_row != rows]
-        return Observed(kind, data, real, from_row[real], distances[real])
-    return Observed("position", data, rows, rows, none, frameless=True)
-
-
-def parameter_names(state: State, kind: Kind) -> list[str]:
-    """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
-    ``station B rx`` … of stations but the first; r in rad, the others in mm."""
-    names = [f"J{i + 1} {TWIST[c]}" for i, c in chain_parameters(state.chain)]
-    names += [f"{f'tool {name}'.rstrip()} {c}" for name in state.tools for c in TWIST[-TOOL_WIDTH[kind] :]]
-    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in TWIST]
-
-
-def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
-    """Returns world_from_tool at joint vectors (m, n), with the tool and the load of each."""
-    place = {name: i for i, name in enumerate(state.tools)}
-    tool = Poses.of(state.tools.values())
-    return carried_poses(state.chain, q, targets, conditions) @ tool[[place[t] for t in targets]]
-
-
-def tips_of(state: State, data: Measurements) -> Poses:
-    """Returns world_from_tool of m measurements."""
-    return tips(state, data.q, data.targets, data.conditions)
-
-
-def residuals(state: State, measured: Observed, tip: Poses | None = None) -> np.ndarray:
-    """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station;
-    ``tip`` : world_from_tool (m,), where they are known."""
-    tip = tips_of(state, measured.data) if tip is None else tip
-    if len(state.stations) > 1:
-        tip = state.seen_from(measured.data.stations) @ tip
-    if measured.kind == "pose":
-        return measured.data.poses().difference(tip)
-    if measured.kind == "position":
-        return measured.data.points() - tip.translation
-    apart = tip.translation[measured.first] - tip.translation[measured.second]
-    return (measured.values - np.linalg.norm(apart, axis=1))[:, None]
-
-
-def jacobian(state: State, measured: Observed) -> np.ndarray:
-    """Returns the derivative (r, 6 or 3 or 1, k) of the modelled values by :func:`parameter_names` and elasticity."""
-    return linear(state, measured)[1]
-
-
-def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
-    """Returns :func:`residuals` and :func:`jacobian`."""
-    tip, full = tip_jacobian(state, measured.data.q, measured.data.targets, measured.kind, measured.data.conditions)
-    if len(state.stations) > 1:
-        full, names = full.copy(), np.array(measured.data.stations)
-        begin = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
-        for s, name in enumerate(list(state.stations)[1:]):
-            at = begin + 6 * s
-            full[names == name, :, at : at + 6] = frame_motions(tip[names == name], np.zeros(3))
-    return residuals(state, measured, tip), as_seen(state, measured, tip, full)
-
-
-def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
-    """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` times the model."""
-    tip, data = tips_of(state, measured.data), measured.data
-    moves = as_seen(state, measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
-    pulls = np.einsum("rw,rwk->rk", pull, moves)
-    return elasticity_curvature(state.chain, data.q, tip, data.targets, pulls, data.conditions)
-
-
-def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
-    """Returns the effect (r, 6 or 3 or 1, k), in the station's axes, of motions (m, 6, k) of the tools, rad over mm."""
-    if len(state.stations) > 1:
-        turn = state.seen_from(measured.data.stations).rotation[:, None]
-        moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
-    if measured.kind == "pose":
-        return moves
-    if measured.kind == "position":
-        return moves[:, 3:]
-    apart = tip.translation[measured.first] - tip.translation[measured.second]
-    unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
-    return np.einsum("ri,rik->rk", unit, moves[measured.first, 3:] - moves[measured.second, 3:])[:, None]
+    if richest != "distance":
+        frameless = kind == "distance"
+        return Observed("position" if frameless else kind, data, rows, rows, none, frameless)
+    distances, from_row = data.lengths()
+    real = rows[from_row != rows]
+    return Observed(kind, data, real, from_row[real], distances[real])
 
 
 def frame_motions(tip: Poses, centre: np.ndarray) -> np.ndarray:
@@ -201,39 +222,6 @@ def tool_motions(tip: Poses, targets: Sequence[str], tool: str, kind: Kind) -> n
     moves[:, :3, :3] = moves[:, 3:, 3:] = tip.rotation
     moves *= np.array([name == tool for name in targets])[:, None, None]
     return moves[..., -TOOL_WIDTH[kind] :]
-
-
-def tip_jacobian(
-    state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, conditions: Conditions = USUAL
-) -> tuple[Poses, np.ndarray]:
-    """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by all parameters, rad over mm."""
-    tip = tips(state, q, targets, conditions)
-    axes_part = chain_jacobian(state.chain, q, tip, conditions)
-    if state.chain.tree is not None:
-        joint = [i for i, _ in chain_parameters(state.chain)]
-        axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
-    parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in state.tools)]
-    parts.append(np.zeros((len(tip), 6, 6 * (len(state.stations) - 1))))
-    if state.elastic:
-        parts.append(elasticity_jacobian(state.chain, q, tip, targets, conditions, state.hysteresis))
-    return tip, np.concatenate(parts, axis=2)
-
-
-def moved(state: State, step: np.ndarray, kind: Kind) -> State:
-    """Returns the state after small motions along the parameters, (k,)."""
-    later = list(state.stations)[1:]
-    sizes = [len(chain_parameters(state.chain)), *[TOOL_WIDTH[kind]] * len(state.tools), *[6] * len(later)]
-    of_chain, *motions, of_elasticity = np.split(step, np.cumsum(sizes))
-    motions = [Rigid.exp(np.pad(each, (6 - len(each), 0))) for each in motions]
-    tools = {name: tool @ motion for (name, tool), motion in zip(state.tools.items(), motions, strict=False)}
-    stations = dict(state.stations)
-    for name, motion in zip(later, motions[len(tools) :], strict=True):
-        stations[name] = stations[name] @ motion
-    chain = moved_chain(state.chain, of_chain)
-    if state.elastic and chain.elasticity is not None:
-        values = elasticity_values(chain.elasticity, state.hysteresis) + of_elasticity
-        chain = replace(chain, elasticity=with_values(chain.elasticity, values))
-    return replace(state, chain=chain, tools=tools, stations=stations)
 
 
 FIELDS = {"factor": "factor", "rad": "sigma_rad", "mm": "sigma_mm"}
@@ -293,6 +281,11 @@ class Weighting:
         """Returns the weighting with the σ ``found`` in place of its own."""
         return replace(self, **{FIELDS[name]: value for name, value in found.items()})
 
+    def scaled(self, change: np.ndarray) -> "Weighting":
+        """Returns the weighting after a ``change`` (p,) of the logarithms of the σ that are estimated."""
+        names = [name for name in FIELDS if name in self.estimated]
+        return self.with_values({name: self.value(name) * np.exp(x) for name, x in zip(names, change, strict=True)})
+
     def medians(self, white: np.ndarray) -> dict[str, float]:
         """Returns the median size of whitened residuals (r, w) by the name of their σ."""
         return {n: float(np.median(np.abs(white[:, at]))) for n, at in self.columns(white.shape[1]).items()}
@@ -310,8 +303,7 @@ def position_errors(found: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found[:, -3:], axis=1)
 
 
-SEEN = 1e-9
-"""Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""
+SEEN = 1e-9  # share of the largest singular value below which a singular value is rounding: no pose shows the parameter
 MEANING = {
     "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
     "O2": "inverse condition number",
@@ -347,10 +339,8 @@ class ObservabilityIndices:
         InputError."""
         sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
         if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
-            raise InputError(
-                "E-ARRAY-SHAPE",
-                f"observability: {len(sigma)} singular values of {count} poses; at least one of each, none negative",
-            )
+            fault = f"observability: {len(sigma)} singular values of {count} poses"
+            raise InputError("E-ARRAY-SHAPE", f"{fault}; at least one of each, none negative")
         first, last = float(sigma[0]), float(sigma[-1])
         if last == 0:
             return cls(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -378,7 +368,7 @@ def identification_jacobian(
 ) -> np.ndarray:
     """Returns the derivatives (m, 6 or 3, k) of the measured values, over σ, at joint vectors (m, n), in the world."""
     state = State(robot.chain(), {tool: robot.tool(tool)})
-    derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
+    derivative = state.tip_jacobian(q, (tool,) * len(q), observe)[1]
     sigma = np.repeat([sigma_rad, sigma_mm], 3)
     return (derivative / sigma[:, None])[:, -WIDTH[observe] :]
 
@@ -386,7 +376,7 @@ def identification_jacobian(
 def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
     """Returns factors (k,) that bring all parameters to mm, angles as arcs at the reach with the longest tool."""
     tools = list(tools)
-    turning = [c < 3 for _, c in chain_parameters(robot.chain())]
+    turning = [c < 3 for _, c in robot.chain().parameters()]
     turning += ([True] * (TOOL_WIDTH[observe] - 3) + [False] * 3) * len(tools)
     return np.where(turning, 1 / reach_mm(robot, tools), 1.0)
 

@@ -19,14 +19,10 @@ from stcal.robot.identification.adjustment import (
     Observed,
     State,
     Weighting,
-    jacobian,
     observed,
-    parameter_names,
     parameter_scale,
     parameter_units,
     position_errors,
-    residuals,
-    tips_of,
 )
 from stcal.robot.identification.prior import NominalRows, bending, placed
 from stcal.robot.identification.problem import GROSS, MOSTLY_GOOD, ArmProblem, ArmSolution, agreeing, mostly, relaxed
@@ -43,24 +39,19 @@ from stcal.robot.identification.result import (
 from stcal.robot.identification.start import start
 from stcal.robot.identification.unexplained import left, moved_meanwhile
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""
-TYPICAL = Weighting(0.1, 5e-4)
-"""σ of typical instruments, for which it is decided what the joint values determine."""
+TYPICAL = Weighting(0.1, 5e-4)  # σ of typical instruments, for which it is decided what the joint values determine
 VARIANCE_ROUNDS = 10
 """Largest number of rounds of estimating σ. Two to four suffice for most data; a robot without noise needs the most."""
 VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
 """Changes of the logarithm of a σ: convergence below the first, a note above the second."""
-FOLD_ROUNDS = 3
-"""Number of rounds of estimating the σ without some of the rows, starting from those of all rows."""
-FALLS = 0.5
-"""Ratio of successive medians of residuals above which they are near enough to start the actual estimation."""
-STILL_RAD, STILL_MM = 1e-5, 1e-2
-"""Motion, in rad or mm, below which a joint did not move."""
+FOLD_ROUNDS = 3  # number of rounds of estimating the σ without some of the rows, starting from those of all rows
+FALLS = 0.5  # ratio of successive medians of residuals above which they are near enough to start the actual estimation
+STILL_RAD, STILL_MM = 1e-5, 1e-2  # motion, in rad or mm, below which a joint did not move
 OUTLIER_ROUNDS = 5
 """Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
 MOST_OF_IT = 0.5
@@ -77,9 +68,9 @@ REPEATS, FEW_ROWS = 5, 300
 def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
     """Identify the axes, base and tools of ``robot`` from ``data``.
 
-    The parameters are complete, minimal and continuous (:func:`stcal.robot.kinematics.forward.chain_parameters`). They
-    are adjusted by a trust-region method with Huber weights, have a covariance, and are converted back to D-H rows,
-    with Hayati's β for nearly parallel axes.
+    The parameters are complete, minimal and continuous (:meth:`stcal.robot.kinematics.robot_model.Chain.parameters`).
+    They are adjusted by a trust-region method with Huber weights, have a covariance, and are converted back to D-H
+    rows, with Hayati's β for nearly parallel axes.
 
     Parameters
     ----------
@@ -110,16 +101,14 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     moves = np.ptp(data.q @ robot.coupling.T, axis=0)
     still = np.flatnonzero(moves < np.where(robot.prismatic, STILL_MM, STILL_RAD)) + 1
     if len(still) and not options.partial:
-        raise DegenerateError(
-            "E-IDENTIFY-UNMOVED",
-            f"{data.where}: joint {still[0]} never moved, so that its axis is not determined; measure with other "
-            f"values of q{still[0]}, or keep its nominal values with --partial",
-        )
+        fault = f"{data.where}: joint {still[0]} never moved, so that its axis is not determined"
+        remedy = f"measure with other values of q{still[0]}, or keep its nominal values with --partial"
+        raise DegenerateError("E-IDENTIFY-UNMOVED", f"{fault}; {remedy}")
     first = start(robot, data)
     computed = options.observe is None and _turns_as_computed(first, data)
     seen = observed(data, "position" if computed else options.observe)
-    units = parameter_units(jacobian(first, seen))
-    rows, names = NominalRows.about(first, units, robot, options.adjust), parameter_names(first, seen.kind)
+    units = parameter_units(first.jacobian(seen))
+    rows, names = NominalRows.about(first, units, robot, options.adjust), first.parameter_names(seen.kind)
     seeks = len(names) - UNSEEN[seen.kind] - int(rows.fixed.sum())
     seen.require_more_than(seeks, "parameters", "better twice that")
     solution, held_out, gain = _modelled(robot, first, seen, options, rows)
@@ -131,7 +120,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     elasticity_sigma = None
     if state.elastic and state.chain.elasticity is not None:
         template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
-        elasticity_sigma = with_values(template, np.sqrt(np.diag(covariance))[-state.elastic_count :])
+        elasticity_sigma = template.with_values(np.sqrt(np.diag(covariance))[-state.elastic_count :])
     every = None
     if rows.fixed.any():  # a rigid arm with all dimensions adjusted
         free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
@@ -146,7 +135,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         rank=rank,
         ranks=_ranks(state, data),
         undetermined=undetermined,
-        nominal_mm=position_errors(residuals(first, seen)),
+        nominal_mm=position_errors(first.residuals(seen)),
         held_out=held_out,
         predicted=Predicted.of(state, robot, seen, covariance, findings or ()),
         placed=placed(state, seen.kind, covariance[:k, :k], solution.units[:k], robot),
@@ -168,22 +157,20 @@ def _modelled(
     rigid = _adjusted(first, seen, options, rows)
     if options.model == "rigid":
         return rigid, _cross_validated(rigid, options), None
-    _undetermined(rigid, parameter_names(first, seen.kind), options.partial)
+    _undetermined(rigid, first.parameter_names(seen.kind), options.partial)
     conditions, deviations = seen.data.conditions, rigid.problem.deviations
     state = bending(rigid.state, robot, deviations.axis_rad, conditions)
-    elasticity, units = state.chain.elasticity, parameter_units(jacobian(state, seen))
+    elasticity, units = state.chain.elasticity, parameter_units(state.jacobian(seen))
     carried = conditions.loaded  # if no row states a load, by the payload of the chain
     if conditions.payload_kg is None:
         carried = elasticity is not None and elasticity.payload_kg > 0
     rows = NominalRows.about(state, units, robot, options.adjust, carried)
     elastic = _without_errors(replace(rigid.problem, rows=rows), state, mostly(rigid.weights >= GROSS))
-    held_out = [_cross_validated(each, options) for each in (rigid, elastic)]
-    if held_out[0] is None or held_out[1] is None:
-        return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
-    gain = Gain.between(held_out[0], held_out[1])
-    if options.model == "elastic" or gain.beyond_chance:
-        return elastic, held_out[1], gain
-    return rigid, held_out[0], gain
+    by_rigid, by_elastic = (_cross_validated(each, options) for each in (rigid, elastic))
+    gain = Gain.between(by_rigid, by_elastic) if by_rigid and by_elastic else None
+    if options.model == "elastic" or (gain is not None and gain.beyond_chance):
+        return elastic, by_elastic if gain else None, gain
+    return rigid, by_rigid if gain else None, gain
 
 
 def _turns_as_computed(first: State, data: Measurements) -> bool:
@@ -191,12 +178,10 @@ def _turns_as_computed(first: State, data: Measurements) -> bool:
     if data.rotations is None or data.positions is None:
         return False
     same = np.flatnonzero(np.array(data.targets[1:]) == np.array(data.targets[:-1]))
-    measured, modelled = (
-        Rotation.from_matrix(np.swapaxes(turn[same], 1, 2) @ turn[same + 1]).magnitude()
-        for turn in (data.rotations, tips_of(first, data).rotation)
-    )
+    both = (np.swapaxes(turn[same], 1, 2) @ turn[same + 1] for turn in (data.rotations, first.tips_of(data).rotation))
+    measured, modelled = (Rotation.from_matrix(turns).magnitude() for turns in both)
     turned = rms(measured - modelled) if len(same) else np.inf
-    away = rms(position_errors(residuals(first, observed(data, "position"))))
+    away = rms(position_errors(first.residuals(observed(data, "position"))))
     return turned < ROUNDED_RAD and away > max(BEYOND_MM, BEYOND * turned * float(np.ptp(data.positions, axis=0).max()))
 
 
@@ -208,10 +193,9 @@ def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weight
     missing = tuple(name for name in needed if sigma[name] is None)
     with_covariances = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
     estimated = ("factor",) if with_covariances or not missing else missing
-    weighting = Weighting(
-        options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, with_covariances, estimated=estimated
-    )
-    misfit = weighting.medians(weighting.whiten(residuals(state, seen), seen))
+    least = options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD
+    weighting = Weighting(*least, with_covariances, estimated=estimated)
+    misfit = weighting.medians(weighting.whiten(state.residuals(seen), seen))
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
@@ -248,7 +232,7 @@ def _without_errors(problem: ArmProblem, state: State, good: np.ndarray, rounds:
 
 def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
     """Solves and estimates σ in turns."""
-    last, share = np.zeros(0), 1.0
+    last, share = None, 1.0
     for _ in range(rounds):
         solution = problem.solve(state)
         solution = replace(solution, spread=(spread := solution.estimated()))
@@ -256,7 +240,7 @@ def _settled(problem: ArmProblem, state: State, rounds: int) -> ArmSolution:
         change = float(np.abs(best).max())
         if change < VARIANCE_SETTLED:
             return solution
-        last, share = best, relaxed(best, last, share) if len(last) else 1.0
+        last, share = best, 1.0 if last is None else relaxed(best, last, share)
         state, problem = solution.state, problem.scaled(share * best)
     note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
     return replace(solution, problem=problem, notes=(note,) if change > VARIANCE_UNSETTLED else ())
@@ -273,18 +257,16 @@ def _undetermined(solution: ArmSolution, names: list[str], partial: bool) -> tup
         return open_directions
     first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
     moved = moved_meanwhile(solution.state, measured, MOST_OF_IT)
-    said = (
-        f"the data determine {solution.rank()} of {solution.seeks()} parameters, open are {first}; measure more varied "
-        "poses (`stcal robot design`), or keep the nominal values of these with --partial"
-    )
+    fault = f"the data determine {solution.rank()} of {solution.seeks()} parameters, open are {first}"
+    remedy = "measure more varied poses (`stcal robot design`), or keep the nominal values of these with --partial"
     if moved is not None and moved.advice:
-        said = f"{first} stay open with residuals that no robot leaves; {moved.sentence()}"
-    raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{measured.data.where}: {said}")
+        fault, remedy = f"{first} stay open with residuals that no robot leaves", moved.sentence()
+    raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{measured.data.where}: {fault}; {remedy}")
 
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Returns how many parameters each kind of measurement at these joint values would determine."""
-    tip, none = tips_of(state, data), {"covariance": None, "common": None, "distances": None, "from_row": None}
+    tip, none = state.tips_of(data), dict.fromkeys(("covariance", "common", "distances", "from_row"))
     exact = replace(data, positions=tip.translation, rotations=tip.rotation, **none)
     seen = {kind: observed(exact, kind) for kind in get_args(Kind)}
     return {kind: ArmProblem(own, TYPICAL, robust=False).at(state).rank() - _place(own) for kind, own in seen.items()}
@@ -293,13 +275,13 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
 def _observability(robot: Robot, solution: ArmSolution, rank: int) -> ObservabilityIndices:
     state, weighting, measured = solution.state, solution.problem.weighting, solution.problem.measured
     scale = parameter_scale(robot, measured.kind, state.tools)
-    rows = weighting.whiten(jacobian(state, measured)[:, :, : len(scale)], measured) * scale
+    rows = weighting.whiten(state.jacobian(measured)[:, :, : len(scale)], measured) * scale
     if measured.frameless:  # remove what a motion of all points of a station can produce
         blocks, points = [], measured.data.points()
-        for rows_of_station in measured.data.by_station().values():
-            lever = (points - points[rows_of_station].mean(0)) * rows_of_station[:, None]
-            shift = np.eye(3) * rows_of_station[:, None, None]
-            blocks.append(np.concatenate([-skew(lever) / np.linalg.norm(lever), shift], axis=2))
+        for within in measured.data.by_station().values():
+            lever = (points - points[within].mean(0)) * within[:, None]
+            turn, shift = -skew(lever) / np.linalg.norm(lever), np.eye(3) * within[:, None, None]
+            blocks += [turn, shift]
         motions = np.concatenate(blocks, axis=2)
         u, s, _ = np.linalg.svd(weighting.whiten(motions, measured).reshape(-1, motions.shape[2]), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
@@ -311,11 +293,9 @@ def _place(measured: Observed) -> int:
     """Returns in how many directions positions that count by distances move together: 6 a station, 5 if on a line."""
     if not measured.frameless:
         return 0
-    directions = 0
-    for rows in measured.data.by_station().values():
-        at = measured.data.points()[rows] - measured.data.points()[rows].mean(0)
-        directions += 3 + int(np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM))
-    return directions
+    points = [measured.data.points()[rows] for rows in measured.data.by_station().values()]
+    turns = [skew(at - at.mean(0)).reshape(-1, 3) for at in points]
+    return sum(3 + int(np.linalg.matrix_rank(each, tol=STILL_MM)) for each in turns)
 
 
 def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRows | None:
@@ -324,27 +304,24 @@ def _cross_validated(whole: ArmSolution, options: IdentifyOptions) -> HeldOutRow
     rows = len(measured)
     if min(options.folds, rows) < LEAST_FOLDS:
         return None
-    repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
+    few = rows <= FEW_ROWS
+    repeats = options.repeats or (REPEATS if few else 1)
     rng, good = np.random.default_rng(options.seed), mostly(whole.weights >= GROSS)
     position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
     for repeat in range(repeats):
         for test_rows in dealt(rows, options.folds, rng):
             train_rows = np.setdiff1d(np.arange(rows), test_rows)
             train, test = replace(problem, measured=measured[train_rows]), measured[test_rows]
-            state, shown = whole.state, {*train.measured.data.stations, next(iter(whole.state.stations))}
-            tools = {name: tool for name, tool in state.tools.items() if name in train.measured.data.targets}
-            stations = {name: each for name, each in state.stations.items() if name in shown}
-            state = replace(state, tools=tools, stations=stations)
+            state = whole.state.of(train.measured.data)
             if WIDTH[measured.kind] * len(train_rows) <= replace(whole, state=state).seeks():
                 return None
-            few = rows <= FEW_ROWS
             found = _without_errors(train, state, good[train_rows], FOLD_ROUNDS) if few else train.solve(state)
             state = found.state
             if measured.kind != "distance":
                 named = zip(test.data.targets, test.data.stations, strict=True)
                 known = np.array([target in state.tools and station in state.stations for target, station in named])
                 test, test_rows = test[known], test_rows[known]
-            errors = residuals(state, test)
+            errors = state.residuals(test)
             position[repeat, test_rows] = position_errors(errors)
             if measured.kind == "pose":
                 rotation[repeat, test_rows] = np.linalg.norm(errors[:, :3], axis=1)

@@ -8,27 +8,24 @@ from scipy.linalg import block_diag
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Kind, State, moved, parameter_names
+from stcal.robot.identification.adjustment import Kind, State
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
-from stcal.robot.kinematics.forward import GRAVITY_M_S2, chain_parameters, elasticity_values, moved_chain
+from stcal.robot.kinematics.forward import GRAVITY_M_S2
 from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot
 
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
 """Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""
-MASS_KG = 100.0
-"""Usual mass of an arm of one metre; a factor of 3 does no harm, as compliances compensate it."""
+MASS_KG = 100.0  # usual mass of an arm of one metre; a factor of 3 does no harm, as compliances compensate it
 BESIDE = 0.15
 """Typical distance of a link's centre of mass from the middle of its two joints, as a share of the arm's length."""
-HEAVIER = 0.5
-"""σ of the factor by which an arm is heavier than usual, which the torques of known masses show."""
+HEAVIER = 0.5  # σ of the factor by which an arm is heavier than usual, which the torques of known masses show
 DOWN = np.array([0.0, 0.0, -1.0])
-SOME = 0.1
-"""Share of a σ at which compliances start; at 0 moments would move nothing."""
+SOME = 0.1  # share of a σ at which compliances start; at 0 moments would move nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
-    """Prior of :func:`elasticity_values`. ``scale`` : factors to rad at the usual torque, or shares of the usual
+    """Prior of :meth:`Elasticity.values`. ``scale`` : factors to rad at the usual torque, or shares of the usual
     moment; ``group`` : of σ of each value; ``apart`` : (p, p) that makes the scaled deviations independent, of σ 1 in
     the group of moments."""
 
@@ -95,16 +92,13 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     return 1e-3 * moment, BESIDE * length_m * whole
 
 
-DIFFERENCE_MM = 1e-4
-"""Step of the derivatives by differences, in mm of movement of the tool."""
-DOUBT = 1.0
-"""σ of the logarithm of the deviations' σ, which are known of makes of robots within a factor of about e."""
+DIFFERENCE_MM = 1e-4  # step of the derivatives by differences, in mm of movement of the tool
+DOUBT = 1.0  # σ of the logarithm of the deviations' σ, which are known of makes of robots within a factor of about e
 COAXIAL_MM = 100.0
 """Distance of parallel axes below which an error of 0.5 mm across them turns θ by more than zero positions err."""
 LENGTH, TWIST, ZERO = 0, 1, 2
 FIXED_LENGTH, FIXED_ANGLE = 8, 9
-FIXED_MM, FIXED_RAD = 1e-4, 1e-7
-"""σ of dimensions that are not adjusted: a ten-thousandth of a millimetre at 1 m."""
+FIXED_MM, FIXED_RAD = 1e-4, 1e-7  # σ of dimensions that are not adjusted: a ten-thousandth of a millimetre at 1 m
 Adjusted = Literal["all", "geometry", "zeros", "base,tool"]
 KEPT: dict[Adjusted, tuple[int, ...]] = {
     "all": (),
@@ -185,15 +179,12 @@ class NominalRows:
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
-            robot = robot_from_chain(moved_chain(state.chain, step), state.tools, nominal)
+            robot = robot_from_chain(state.chain.moved(step), state.tools, nominal)
             return _dimensions(robot, nominal, coaxial)
 
-        units = units[: len(chain_parameters(state.chain))]
-        jacobian, reference = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
-        for k in range(len(units)):
-            step = np.zeros(len(units))
-            step[k] = DIFFERENCE_MM * units[k]
-            jacobian[:, :, k] = (values(step) - reference) / step[k]
+        units = units[: len(state.chain.parameters())]
+        reference, steps = values(np.zeros(len(units))), DIFFERENCE_MM * np.diag(units)
+        jacobian = np.stack([(values(step) - reference) / step.max() for step in steps], axis=2)
         group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(jacobian), 1))
         group[nominal.prismatic, 3] = TWIST  # the zero position of a prismatic joint is d
         group[[turn for turn, _ in coaxial], 3] = LENGTH
@@ -209,10 +200,10 @@ class NominalRows:
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
-        others = len(parameter_names(state, kind)) - jacobian.shape[1]
+        others = len(state.parameter_names(kind)) - jacobian.shape[1]
         derivative, value, usual_ = np.pad(jacobian, ((0, 0), (0, others))), away[self.free], self.elasticity
         if usual_ is not None and state.chain.elasticity is not None:
-            apart = elasticity_values(state.chain.elasticity, state.hysteresis) - usual_.expected
+            apart = state.chain.elasticity.values(state.hysteresis) - usual_.expected
             derivative = np.asarray(block_diag(derivative, usual_.apart * usual_.scale))
             value = np.append(value, usual_.apart @ (apart * usual_.scale))
         sigma = np.array([*astuple(deviations), 1.0, FIXED_MM, FIXED_RAD])[self.groups]
@@ -300,14 +291,12 @@ def placed(
         mounts = [] if robot.tree is None else [pose for _, pose in robot.tree.mounts.values()]
         return Poses.of([robot.world_from_base, *robot.tools.values(), *stations, *mounts])
 
+    def slope(step: np.ndarray) -> np.ndarray:
+        ahead, behind = poses(state.moved(step, kind)), poses(state.moved(-step, kind))
+        return ahead.difference(behind) / (2 * step.max())
+
     state = replace(state, elastic=False)
-    current = poses(state)
-    derivative = np.zeros((len(current), 6, len(units)))
-    for k, unit in enumerate(units):
-        step = np.zeros(len(units))
-        step[k] = DIFFERENCE_MM * unit
-        ahead, behind = poses(moved(state, step, kind)), poses(moved(state, -step, kind))
-        derivative[:, :, k] = ahead.difference(behind) / (2 * step[k])
+    derivative = np.stack([slope(step) for step in DIFFERENCE_MM * np.diag(units)], axis=2)
     sigma = np.sqrt(np.einsum("pik,kl,pil->pi", derivative, covariance, derivative).clip(0))
     if kind != "pose":
         sigma[1 : 1 + len(state.tools), :3] = np.nan
@@ -320,4 +309,4 @@ def placed(
             f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
             for i, (after, _) in nominal.tree.mounts.items()
         ]
-    return tuple(PlacedFrame(*station) for station in zip(names, current, sigma, strict=True))
+    return tuple(PlacedFrame(*each) for each in zip(names, poses(state), sigma, strict=True))

@@ -21,29 +21,12 @@ from stcal.geometry.clusters import by_clusters
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit, ratio_limit
-from stcal.robot.identification.adjustment import (
-    FIELDS,
-    UNSEEN,
-    WIDTH,
-    Kind,
-    Observed,
-    State,
-    Weighting,
-    curvature,
-    jacobian,
-    linear,
-    moved,
-    parameter_names,
-    parameter_units,
-    residuals,
-)
+from stcal.robot.identification.adjustment import UNSEEN, WIDTH, Kind, Observed, State, Weighting, parameter_units
 from stcal.robot.identification.prior import ACROSS, AXIS, DOUBT, MOMENT, Deviations, NominalRows
 
 MAX_STEPS = 100
-SETTLED = 1e-10
-"""Relative decrease of the cost below which the descent has converged."""
-HUBER_LEVEL = 0.999
-"""Probability that an observation without a gross error has full weight; one in a thousand has less."""
+SETTLED = 1e-10  # relative decrease of the cost below which the descent has converged
+HUBER_LEVEL = 0.999  # probability that an observation without a gross error has full weight; one in a thousand has less
 USELESS_MM = 50.0
 """Largest σ of a determined direction (1 mm, or the rotation that moves the tool by 1 mm). Beyond it the nominal value
 is better. All parameters are held to their start by this σ, which determined directions do not feel."""
@@ -56,34 +39,27 @@ ROUNDING = 1e-13
 NEAR, NEAR_STEPS = 1.0, 50
 """Largest predicted decrease of a step, in σ², for which second derivatives are good, and largest number of steps
 without them before: used from afar they may lead to a compliance and a moment that both have the wrong sign."""
-STAYS_MM = 1e-3
-"""σ, in mm, that fixes a movement which the observations never show."""
+STAYS_MM = 1e-3  # σ, in mm, that fixes a movement which the observations never show
 LEAST_GAIN, LEAST_ELASTIC = 1e-9, 1e-3
 """Decrease of the cost, in σ², below which a descent ends, for rigid and for elastic arms. Measurements without noise
 still gain the first by rounding; the second moves no parameter by more than 0.03 σ."""
-LEAST = 1e-9
-"""Smallest σ, in mm or rad: that of data without noise."""
+LEAST = 1e-9  # smallest σ, in mm or rad: that of data without noise
 FARTHEST, NEAREST = 3.0, 0.7
 """Largest change of log σ in a round; the second of compliances, whose products with moments are nonlinear."""
 QUIETER = -2.5
 """Second start of the search for log σ of the data: few data may be explained by noise alone, or by dimensions."""
 GROSS = 0.5
 """Weight below which an observation is a gross error, and does not count for σ: normal errors are never so large."""
-MOSTLY_GOOD = 0.5
-"""Smallest share of good observations; where fewer would be good, nothing is called an error."""
+MOSTLY_GOOD = 0.5  # smallest share of good observations; where fewer would be good, nothing is called an error
 NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 1.0, 1.0]) / 6
 """Points and weights of three-point Gauss-Hermite quadrature for a standard normal distribution."""
-MOST_PRODUCT = 5
-"""Largest number of dimensions for the product rule: 243 points; rigid arms have no more."""
+MOST_PRODUCT = 5  # largest number of dimensions for the product rule: 243 points; rigid arms have no more
 SHORTEST = 0.1
 """Smallest share of a step of the σ: two steps that lead back and forth by chance must not stop the iteration."""
-STEP = 1e-4
-"""Step of the second derivatives, in log σ."""
-SAME_DIGITS = 5
-"""Decimals, of rad or mm, to which joint values agree that are one place of the robot."""
+STEP = 1e-4  # step of the second derivatives, in log σ
+SAME_DIGITS = 5  # decimals, of rad or mm, to which joint values agree that are one place of the robot
 
-Away = tuple[State, np.ndarray]
-"""A state, and the sum of the steps (k,) that led to it."""
+Away = tuple[State, np.ndarray]  # a state, and the sum of the steps (k,) that led to it
 
 
 def huber_limit(kind: Kind) -> float:
@@ -117,15 +93,14 @@ class ArmProblem:
     def scaled(self, change: np.ndarray) -> "ArmProblem":
         """Returns the problem after a ``change`` (p,) of the logarithms of its σ: of measurements, then dimensions."""
         assert self.rows is not None
-        names = [name for name in FIELDS if name in self.weighting.estimated]
-        new = {name: self.weighting.value(name) * np.exp(x) for name, x in zip(names, change, strict=False)}
+        of_data, of_robot = np.split(change, [len(self.weighting.estimated)])
         sigma = np.array(astuple(self.deviations))
-        sigma[np.intersect1d(self.rows.groups, np.arange(len(sigma)))] *= np.exp(change[len(names) :])
-        return replace(self, weighting=self.weighting.with_values(new), deviations=Deviations(*sigma.tolist()))
+        sigma[np.intersect1d(self.rows.groups, np.arange(len(sigma)))] *= np.exp(of_robot)
+        return replace(self, weighting=self.weighting.scaled(of_data), deviations=Deviations(*sigma.tolist()))
 
     def at(self, state: State) -> "ArmSolution":
         """Returns the observations alone, linearised about a state."""
-        errors, derivative = linear(state, self.measured)
+        errors, derivative = state.linear(self.measured)
         white, slope = (self.weighting.whiten(each, self.measured) for each in (errors, derivative))
         cost, weights = self._cost(white)
         flat = slope.reshape(-1, slope.shape[2])
@@ -164,20 +139,16 @@ class ArmProblem:
             return replace(straight, normal=straight.normal - (along * share) @ along.T)
 
         def cost(at: Away) -> float:
-            return self._cost(self.weighting.whiten(residuals(at[0], measured), measured))[0] + float(kept(at[1]).cost)
+            return self._cost(self.weighting.whiten(at[0].residuals(measured), measured))[0] + float(kept(at[1]).cost)
+
+        def later(at: Away, step: np.ndarray) -> Away:
+            return at[0].moved(step, measured.kind), at[1] + step
 
         begin: Away = state, np.zeros(len(hold))
         descents = [(False, NEAR, NEAR_STEPS), (True, LEAST_ELASTIC, MAX_STEPS)]
-        for bends, least_gain, max_steps in descents if state.elastic else [(False, LEAST_GAIN, MAX_STEPS)]:
-            fit = minimise(
-                begin,
-                partial(linearise, bends=bends),
-                lambda at, step: (moved(at[0], step, measured.kind), at[1] + step),
-                cost=cost,
-                settled=SETTLED,
-                least_gain=least_gain,
-                max_steps=max_steps,
-            )
+        for bends, gain, most in descents if state.elastic else [(False, LEAST_GAIN, MAX_STEPS)]:
+            equations = partial(linearise, bends=bends)
+            fit = minimise(begin, equations, later, cost, settled=SETTLED, least_gain=gain, max_steps=most)
             begin = fit.state
         accepted = ACCEPTED_ELASTIC if state.elastic else ACCEPTED
         fit.required(f"{measured.data.where}: identification", "check the robot file and the outliers", accepted)
@@ -225,11 +196,11 @@ class ArmSolution:
     def seeks(self) -> int:
         """Returns the number of parameters that observations of this kind could determine, without conditions."""
         kind = self.problem.measured.kind
-        return len(parameter_names(self.state, kind)) - UNSEEN[kind] - self.fixed_count
+        return len(self.state.parameter_names(kind)) - UNSEEN[kind] - self.fixed_count
 
     def among(self, measured: Observed) -> "ArmSolution":
         """Returns the solution beside all observations, of which those of the problem are a part."""
-        errors = residuals(self.state, measured)
+        errors = self.state.residuals(measured)
         length = np.linalg.norm(self.problem.weighting.whiten(errors, measured), axis=1)
         weights = huber_weights(length, huber_limit(measured.kind))
         return replace(self, problem=replace(self.problem, measured=measured), residuals=errors, weights=weights)
@@ -240,7 +211,7 @@ class ArmSolution:
         if not state.elastic or measured.kind == "distance":
             return None
         white = self.weights[:, None] * weighting.whiten(self.residuals, measured)
-        elastic = curvature(state, measured, weighting.pull(white, measured))
+        elastic = state.curvature(measured, weighting.pull(white, measured))
         begin, rest = len(self.units) - state.elastic_count, state.elastic_count - len(elastic)
         return np.pad(elastic, (begin, rest))
 
@@ -248,7 +219,7 @@ class ArmSolution:
         """Returns what tells the σ, linear about the solution: of the data where σ is sought, then of dimensions."""
         problem, measured, weighting, rows = self.problem, self.problem.measured, self.problem.weighting, self.rows
         white = weighting.whiten(self.residuals, measured)
-        derivative = weighting.whiten(jacobian(self.state, measured), measured) * self.units
+        derivative = weighting.whiten(self.state.jacobian(measured), measured) * self.units
         width, limit = white.shape[1], huber_limit(measured.kind) ** 2
         # Share of the square of normal residuals below Huber's limit (Huber's Proposal 2).
         share = float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit)) if problem.robust else 1.0
@@ -264,12 +235,11 @@ class ArmSolution:
         parts = []
         fixed = replace(Equations.nothing(len(self.units)), normal=np.eye(len(self.units)) / USELESS_MM**2)
         for name, columns in weighting.columns(width).items():
+            sought = scaled if name in weighting.estimated else np.zeros(len(scaled))
+            fixed = fixed + linear_of(columns, self.weights - sought)
             if name in weighting.estimated:
                 equations = replace(linear_of(columns, scaled), count=share * white[honest, columns].size)
                 parts.append((equations, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST))
-                fixed = fixed + linear_of(columns, self.weights - scaled)
-            else:
-                fixed = fixed + linear_of(columns, self.weights)
         e, j, _ = rows.held(self.state, problem.deviations, measured.kind)
         j, group = j * self.units, rows.groups
         fixed = fixed + Equations.of(e[group >= MOMENT], j[group >= MOMENT])
@@ -282,14 +252,13 @@ class ArmSolution:
         curved = self.curvature()
         if curved is not None:
             # At the minimum the data pull as much as held and fixed parts hold; this changes with the σ of these parts.
-            holds = np.isfinite(doubt)
-            holding = fixed.normal + sum(own.normal for own in compress(each, holds))
+            each, holds = [*each, fixed], [*np.isfinite(doubt), True]
+            holding = np.sum([own.normal for own in compress(each, holds)], axis=0)
             directions, share = bent(holding, curved * self.units[:, None] * self.units)
             bends = (directions * np.sqrt(1 - share)) @ directions.T @ holding
-            *each, fixed = (
-                replace(own, normal=bends.T @ own.normal @ bends) if hold else own
-                for own, hold in zip((*each, fixed), (*holds, True), strict=True)
-            )
+            for i in np.flatnonzero(holds):
+                each[i] = replace(each[i], normal=bends.T @ each[i].normal @ bends)
+            *each, fixed = each
         return Spread(Components(each, fixed, expected, doubt), least, most, self.units)
 
     @property
@@ -309,11 +278,10 @@ class ArmSolution:
             blind = np.pad(blind, ((0, k - len(blind)), (0, 0)))
             projector = (np.eye(k) - blind @ blind.T) * self.units[:, None] / self.units
             return projector @ covariance @ projector.T
-        place = self.places()
-        if place is None:
+        if (place := self.places()) is None:
             return covariance
         sigma, root = np.sqrt(np.diag(covariance)), np.sqrt(self.weights)[:, None]
-        slope = root[..., None] * whiten(jacobian(self.state, measured), measured) * sigma
+        slope = root[..., None] * whiten(self.state.jacobian(measured), measured) * sigma
         information, pull = blocks_of(slope, root * whiten(self.residuals, measured), place, place.max() + 1)
         clusters = by_clusters(np.linalg.inv(covariance / sigma[:, None] / sigma), pull, information)
         return covariance + (clusters.covariance - clusters.independent) * sigma[:, None] * sigma
@@ -390,12 +358,9 @@ SUBSETS, SEED = 1000, 0
 """Number of random subsets, and seed. With a quarter of 40 rows wrong, one in forty is clean."""
 KEPT_SUBSETS, FIRST_STEPS, STEPS = 20, 2, 50
 """Number of subsets that are followed to their end, and of concentration steps before and after their choice."""
-MOST_ROWS = 400
-"""Largest number of rows that are searched; of more a random sample is, with the same share of errors."""
-HELD = 1e-4
-"""Information on each parameter (of 1 mm) about its start, in units of that of one observation."""
-FALSE_ALARM = 1e-3
-"""False-alarm probability of a set: that any row of a good set is called wrong."""
+MOST_ROWS = 400  # largest number of rows that are searched; of more a random sample is, with the same share of errors
+HELD = 1e-4  # information on each parameter (of 1 mm) about its start, in units of that of one observation
+FALSE_ALARM = 1e-3  # false-alarm probability of a set: that any row of a good set is called wrong
 TINY = 1e-300
 ROUNDS, SEARCHES = 6, 2
 """Number of linear solutions, the third of which is practically exact, and of searches, the second by better σ."""
@@ -413,7 +378,7 @@ def agreeing(problem: ArmProblem, state: State) -> np.ndarray:
     measured, weighting = problem.measured, problem.weighting
     good = every = np.ones(len(measured), bool)
     for step in range(ROUNDS):
-        errors, derivative = linear(state, measured)
+        errors, derivative = state.linear(measured)
         units = parameter_units(derivative)
         if step:
             medians = weighting.medians(weighting.whiten(errors, measured))
@@ -426,7 +391,7 @@ def agreeing(problem: ArmProblem, state: State) -> np.ndarray:
         before, searched = good, step < SEARCHES
         begin = rows.trimmed(half) if searched else good
         good = rows.tested(begin, half if searched else None, list(weighting.columns(w).values()))
-        state = moved(state, units * rows.solved(good[None])[0], measured.kind)
+        state = state.moved(units * rows.solved(good[None])[0], measured.kind)
         if not searched and (good == before).all():
             break
     return good

@@ -23,8 +23,6 @@ from stcal.robot.identification.adjustment import (
     Weighting,
     over_ranges,
     position_errors,
-    residuals,
-    tip_jacobian,
 )
 from stcal.robot.identification.prior import Adjusted, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS, ArmSolution
@@ -36,24 +34,19 @@ Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
 """Standard errors by which one model must predict better; rows of one fold share the error of their solution."""
-NO_GAIN = 0.95
-"""Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
+NO_GAIN = 0.95  # errors of held-out rows over those of the nominal robot from which on nothing was gained
 LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
 """Common relative change of all lengths, its probability by chance, and number of adjusted lengths for a note."""
-FAR_FROM_STATED = 3.0
-"""Factor between the σ that residuals show and those that are stated from which on it is told."""
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of the size of a normal error of σ 1."""
+FAR_FROM_STATED = 3.0  # factor between the σ that residuals show and those that are stated from which on it is told
+MEDIAN_OF_NORMAL = 0.6745  # median of the size of a normal error of σ 1
 OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
 """Change of a length beyond what workshops make of one type of arm, and most lengths to be shown."""
 TOGETHER, MOST_BESIDE = 0.2, 2
 """Share of a direction's largest motion from which on a parameter is named with it, and largest number of those."""
-SAMPLES = 200
-"""Number of joint vectors over the ranges for which σ is predicted."""
+SAMPLES = 200  # number of joint vectors over the ranges for which σ is predicted
 ELSEWHERE = 3.0
 """Largest ratio of σ over the ranges to σ at the rows without a warning: 40 rows over 60 % of the ranges have 1.6."""
-FEW = 2.0
-"""Number of measured values per parameter below which σ may come out at a tenth of the true ones."""
+FEW = 2.0  # number of measured values per parameter below which σ may come out at a tenth of the true ones
 REPEATED = "joint values were measured several times: what the model lacks there counts once in σ"
 COMPUTED = (
     "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
@@ -104,10 +97,8 @@ class IdentifyOptions:
             if value is not None and not 1e-12 <= value <= most:
                 raise InputError("E-OPTION-RANGE", f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
         if self.model == "auto" and self.folds < LEAST_FOLDS:
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"folds is {self.folds}: models are compared on held-out rows; {LEAST_FOLDS} or more folds needed",
-            )
+            fault = f"folds is {self.folds}: models are compared on held-out rows"
+            raise InputError("E-OPTION-RANGE", f"{fault}; {LEAST_FOLDS} or more folds needed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +184,6 @@ class Predicted:
         """σ (s,) at random joint values over the ranges, with what the model lacks."""
         return np.hypot(self.model_mm, self.left_mm)
 
-    def elsewhere(self) -> float:
-        """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
-        return rms(self.ranges_mm) / max(rms(self.here_mm), 1e-9)
-
     def at(self, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
         """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in
         the residuals; nan for tools that were not measured."""
@@ -216,7 +203,7 @@ def position_sigma(
     conditions: Conditions = USUAL,
 ) -> np.ndarray:
     """Returns σ (r,) of the position at joint values (r, n), mm."""
-    place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
+    place = state.tip_jacobian(q, targets, kind, conditions)[1][:, 3:]
     return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 
@@ -318,12 +305,11 @@ class Identified(Brief):
     @property
     def errors(self) -> dict[str, Figures]:
         """Position errors, and their predicted σ, mm, by the keys of :data:`ERRORS`."""
-        held_out, every, predicted = self.held_out, self.all_held_out, self.predicted
         found = {"nominal": self.nominal_mm, "identified": self.fitted_mm}
-        found |= {} if held_out is None else {"held_out": held_out.position_mm}
-        found |= {} if every is None else {"all_held_out": every.position_mm}
-        if predicted is not None:
-            found |= {"sigma": predicted.here_mm, "sigma_over_ranges": predicted.ranges_mm}
+        for key, rows in (("held_out", self.held_out), ("all_held_out", self.all_held_out)):
+            found |= {} if rows is None else {key: rows.position_mm}
+        if self.predicted is not None:
+            found |= {"sigma": self.predicted.here_mm, "sigma_over_ranges": self.predicted.ranges_mm}
         return {key: Figures.of(values) for key, values in found.items()}
 
     @property
@@ -424,29 +410,26 @@ def directions_named(directions: np.ndarray, names: tuple[str, ...] | list[str])
 def remarks(result: Identified, tested: bool, computed: bool) -> tuple[str, ...]:
     """Returns the notes on a result; ``tested`` : rows were held out, or none were asked for; ``computed`` : the
     controller computed the orientations."""
-    left, rows, conditions = result.left or (), result.adjustment.rows, result.seen.data.conditions
+    left, rows, predicted = result.left or (), result.adjustment.rows, result.predicted
     notes = [*result.seen.data.notes, *([COMPUTED] if computed else []), *rows.notes(result.robot)]
     notes += [*result.adjustment.notes, *([REPEATED] if result.adjustment.places() is not None else [])]
     notes += [*_little_known(result, tested), *(each.sentence() for each in left)]
-    if result.predicted is not None and left:
-        notes.append(
-            f"σ hold for these rows, and for places like theirs: the model leaves {result.predicted.left_mm:.2g} mm "
-            "RMS that goes with what is named above; over the joints' ranges the tool's position is known to "
-            f"{rms(result.predicted.ranges_mm):.2g} mm (σ, with that in it)"
-        )
+    if predicted is not None and left:
+        remains = f"the model leaves {predicted.left_mm:.2g} mm RMS that goes with what is named above"
+        known = f"the tool's position is known to {rms(predicted.ranges_mm):.2g} mm (σ, with that in it)"
+        notes.append(f"σ hold for these rows, and for places like theirs: {remains}; over the joints' ranges {known}")
         if not result.state.elastic and any(not each.advice for each in left):
             notes.append(TRY_ELASTIC)
     if result.robot.elasticity is None:
-        notes += conditions.ignored("the arm as identified")
+        notes += result.seen.data.conditions.ignored("the arm as identified")
     notes += _stated_otherwise(result)
     if result.held_out is not None:
         before, after = (result.errors[key].rms for key in ("nominal", "held_out"))
         if after > NO_GAIN * before > 0:
-            notes.append(
-                f"no gain: rows held out err by {after:.3g} mm (RMS) with the identified robot and by {before:.3g} mm "
-                "with the nominal one, base and tool fitted: what errs is not the robot's dimensions; check joint "
-                "values and measurements, rounding too"
-            )
+            errs = f"{after:.3g} mm (RMS) with the identified robot and by {before:.3g} mm with the nominal one"
+            fault = f"no gain: rows held out err by {errs}, base and tool fitted"
+            remedy = "check joint values and measurements, rounding too"
+            notes.append(f"{fault}: what errs is not the robot's dimensions; {remedy}")
     return (*notes, *_lengths(result))
 
 
@@ -466,12 +449,11 @@ def _little_known(result: Identified, tested: bool) -> list[str]:
     if times > ELSEWHERE:
         units = result.adjustment.units[: len(names)]
         sizes, directions = np.linalg.eigh(result.covariance / units[:, None] / units)
-        worst = directions_named(directions[:, -1:], names)[0]
+        worst = f"{directions_named(directions[:, -1:], names)[0]}, ± {np.sqrt(sizes[-1]):.2g} mm"
         notes.append(
             f"over the joints' ranges the tool's position is known to {ranges:.2g} mm (σ), {times:.0f} times that at "
-            f"the measured rows, {here:.2g} mm: they are few, or of a small part of the ranges; least known: {worst}, "
-            f"± {np.sqrt(sizes[-1]):.2g} mm; add rows (`stcal robot design`), or use the result where it was measured "
-            "only"
+            f"the measured rows, {here:.2g} mm: they are few, or of a small part of the ranges; least known: {worst}; "
+            "add rows (`stcal robot design`), or use the result where it was measured only"
         )
     return notes
 
@@ -485,18 +467,13 @@ def _lengths(result: Identified) -> list[str]:
         scale = float(lengths @ changes) / square
         rest = float(np.linalg.norm(changes - scale * lengths)) / np.sqrt(free * square)
         if abs(scale) > LEAST_SCALE and 2 * stdtr(free, -abs(scale) / max(rest, 1e-15)) < BY_CHANCE:
-            return [
-                f"all lengths of the robot are {1 + scale:.5f} ± {rest:.1g} times nominal: rather than of the arm, "
-                "this is the scale of the instrument, or of a board or target by which positions were measured; check "
-                "a known length"
-            ]
+            whose = "the scale of the instrument, or of a board or target by which positions were measured"
+            times = f"all lengths of the robot are {1 + scale:.5f} ± {rest:.1g} times nominal"
+            return [f"{times}: rather than of the arm, this is {whose}; check a known length"]
     far = np.flatnonzero(np.abs(changes) > OTHER_TYPE_MM)
     which = ", ".join(f"{'ad'[i % 2]} of joint {i // 2 + 1} by {changes[i]:+.1f} mm" for i in far[:SHOWN_LENGTHS])
-    said = (
-        f"lengths are not those of the robot file: {which}; arms of one type differ by less than 2 mm: check that the "
-        "file is of this type, and its units"
-    )
-    return [said] if len(far) else []
+    remedy = "arms of one type differ by less than 2 mm: check that the file is of this type, and its units"
+    return [f"lengths are not those of the robot file: {which}; {remedy}"] if len(far) else []
 
 
 def _stated_otherwise(result: Identified) -> list[str]:
@@ -523,6 +500,6 @@ def require_identified_written(path: Path | str, result: Identified) -> None:
     def again() -> np.ndarray:
         robot = load_robot(path)
         tools = {name: robot.tool(name) for name in result.state.tools}
-        return residuals(State(robot.chain(), tools, stations=result.state.stations), result.seen)
+        return State(robot.chain(), tools, stations=result.state.stations).residuals(result.seen)
 
     require_written(path, again, result.residuals, WRITTEN_MM, "mm or rad")

@@ -11,11 +11,12 @@ from scipy.optimize import least_squares
 
 from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
+from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import NormalEquations, minimise
-from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, by_pose
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
-from stcal.robot.identification.adjustment import State, observed, position_errors, residuals, tips_of
+from stcal.robot.identification.adjustment import State, observed, position_errors
 from stcal.robot.identification.problem import USELESS_MM
 from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
@@ -29,11 +30,9 @@ ROUNDS = 500
 SETTLED, REGULAR = 1e-5, 1e-10
 """Largest predicted decrease of the last step, as a share of the squared misfit, which is compared with others; and
 smallest damping, which keeps what these positions leave open at its start, as the point of a tool that never turned."""
-NEARLY = 1e-3
-"""Share of the squared misfit that the next step may still gain: of a wrong robot file the valley is flat."""
+NEARLY = 1e-3  # share of the squared misfit that the next step may still gain: of a wrong robot file the valley is flat
 STILL_MM = 0.01
-QUARTERS_DEG = (90, -90, 180)
-"""Errors of a joint's zero by conventions of the home position."""
+QUARTERS_DEG = (90, -90, 180)  # errors of a joint's zero by conventions of the home position
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
@@ -41,8 +40,7 @@ MOST_NAMED, SHOWN = 3, 6
 """Largest numbers of mistakes that explain the data equally and are named, and of lines that a message names."""
 GUESS_ROWS = 60
 """Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
-MOST_JOINTS = 8
-"""Largest number of joints of which two at a time are tried."""
+MOST_JOINTS = 8  # largest number of joints of which two at a time are tried
 LEAST_ORIENTATIONS = 5
 """Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
 PROBED, MOST_MOVES = 8, 4
@@ -63,25 +61,21 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     _require_motion(data, named)
     carriers = named if robot.tree is None else robot.tree.carriers
     for name in (name for name in named if name not in carriers):
-        target = f"target {name}; give it a [[target]] with joint"
-        target = target if name else "the tool of rows without a target; give [tool] joint"
-        raise InputError(
-            "E-ROBOT-TREE",
-            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}",
-        )
+        target = f"target {name}" if name else "the tool of rows without a target"
+        remedy = "give it a [[target]] with joint" if name else "give [tool] joint"
+        fault = f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}"
+        raise InputError("E-ROBOT-TREE", f"{fault}; {remedy}")
     default = robot.tools.get("", Rigid())
     tools = {name: robot.tools.get(name, default) if "tool" in fit else robot.tool(name) for name in named}
     state, misfit = _placed(robot, data, tools, fit)
     extent = _extent(data)
     if misfit > FITS * extent:
+        missed = f"misses the measurements by {misfit:.3g} mm RMS, {FITS * extent:.3g} mm allowed"
+        who, fault = f"{data.where}: robot {robot.name}", f"{missed}, {FITS:.0%} of their spread"
         if fit != BOTH and _placed(robot, data, tools)[1] <= FITS * extent:
-            raise InputError(
-                "E-IDENTIFY-MISFIT",
-                f"{data.where}: robot {robot.name} as its file stands misses the measurements by {misfit:.3g} mm RMS, "
-                f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; it fits with base and tool fitted to "
-                "them (base-tool)",
-            )
-        _explain(robot, data, tools, misfit, extent)
+            remedy = "it fits with base and tool fitted to them (base-tool)"
+            raise InputError("E-IDENTIFY-MISFIT", f"{who} as its file stands {fault}; {remedy}")
+        raise InputError("E-IDENTIFY-MISFIT", f"{who} {fault}; {_explanation(robot, data, tools, misfit / extent)}")
     if data.rotations is not None:
         flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
         require_orientations(data.where, data.targets, flange, data.rotations, len(data) >= LEAST_ORIENTATIONS)
@@ -97,52 +91,43 @@ def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
     stations = dict(state.stations)
     for name, rows in others:
         part = data[rows]
-        places = tips_of(state, part).translation
+        places = state.tips_of(part).translation
+        where = f"{data.where}: station {name}"
         try:
             stations[name] = align_rigid(part.points(), places)
         except DegenerateError as error:
-            raise DegenerateError(
-                "E-STATION-FEW",
-                f"{data.where}: station {name}: {rows.sum()} positions do not show where it stands; 3 or more off one "
-                "line needed, or leave them out",
-            ) from error
-        misfit, extent = _length_rms(part.points() - stations[name] @ places), _extent(part)
+            fault = f"{where}: {rows.sum()} positions do not show where it stands"
+            remedy = "3 or more off one line needed, or leave them out"
+            raise DegenerateError("E-STATION-FEW", f"{fault}; {remedy}") from error
+        misfit, extent = rms(position_errors(part.points() - stations[name] @ places)), _extent(part)
         if misfit > FITS * extent:
-            raise InputError(
-                "E-IDENTIFY-STATION",
-                f"{data.where}: station {name}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station "
-                f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station",
-            )
+            fault = f"{where}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station {first} place it"
+            allowed = f"{FITS:.0%} of their spread of {extent:.3g} mm allowed"
+            raise InputError("E-IDENTIFY-STATION", f"{fault}, {allowed}; check column station")
     return replace(state, stations=stations)
-
-
-def _length_rms(xyz: np.ndarray) -> float:
-    return float(np.sqrt((xyz**2).sum(-1).mean()))
 
 
 def _extent(data: Measurements) -> float:
     """Returns the RMS of the measured positions about their mean, or of the measured distances, mm."""
     if data.positions is None:
-        return _length_rms(data.lengths()[0][:, None])
-    return _length_rms(data.positions - data.positions.mean(0))
+        return rms(data.lengths()[0])
+    return rms(position_errors(data.positions - data.positions.mean(0)))
 
 
 def _require_motion(data: Measurements, targets: list[str]) -> None:
-    if data.positions is None and np.ptp(data.lengths()[0]) < STILL_MM:
-        raise DegenerateError(
-            "E-IDENTIFY-UNDETERMINED",
-            f"{data.where}: all distances are equal; positions apart from one another needed",
-        )
-    for name in targets if data.positions is not None else ():
-        xyz = data.points()[[t == name for t in data.targets]]
+    if data.positions is None:
+        if np.ptp(data.lengths()[0]) < STILL_MM:
+            fault = f"{data.where}: all distances are equal"
+            raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{fault}; positions apart from one another needed")
+        return
+    for name in targets:
+        xyz = data.positions[[t == name for t in data.targets]]
         moved = float(np.linalg.norm(np.ptp(xyz, axis=0)))
         if moved < STILL_MM and len(xyz) > 1:
-            raise DegenerateError(
-                "E-IDENTIFY-UNMOVED",
-                f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(xyz)} rows, more "
-                f"than {STILL_MM} mm needed); check that it was on the robot, and that each position was measured "
-                "again",
-            )
+            motion = f"{moved:.2g} mm over {len(xyz)} rows, more than {STILL_MM} mm needed"
+            remedy = "check that it was on the robot, and that each position was measured again"
+            fault = f"{data.where}: target {name or 'of all rows'} never moved ({motion})"
+            raise DegenerateError("E-IDENTIFY-UNMOVED", f"{fault}; {remedy}")
 
 
 def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
@@ -159,17 +144,15 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
     if "base" in fit:
         extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
         if len(extents) < 2 or extents[1] <= STILL_MM:
-            raise DegenerateError(
-                "E-IDENTIFY-UNDETERMINED",
-                f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that the instrument's pose is "
-                "not determined; move joints that take the target off the line",
-            )
+            line = f"{data.where}: all positions lie on one line (within {STILL_MM} mm)"
+            fault = f"{line}, so that the instrument's pose is not determined"
+            raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{fault}; move joints that take the target off the line")
     base, points = _base_and_points(robot, data.where, flange, data.points(), rows, points, fit)
     if data.rotations is not None and "tool" in fit:
         seen = np.swapaxes(flange.rotation, 1, 2) @ (base.inverse() @ data.poses()).rotation
         turns = [best_rotations(seen[rows == k].sum(0))[0] for k in range(len(names))]
     fitted = dict(zip(names, map(Rigid, turns, points), strict=True))
-    misfit = _length_rms(base @ (flange @ points[rows]) - data.positions)
+    misfit = rms(position_errors(base @ (flange @ points[rows]) - data.positions))
     return State(replace(robot, world_from_base=base).chain(), fitted), misfit
 
 
@@ -181,24 +164,21 @@ def _base_and_points(
     try:
         base = align_rigid(positions, flange @ points[rows]) if "base" in fit else robot.world_from_base
     except DegenerateError as error:
-        raise DegenerateError(
-            "E-IDENTIFY-UNDETERMINED",
-            f"{where}: according to the robot file, the target is on one line at all joint values, so that the "
-            "instrument's rotation about it is not determined; move other joints, or give the tool in the robot file "
-            "if it is off the axis",
-        ) from error
+        line = "according to the robot file, the target is on one line at all joint values"
+        fault = f"{where}: {line}, so that the instrument's rotation about it is not determined"
+        remedy = "move other joints, or give the tool in the robot file if it is off the axis"
+        raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{fault}; {remedy}") from error
     if not fit:
         return base, points
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
-    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    spread = position_errors(positions - positions.mean(0)).max()
     information = (np.array([spread] * 3 + [1.0] * (3 + points.size)) / USELESS_MM) ** 2
 
     def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
         points_base = flange @ at[1][rows]
         turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
-        derivative = np.concatenate(
-            [-skew(points_base @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2
-        )
+        by_base = by_pose(np.tile(np.eye(3), (len(rows), 1, 1)), points_base @ at[0].rotation.T)
+        derivative = np.concatenate([by_base, turned], axis=2)
         errors = (at[0] @ points_base - positions).ravel()
         held = NormalEquations(float(at[2] @ (information * at[2])), np.diag(information), information * at[2])
         return NormalEquations.of(errors, free * derivative.reshape(-1, derivative.shape[2])) + held
@@ -230,29 +210,22 @@ def _points_of_distances(
         # This is a start, converged or not: the adjustment goes on from here, and reports if it does not converge.
         fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
         points = min(fits, key=lambda fit: fit.cost).x.reshape(-1, 3)
-    return points, _length_rms(errors(points.ravel())[:, None])
+    return points, rms(errors(points.ravel()))
 
 
-Case = tuple[str, str, Robot, Measurements]
-"""What was mistaken, the remedy, and robot and data without the mistake."""
+Case = tuple[str, Robot, Measurements]  # what was mistaken, with the remedy, and robot and data without the mistake
 
 
-def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
-    """Raises an error that says what is wrong with the data, or with the robot file."""
+def _explanation(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float) -> str:
+    """Returns what is wrong with the data, or with the robot file; ``misfit`` : as a share of the data's spread."""
     thinned = data  # enough rows of positions to judge a guess; distances, which refer to one another, as they are
     if data.positions is not None:
         thinned = data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
-    levels = (
-        [("", "", robot, data)],
-        chain(*(kind(robot, thinned) for kind in (_of_values, _of_rows, _of_order)), _of_frames(robot, data)),
-        _moves_of(robot, data, tools),
-    )
-    most, found = min(EXPLAINS * misfit / extent, FITS), []
+    mistakes = chain(*(kind(robot, thinned) for kind in (_of_values, _of_rows, _of_order)), _of_frames(robot, data))
+    levels = [("", robot, data)], mistakes, _moves_of(robot, data, tools)
+    most, found = min(EXPLAINS * misfit, FITS), []
     for level in levels:  # one after the other: what a level tries may be impossible where an earlier one explains
-        cases = (
-            Candidate(f"{what}; {cure}" if what else "", partial(tuple, (variant, guess)))
-            for what, cure, variant, guess in level
-        )
+        cases = (Candidate(what, partial(tuple, case)) for what, *case in level)
         if found := explain(cases, lambda case: _fitting(case, tools)[0], most):
             break
     words = []
@@ -263,11 +236,7 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
         rows = f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
         words.append(", and ".join(filter(None, (each.words, rows if lines else ""))))
     cause = "check D-H rows and convention, the order and zero of joints, coupling, and units"
-    raise InputError(
-        "E-IDENTIFY-MISFIT",
-        f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, {FITS * extent:.3g} mm "
-        f"allowed, {FITS:.0%} of their spread; " + (f"it would fit if {', or if '.join(words)}" if words else cause),
-    )
+    return f"it would fit if {', or if '.join(words)}" if words else cause
 
 
 def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
@@ -280,7 +249,7 @@ def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple
         share = misfit / _extent(used)
         if data.positions is None:
             break
-        errors = position_errors(residuals(state, observed(data, "position")))
+        errors = position_errors(state.residuals(observed(data, "position")))
         limit = max(FAR * float(np.median(errors[near])), FITS * _extent(used))
         before, near = near, errors <= limit
         if share < FITS or (near == before).all() or near.mean() < MOSTLY_NEAR:
@@ -295,7 +264,7 @@ def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
     starts, far_mm = [0], FITS * _extent(data)
     while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
         state, misfit = _placed(robot, data[first : first + PROBED], tools)
-        far = position_errors(residuals(state, observed(data[first:], "position"))) > far_mm
+        far = position_errors(state.residuals(observed(data[first:], "position"))) > far_mm
         if misfit > far_mm or not far.any():
             break
         starts.append(first + int(far.argmax()))
@@ -313,58 +282,57 @@ def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
         what, column = "the target, and perhaps the instrument, had", "target"
     lines = ", ".join(str(data.lines[first]) for first in starts[1:])
     what = f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}"
-    yield what, f"name the rows from there on in column {column}", robot, pieces[0]
+    yield f"{what}; name the rows from there on in column {column}", robot, pieces[0]
 
 
 def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields data with joint values and lengths of another unit, sign or coupling."""
     q, sliding, n = data.q, robot.prismatic, len(robot.rows)
-    for what, cure, values in (
-        ("joint values are radians in columns of degrees", "call the columns q1_rad …", q * (180 / np.pi)),
-        ("joint values are degrees in columns of radians", "call the columns q1_deg …", q / (180 / np.pi)),
-        ("all joint values had the opposite sign", "check the rows and the joints' directions", -q),
+    for what, values in (
+        ("joint values are radians in columns of degrees; call the columns q1_rad …", q * (180 / np.pi)),
+        ("joint values are degrees in columns of radians; call the columns q1_deg …", q / (180 / np.pi)),
+        ("all joint values had the opposite sign; check the rows and the joints' directions", -q),
     ):
-        yield what, cure, robot, replace(data, q=np.where(sliding, q, values))
+        yield what, robot, replace(data, q=np.where(sliding, q, values))
     lengths = {"distances": data.distances, "positions": data.positions}
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
         for held, said, right, times in (there, ("mm", words, "mm", 1 / LENGTHS[unit])):
-            scaled: dict[str, Any] = {name: times * values for name, values in lengths.items() if values is not None}
-            cure = f"call the columns x_{right} … or distance_{right}"
-            yield f"lengths are {held} in columns of {said}", cure, robot, replace(data, **scaled)
+            scaled = {name: times * values for name, values in lengths.items() if values is not None}
+            remedy = f"call the columns x_{right} … or distance_{right}"
+            yield f"lengths are {held} in columns of {said}; {remedy}", robot, replace(data, **scaled)
     for i in range(n):
-        cure = f"check its direction in the rows, or the sign of q{i + 1}"
+        remedy = f"check its direction in the rows, or the sign of q{i + 1}"
         reversed_ = replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
-        yield f"joint {i + 1} had the opposite sign", cure, robot, reversed_
+        yield f"joint {i + 1} had the opposite sign; {remedy}", robot, reversed_
     if (robot.coupling != np.eye(n)).any():
-        uncoupled = replace(robot, coupling=np.eye(n))
-        yield "the joints were not coupled", "take coupling out of the robot file", uncoupled, data
-        other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
-        cure = "change the signs of coupling off its diagonal"
-        yield "the joints were coupled with the other sign", cure, other, data
+        what = "the joints were not coupled; take coupling out of the robot file"
+        yield what, replace(robot, coupling=None), data
+        what = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
+        yield what, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)
             coupling[2, 1] = sign
-            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}"
-            yield what, "give coupling in the robot file", replace(robot, coupling=coupling), data
+            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
+            yield what, replace(robot, coupling=coupling), data
 
 
 def _of_rows(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields the robot with rows of the other convention, unit, or zeros of joints that neither base nor tool takes."""
     other = "standard" if robot.convention == "modified" else "modified"
-    cure = f'give convention = "{other}" in the robot file'
-    yield f"rows were of the {other} convention", cure, replace(robot, convention=other), data
+    what = f'rows were of the {other} convention; give convention = "{other}" in the robot file'
+    yield what, replace(robot, convention=other), data
     angles = np.array([[row.alpha, row.theta] for row in robot.rows])
     if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
         rows = tuple(replace(row, alpha=np.degrees(row.alpha), theta=np.degrees(row.theta)) for row in robot.rows)
-        yield "angles of the robot file were radians", "write them in degrees", replace(robot, rows=rows), data
+        yield "angles of the robot file were radians; write them in degrees", replace(robot, rows=rows), data
     inner = np.flatnonzero(~robot.prismatic[1:-1]) + 1
     for i, turn in product(inner.tolist(), QUARTERS_DEG):
         rows = list(robot.rows)
         rows[i] = replace(rows[i], theta=rows[i].theta + np.radians(turn))
-        turned = replace(robot, rows=tuple(rows))
-        yield f"theta of joint {i + 1} were larger by {turn:+d}°", "correct theta_deg", turned, data
+        what = f"theta of joint {i + 1} were larger by {turn:+d}°; correct theta_deg"
+        yield what, replace(robot, rows=tuple(rows)), data
 
 
 def _of_order(robot: Robot, data: Measurements) -> Iterator[Case]:
@@ -373,37 +341,35 @@ def _of_order(robot: Robot, data: Measurements) -> Iterator[Case]:
     for i, k in combinations(range(n), 2) if n <= MOST_JOINTS else ():
         if sliding[i] == sliding[k]:
             order = [{i: k, k: i}.get(r, r) for r in range(n)]
-            columns = f"columns q{i + 1} and q{k + 1} were exchanged"
-            yield columns, "correct the order of the joint values", robot, replace(data, q=q[:, order])
+            what = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
+            yield what, robot, replace(data, q=q[:, order])
             if robot.tree is None:
-                what, rows = f"rows {i + 1} and {k + 1} were exchanged", tuple(robot.rows[r] for r in order)
-                yield what, "correct the robot file", replace(robot, rows=rows), data
+                what = f"rows {i + 1} and {k + 1} were exchanged; correct the robot file"
+                yield what, replace(robot, rows=tuple(robot.rows[r] for r in order)), data
     if sliding.all() or not sliding.any():
-        backward = replace(data, q=q[:, ::-1])
-        yield "joint values were in the opposite order, the last joint first", "correct the columns", robot, backward
+        what = "joint values were in the opposite order, the last joint first; correct the columns"
+        yield what, robot, replace(data, q=q[:, ::-1])
 
 
 def _of_frames(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields positions that are of other rows, mirrored, or seen from the tool."""
     if data.positions is None:
         return
-    cure = "pair each position with the joint values of its moment"
+    remedy = "pair each position with the joint values of its moment"
     for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
         if len(data) > 2:
             shifted = replace(data[places], q=data.q[joints])
-            yield f"joint values stood one row further {way}", cure, robot, shifted
+            yield f"joint values stood one row further {way}; {remedy}", robot, shifted
     moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
     if not moved.all():
         first, last = np.flatnonzero(~moved)[[0, -1]]
-        what = (
-            f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}, did not repeat the position "
-            "of the row before them, while the joints moved"
-        )
-        yield what, "leave them out, or measure again", robot, data[moved]
+        rows = f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}"
+        what = f"{rows}, did not repeat the position of the row before them, while the joints moved"
+        yield f"{what}; leave them out, or measure again", robot, data[moved]
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
-    yield "positions are mirrored (a left-handed frame)", "change the sign of one axis", robot, mirrored
+    yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
     if data.rotations is not None:
         inverse = data.poses().inverse()
         inverted = replace(data, positions=inverse.translation, rotations=inverse.rotation, covariance=None)
-        cure = "give the tool in the instrument's frame"
-        yield "poses are inverse (instrument seen from the tool)", cure, robot, inverted
+        what = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
+        yield what, robot, inverted

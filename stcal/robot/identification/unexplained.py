@@ -1,39 +1,26 @@
 """F tests of effects that a model leaves in the residuals: of a joint's angle, gravity, place, or order of the rows."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import fdtrc
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import (
-    WIDTH,
-    Observed,
-    State,
-    Weighting,
-    as_seen,
-    frame_motions,
-    jacobian,
-    residuals,
-    tips_of,
-    tool_motions,
-)
+from stcal.robot.identification.adjustment import WIDTH, Observed, State, Weighting, frame_motions, tool_motions
 from stcal.robot.identification.problem import GROSS
 from stcal.robot.kinematics.forward import joint_frames, joint_motions
 from stcal.row_order import Change, changes_along
 
-LEVEL = 0.01
-"""Probability that anything is reported of a clean set; it is divided among the tests (Bonferroni)."""
-MOST = 3
-"""Largest number of findings, the strongest first."""
+LEVEL = 0.01  # probability that anything is reported of a clean set; it is divided among the tests (Bonferroni)
+MOST = 3  # largest number of findings, the strongest first
 LEAST_SHARE, LEAST_MM, LEAST_RAD = 0.01, 1e-3, 1e-6
 """Smallest share of the squared residuals, and smallest RMS effects, that are worth a sentence."""
-LEAST_FREEDOM = 10
-"""Smallest number of degrees of freedom that allows a test."""
+LEAST_FREEDOM = 10  # smallest number of degrees of freedom that allows a test
 NEW, SAME = 1e-3, 1e-9
 """Share of a motion that must be left beside the parameters, and share below which a remainder is rounding."""
-SHARED = 4
-"""Number of distances from one position from which on the error of this position counts as a parameter."""
+SHARED = 4  # number of distances from one position from which on the error of this position counts as a parameter
 TURNS = {1: "once a turn", 2: "twice a turn"}
 
 
@@ -79,34 +66,25 @@ def left(
     ``explained`` : (r, w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are
     left out.
     """
-    explained = jacobian(state, measured) if explained is None else explained
+    explained = state.jacobian(measured) if explained is None else explained
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
-    rows = _Weighted(residuals(state, measured), weighting, measured)
+    rows = state.residuals(measured), partial(weighting.whiten, measured=measured)
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
-    weights = np.ones(len(rows.errors)) if weights is None else weights
-    rest = _Rest.of(rows, explained, candidates, np.sqrt(weights) * (weights >= GROSS))
-    findings: list[Effect] = []
+    weights = np.ones(len(rows[0])) if weights is None else weights
+    rest = _Rest.of(*rows, explained, candidates, np.sqrt(weights) * (weights >= GROSS))
+    findings, tests = [], len(candidates) + len(order)
     while len(findings) < MOST:
-        tried = rest.strongest(len(order)), _moved_meanwhile(rows, order, explained, len(candidates) + len(order))
+        tried = rest.strongest(len(order)), _moved_meanwhile(*rows, measured.lines, order, explained, tests)
         found = min((each for each in tried if each is not None), key=lambda each: each.log_p, default=None)
         if found is None:
             break
         findings.append(found.finding)
         explained = np.concatenate([explained, found.motions], axis=2)
-        rest = found.rest or _Rest.of(rows, explained, candidates, found.root)
+        rest = found.rest or _Rest.of(*rows, explained, candidates, found.root)
     return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weighted:
-    """Residuals (r, w) of observations, with their weights."""
-
-    errors: np.ndarray
-    weighting: Weighting
-    measured: Observed
-
-    def white(self, values: np.ndarray) -> np.ndarray:
-        return self.weighting.whiten(values, self.measured)
+Whiten = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,11 +112,15 @@ class _Found:
     root: np.ndarray
     rest: "_Rest | None" = None
 
-    def worth_saying(self) -> "_Found | None":
-        """Returns the finding if it is beyond chance, and not tiny."""
-        found = self.finding
-        tiny = found.share < LEAST_SHARE or (found.effect_mm < LEAST_MM and found.effect_rad < LEAST_RAD)
-        return None if tiny or self.log_p > np.log(LEVEL) else self
+    @classmethod
+    def of(
+        cls, finding: Effect, log_p: float, motions: np.ndarray, root: np.ndarray, rest: "_Rest | None" = None
+    ) -> "_Found | None":
+        """Returns the finding, with its probability, if it is beyond chance, and not tiny."""
+        tiny = finding.share < LEAST_SHARE or (finding.effect_mm < LEAST_MM and finding.effect_rad < LEAST_RAD)
+        if tiny or log_p > np.log(LEVEL):
+            return None
+        return cls(replace(finding, p=float(np.exp(min(log_p, 0.0)))), log_p, motions, root, rest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,20 +139,20 @@ class _Rest:
     effects: list[tuple[_Effect, np.ndarray]]
 
     @classmethod
-    def of(cls, rows: _Weighted, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray) -> "_Rest":
-        """Returns the residuals that the motions ``explained`` (r, w, k) leave."""
+    def of(
+        cls, errors: np.ndarray, white: Whiten, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray
+    ) -> "_Rest":
+        """Returns the residuals that the motions ``explained`` (r, w, k) leave of ``errors`` (r, w)."""
 
-        def white(values: np.ndarray) -> np.ndarray:
-            return (root[:, None, None] * rows.white(values)).reshape(rows.errors.size, -1)
+        def weighted(values: np.ndarray) -> np.ndarray:
+            return (root[:, None, None] * white(values)).reshape(errors.size, -1)
 
-        good = root > 0
-        fitted = _basis(_unit(white(explained)), SAME)
-        before = white(rows.errors[..., None]).ravel()
+        good, fitted = root > 0, _basis(_unit(weighted(explained)), SAME)
+        before = weighted(errors[..., None]).ravel()
         remaining = before - fitted @ (fitted.T @ before)
-        freedom = int(good.sum()) * rows.errors.shape[1] - fitted.shape[1]
-        effects = [(each, white(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
-        square = float(remaining @ remaining)
-        return cls(rows.errors[good], before, fitted, remaining, square, freedom, root, effects)
+        freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
+        effects = [(each, weighted(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
+        return cls(errors[good], before, fitted, remaining, float(remaining @ remaining), freedom, root, effects)
 
     def strongest(self, others: int) -> _Found | None:
         """Returns the candidate that explains most beyond chance; ``others`` : number of further tests."""
@@ -182,19 +164,16 @@ class _Rest:
 
         def size(part: slice) -> float:
             """Returns the amplitude, or RMS, of what the candidate takes, rad or mm."""
-            unit, white, taken = (
-                float((each.reshape(-1, width)[:, part] ** 2).sum()) for each in (self.errors, self.before, takes)
-            )
+            parts = (each.reshape(-1, width)[:, part] for each in (self.errors, self.before, takes))
+            unit, white, taken = (float((each**2).sum()) for each in parts)
             return float(amplitude * np.sqrt(unit / np.count_nonzero(self.root) / max(white, 1e-300) * taken))
 
         mm, rad = size(slice(-3, None)), size(slice(0, 3)) if width == 6 else 0.0
-        log_p += float(np.log(len(tried) + others))
         share, fitted = float(takes @ takes) / max(self.square, 1e-300), np.hstack([self.fitted, new])
         freedom = self.freedom - new.shape[1]
         rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
-        p = float(np.exp(min(log_p, 0.0)))
-        finding = Effect(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
-        return _Found(finding, log_p, candidate.motions, self.root, rest).worth_saying()
+        finding = Effect(candidate.what, candidate.joint, candidate.turns, mm, rad, share, 1.0)
+        return _Found.of(finding, log_p + float(np.log(len(tried) + others)), candidate.motions, self.root, rest)
 
     def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
         """Returns the F test of what ``values`` (N, c) add: log p, the part (N,) of the residuals that it explains, and
@@ -228,9 +207,7 @@ def _shared(state: State, measured: Observed) -> np.ndarray:
     starts = starts[counts >= SHARED]
     if measured.kind != "distance" or not len(starts):
         return np.zeros((len(measured), WIDTH[measured.kind], 0))
-    place = tips_of(state, measured.data).translation
-    away = place[measured.first] - place[measured.second]
-    away /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
+    away = measured.along(state.tips_of(measured.data))
     return np.concatenate([away * (measured.second == row)[:, None] for row in starts], axis=1)[:, None]
 
 
@@ -241,10 +218,10 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     """Returns what may move during the measurements; none for distances, which no frame enters."""
     if measured.used == "distance":
         return []
-    tip, data, order = tips_of(state, measured.data), measured.data, []
+    tip, data, order = state.tips_of(measured.data), measured.data, []
 
     def add(what: str, motions: np.ndarray, advice: str, joint: int = 0, slides: bool = False) -> None:
-        order.append(_Effect(what, joint, as_seen(state, measured, tip, motions), 0, advice, slides))
+        order.append(_Effect(what, joint, state.as_seen(measured, tip, motions), 0, advice, slides))
 
     another = "name these rows another {0} (column {0}), or measure again"
     frame = frame_motions(tip, tip.translation.mean(0))
@@ -260,31 +237,31 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     return order
 
 
-def _moved_meanwhile(rows: _Weighted, order: list[_Effect], explained: np.ndarray, tests: int) -> _Found | None:
+def _moved_meanwhile(
+    errors: np.ndarray, white: Whiten, lines: list[int], order: list[_Effect], explained: np.ndarray, tests: int
+) -> _Found | None:
     """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
-    motions = [rows.white(each.motions) for each in order]
-    changes = changes_along(rows.white(rows.errors), rows.white(explained), motions)
+    changes = changes_along(white(errors), white(explained), [white(each.motions) for each in order])
     found = [(each, change) for each, change in zip(order, changes, strict=True) if change is not None]
     if not found:
         return None
     moved, change = min(found, key=lambda each: each[1].log_p)
-    what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
+    when, line, advice = "by and by", None, DRIFTS
     if change.kind != "drift":
-        lines = rows.measured.lines
         line, advice = lines[change.row], moved.advice
         likely = f" ({lines[change.first]} to {lines[change.last]} as likely)" if change.first < change.last else ""
-        what = f"the order of the rows, {moved.what} from line {line}{likely} on"
-    log_p = change.log_p + float(np.log(tests))
-    p = float(np.exp(min(log_p, 0.0)))
-    finding = Effect(what, moved.joint, 0, *_size(moved, change), change.share, p, line, advice)
+        when = f"from line {line}{likely} on"
+    what, size = f"the order of the rows, {moved.what} {when}", _size(moved, change)
+    finding = Effect(what, moved.joint, 0, *size, change.share, 1.0, line, advice)
     taken = change.moves[:, None, None] * moved.motions
-    return _Found(finding, log_p, taken, change.good.astype(float)).worth_saying()
+    return _Found.of(finding, change.log_p + float(np.log(tests)), taken, change.good.astype(float))
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Effect | None:
     """Returns the jump or drift along the rows, of equal σ; None without one of more than ``share`` of the squares."""
-    order, rows = _order(state, measured), _Weighted(residuals(state, measured), Weighting(1.0, 1.0), measured)
-    found = _moved_meanwhile(rows, order, jacobian(state, measured), len(order))
+    order, errors = _order(state, measured), state.residuals(measured)
+    white = partial(Weighting(1.0, 1.0).whiten, measured=measured)
+    found = _moved_meanwhile(errors, white, measured.lines, order, state.jacobian(measured), len(order))
     return found.finding if found is not None and found.finding.share > share else None
 
 
@@ -301,7 +278,7 @@ def _size(moved: _Effect, change: Change) -> tuple[float, float]:
 def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> list[_Effect]:
     """Returns what may go with the place, or with the values and torques of joints."""
     chain, data = state.chain, measured.data
-    tip = tips_of(state, data)
+    tip = state.tips_of(data)
     turned, origins = joint_frames(chain, data.q, data.conditions)
     base, place = world_from_base.rotation, world_from_base.inverse() @ tip.translation
     along = np.concatenate([np.zeros((3, 3)), base])  # motions along the base's axes
@@ -310,7 +287,7 @@ def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> lis
     def add(what: str, motions: np.ndarray, joint: int = 0, turns: int = 0) -> None:
         if joint:
             motions = motions * carries[joint - 1, :, None, None]
-        candidates.append(_Effect(what, joint, as_seen(state, measured, tip, motions), turns))
+        candidates.append(_Effect(what, joint, state.as_seen(measured, tip, motions), turns))
 
     twists = joint_motions(chain, data.q, tip, data.conditions)[..., None]
     for i, (z, origin, twist) in enumerate(zip(turned[..., 2], origins, twists, strict=True)):

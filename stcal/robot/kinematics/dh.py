@@ -1,7 +1,7 @@
 """Denavit-Hartenberg rows from a chain of axes, and checks of poses against joint values."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import partial
 
 import numpy as np
@@ -74,14 +74,8 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     if tree is not None:
         before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
         tree = replace(tree, mounts={i: (after, before[i] @ begin(i)) for i, (after, _) in mounts.items()})
-    robot = replace(
-        nominal,
-        rows=tuple(rows),
-        world_from_base=base,
-        tools={name: end(k := chain.carrier(name)) @ chain.ends[k] @ tool for name, tool in tools.items()},
-        elasticity=None,
-        tree=tree,
-    )
+    on_flange = {name: end(k := chain.carrier(name)) @ chain.ends[k] @ tool for name, tool in tools.items()}
+    robot = replace(nominal, rows=tuple(rows), world_from_base=base, tools=on_flange, elasticity=None, tree=tree)
     if chain.elasticity is None:
         return robot
     return replace(robot, elasticity=_elasticity(robot, chain, chain.elasticity, end(chain.carrier(""))))
@@ -110,18 +104,14 @@ def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
     """Returns the row with θ, d of the previous joint and a, α, β to the next axis, up to that joint's motion."""
     z, place = gap.rotation[:, 2], gap.translation
     sine = float(np.hypot(z[0], z[1]))
-    parallel = sine < np.sin(PARALLEL_RAD)
-    if parallel:
-        theta = nominal.theta
+    if sine < np.sin(PARALLEL_RAD):
+        a, theta = nominal.a, nominal.theta
         if not to_prismatic:
             x, y = place[:2] + (nominal.d - place[2]) / z[2] * z[:2]
-            offset = float(np.hypot(x, y))
             sign = -1.0 if nominal.a < 0 else 1.0
-            a = sign * offset
-            if offset > SAME_AXIS_MM:
+            a = sign * float(np.hypot(x, y))
+            if abs(a) > SAME_AXIS_MM:
                 theta = _near(float(np.arctan2(sign * y, sign * x)), nominal.theta)
-        else:
-            a = nominal.a
         rotated = about_z(-theta) @ z  # (sin β, −sin α cos β, cos α cos β)
         alpha = _near(float(np.arctan2(-rotated[1], rotated[2])), nominal.alpha)
         return DHRow(a, alpha, nominal.d, theta, float(np.arcsin(rotated[0])))
@@ -152,8 +142,10 @@ def robot_between(
             k = i if convention == "standard" else i + 1
             hints[k] = DHRow(-robot.rows[k].a, -robot.rows[k].alpha, 0.0, 0.0)
             robot = _with_ends(chain, tools, replace(bare, rows=tuple(hints)))
-    rows = [DHRow(_length(r.a), _angle(r.alpha), _length(r.d), _angle(r.theta), _angle(r.beta)) for r in robot.rows]
-    return replace(robot, rows=tuple(rows))
+    rows = np.array([astuple(row) for row in robot.rows])  # without rounding errors of lengths of 0 and right angles
+    exact = np.pi / 2 * np.round(rows / (np.pi / 2)) * [0, 1, 0, 1, 1] + 0.0  # not -0
+    rounded = np.abs(rows - exact) < [NOTHING_MM, NOTHING_RAD, NOTHING_MM, NOTHING_RAD, NOTHING_RAD]
+    return replace(robot, rows=tuple(DHRow(*row) for row in np.where(rounded, exact, rows).tolist()))
 
 
 def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
@@ -188,17 +180,6 @@ def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
     return row if fits else None
 
 
-def _length(value: float) -> float:
-    """Returns ``value``, or 0 if it is only rounding error."""
-    return 0.0 if abs(value) < NOTHING_MM else value
-
-
-def _angle(value: float) -> float:
-    """Returns ``value``, or the nearest multiple of 90° if the difference is only rounding error."""
-    right = np.pi / 2 * round(value / (np.pi / 2))
-    return right if abs(value - right) < NOTHING_RAD else value
-
-
 FITS, TURNED_RAD = 0.05, 0.2
 """Largest RMS error of a nominal robot over the spread of its data, and of orientations: twice what robots err by."""
 
@@ -227,11 +208,9 @@ def require_orientations(
     for best, left in found[:1]:
         raise InputError("E-ROBOT-ORIENTATIONS", f"{missed} allowed; by {np.degrees(left):.2g}° if {best.words}")
     if many:
-        raise InputError(
-            "E-ROBOT-ORIENTATIONS",
-            f"{missed} allowed, though positions fit; check the convention of the angles and that each orientation is "
-            "in the line of its joint values, or leave the orientations out",
-        )
+        remedy = "check the convention of the angles and that each orientation is in the line of its joint values"
+        fault = f"{missed} allowed, though positions fit"
+        raise InputError("E-ROBOT-ORIENTATIONS", f"{fault}; {remedy}, or leave the orientations out")
 
 
 def _typical_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
@@ -251,14 +230,12 @@ def _misread(seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     moving = Rotation.from_matrix(seen).as_euler("XYZ")
     swapped = "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)"
     signs = zip("XYZ", 1 - 2 * np.eye(3), strict=True)
-    angles = [(f"the angle about {axis} had the other sign", "xyz", fixed * sign) for axis, sign in signs]
-    angles = [
+    for words, axes, values in (
         (swapped, "xyz", fixed[:, ::-1]),
-        *angles,
+        *((f"the angle about {axis} had the other sign", "xyz", fixed * sign) for axis, sign in signs),
         ("the angles were about moving axes, X first", "XYZ", fixed),
         ("the angles were about fixed axes, X first", "xyz", moving),
-    ]
-    for words, axes, values in angles:
+    ):
         yield f"{words}: correct them", rows, Rotation.from_euler(axes, values).as_matrix()
     yield "each orientation were in the line before: correct them", rows[:-1], seen[1:]
     yield "each orientation were in the line after: correct them", rows[1:], seen[:-1]

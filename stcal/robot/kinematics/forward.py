@@ -13,8 +13,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot, loaded, warn_of_degrees
 
 GRAVITY_M_S2 = 9.80665
-CHUNK = 8192
-"""Number of joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache."""
+CHUNK = 8192  # number of joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache
 
 
 def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
@@ -119,15 +118,11 @@ def torques(
     """Returns the torque of gravity about each joint, (n, m, 3) N m, in the world's axes; frames from :func:`links`."""
     elasticity = _elasticity(chain)
     carried = chain.gathered((rotation @ elasticity.moment[:, None, :, None])[:, :, :, 0])
-    mass = conditions.payload_kg
-    if mass is None:
-        mass = np.full(len(q), elasticity.payload_kg)
+    mass = np.full(len(q), elasticity.payload_kg) if conditions.payload_kg is None else conditions.payload_kg
     if mass.any():
         if "" not in chain.order.carriers:
-            raise InputError(
-                "E-ROBOT-TREE",
-                "the robot is a tree of joints, and its file does not say which carries the load; give [tool] joint",
-            )
+            fault = "the robot is a tree of joints, and its file does not say which carries the load"
+            raise InputError("E-ROBOT-TREE", f"{fault}; give [tool] joint")
         last = chain.carrier("")
         place = origin[last] + rotation[last] @ elasticity.payload_centre
         if chain.prismatic[last]:
@@ -201,20 +196,10 @@ def _walk(
     return axes, origin
 
 
-def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
-    """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz.
-
-    An axis is a line: rotation about it and shift along it belong to the frames that follow, and of a prismatic joint
-    only the direction counts. With the six of one tool this is the complete, minimal and
-    continuous set of 4 R + 2 P + 6 (Zhuang, Roth & Hamano 1992; Okamura & Park 1996).
-    """
-    return [(i, c) for i in range(len(chain)) for c in ((0, 1) if chain.prismatic[i] else (0, 1, 3, 4))]
-
-
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Returns the derivative (m, 6, k) of ``tip`` by :func:`chain_parameters`, in the world's axes."""
+    """Returns the derivative (m, 6, k) of ``tip`` by :meth:`Chain.parameters`, in the world's axes."""
     rotation, origin = joint_frames(chain, q, conditions)
-    joint, component = np.array(chain_parameters(chain)).T
+    joint, component = np.array(chain.parameters()).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
     turning = (component < 3)[:, None, None]
     swept = np.cross(direction, (tip.translation - origin)[joint])
@@ -230,7 +215,7 @@ def elasticity_jacobian(
     conditions: Conditions = USUAL,
     hysteresis: bool = False,
 ) -> np.ndarray:
-    """Returns the derivative (m, 6, 9 n or 10 n) of ``tip`` by :func:`elasticity_values`, in the world's axes."""
+    """Returns the derivative (m, 6, 9 n or 10 n) of ``tip`` by :meth:`Elasticity.values`, in the world's axes."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
@@ -276,38 +261,6 @@ def elasticity_curvature(
 def _by_moment(chain: Chain, rotation: np.ndarray, elasticity: Elasticity) -> np.ndarray:
     """Returns the derivative (n, m, 3, 3) of the torque, in the world's axes, by each link's moment."""
     return np.cross(rotation, (chain.rotation[0] @ elasticity.gravity)[:, None], axisa=2, axisb=0, axisc=2)
-
-
-def elasticity_values(elasticity: Elasticity, hysteresis: bool = False) -> np.ndarray:
-    """Returns compliance, moment and periodic of all joints, each row by row, (9 n,), or (10 n,) with hysteresis."""
-    parts = [elasticity.compliance.ravel(), elasticity.moment.ravel(), elasticity.periodic.ravel()]
-    return np.concatenate([*parts, *([elasticity.hysteresis] if hysteresis else [])])
-
-
-def with_values(elasticity: Elasticity, values: np.ndarray) -> Elasticity:
-    """Returns the elasticity with other :func:`elasticity_values`, (9 n,) or (10 n,)."""
-    n = len(elasticity.moment)
-    compliance, moment, periodic, hysteresis = np.split(values, [2 * n, 5 * n, 9 * n])
-    return replace(
-        elasticity,
-        compliance=compliance.reshape(n, 2),
-        moment=moment.reshape(n, 3),
-        periodic=periodic.reshape(n, 4),
-        hysteresis=hysteresis if len(hysteresis) else elasticity.hysteresis,
-    )
-
-
-def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
-    """Returns the chain after small motions along :func:`chain_parameters`, (k,)."""
-    twist = np.zeros((len(chain), 6))
-    for value, (i, c) in zip(step, chain_parameters(chain), strict=True):
-        twist[i, c] = value
-    turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
-    translation = chain.translation + np.einsum("nij,nj->ni", chain.rotation, twist[:, 3:])
-    rotation = chain.rotation @ turn
-    # One step of Newton's iteration for the polar factor removes rounding errors.
-    rotation = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
-    return replace(chain, rotation=rotation, translation=translation)
 
 
 def _joint_vectors(q: ArrayLike, robot: Robot) -> np.ndarray:

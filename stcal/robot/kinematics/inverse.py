@@ -1,6 +1,6 @@
 """Inverse kinematics of any serial arm: many poses at once, joint limits, nearest branch."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,26 +13,21 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import flange_poses, from_base, tool_jacobian
 from stcal.robot.kinematics.robot_model import Robot
 
-DONE_MM, DONE_RAD = 1e-10, 1e-13
-"""Errors at which iteration ends, one digit below the tolerance of a reached pose."""
+DONE_MM, DONE_RAD = 1e-10, 1e-13  # errors at which iteration ends, one digit below the tolerance of a reached pose
 WITHIN_MM, WITHIN_RAD = 1e-9, 1e-12
 """Errors below which a pose counts as reached: far below any measurement, above the rounding of a chain of metres."""
 LONGEST, LEAST_DAMPING = 1.0, 1e-14
 """Longest step of a joint, rad or fraction of the reach, and smallest damping, for singular Jacobians."""
-ORIENTATION_WEIGHT = 0.03
-"""Weight of the orientation for arms of fewer than six joints, whose position has priority."""
-LIMIT_SLACK = 1e-9
-"""Largest excess over joint limits that counts as rounding, rad (or shares of the reach)."""
+ORIENTATION_WEIGHT = 0.03  # weight of the orientation for arms of fewer than six joints, whose position has priority
+LIMIT_SLACK = 1e-9  # largest excess over joint limits that counts as rounding, rad (or shares of the reach)
 SINGULAR = 1e-5
 """Smallest singular value (no unit) below which joint values are not determined, as an error of 1e-12 leaves 1e-6."""
-POOL, STARTS = 4096, 96
-"""Joint vectors over the range, and nearest that are starts: 96 miss none of 2738 branches."""
+POOL, STARTS = 4096, 96  # joint vectors over the range, and nearest that are starts: 96 miss none of 2738 branches
 SAME_BRANCH, SHORT = 1e-4, 0.1
 """Distances of joint vectors, rad, below which they are one solution, and up to which others are sought nearby only."""
 AS_GOOD = 2.0
 """Largest ratio of an orientation error to the least one that counts as equally good, for arms with few joints."""
-GROUP = 2048
-"""Number of poses processed at a time if all branches are sought."""
+GROUP = 2048  # number of poses processed at a time if all branches are sought
 TURN = 2 * np.pi
 
 REACHED, ORIENTATION, SINGULAR_POSE = "reached", "orientation", "singular"
@@ -73,6 +68,14 @@ class Inverse(Brief):
 
     def __len__(self) -> int:
         return len(self.status)
+
+    def with_rows(self, rows: Sequence[int], other: "Inverse") -> "Inverse":
+        """Returns these joint vectors, with those of ``other`` in some rows."""
+        q, status, error_mm, error_rad = self.q.copy(), [*self.status], self.error_mm.copy(), self.error_rad.copy()
+        q[rows], error_mm[rows], error_rad[rows] = other.q, other.error_mm, other.error_rad
+        for row, each in zip(rows, other.status, strict=True):
+            status[row] = each
+        return Inverse(q, tuple(status), error_mm, error_rad)
 
     @property
     def usable(self) -> np.ndarray:
@@ -170,11 +173,8 @@ class InverseProblem:
 
     def refuse_redundant(self) -> None:
         if (n := len(self.unit)) > 6:
-            raise InputError(
-                "E-ROBOT-REDUNDANT",
-                f"robot {self.robot.name}: {n} joints reach a pose in infinitely many ways; "
-                "give the joint values to stay near to (columns q1_deg …)",
-            )
+            fault = f"robot {self.robot.name}: {n} joints reach a pose in infinitely many ways"
+            raise InputError("E-ROBOT-REDUNDANT", f"{fault}; give the joint values to stay near to (columns q1_deg …)")
 
     def errors(self, poses: Poses, q: np.ndarray) -> np.ndarray:
         """Returns (m, 6) differences from the poses that q reaches to ``poses``: rad, mm."""

@@ -29,8 +29,7 @@ from stcal.robot.kinematics.robot_model import (
 WHAT = "robot data"
 STATUS, AMBIGUOUS = "status", "ambiguous"
 """Column ``status`` of ``stcal-sfm measure``, and its word for an undecided pose."""
-LONGEST_TOOL_MM = 10_000.0
-"""Longest possible tool, by which a target may be farther than the arm reaches."""
+LONGEST_TOOL_MM = 10_000.0  # longest possible tool, by which a target may be farther than the arm reaches
 ORIENTED_BY = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
 
 
@@ -47,9 +46,8 @@ class JointTable(Brief):
     def __getitem__(self, index) -> Self:
         """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
         if getattr(self, "distances", None) is not None:
-            raise InputError(
-                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be left out"
-            )
+            fault = f"{self.where}: distances refer to other rows, so that rows cannot be left out"
+            raise InputError("E-MEASURED-DISTANCES", fault)
         rows = np.arange(len(self))[index]
 
         def of(values: Any) -> Any:
@@ -153,9 +151,8 @@ class Measurements(JointTable):
     def own_covariance(self) -> np.ndarray:
         """Returns the covariances (m, 6, 6) of the independent errors of poses, without the common ones."""
         if self.covariance is None:
-            raise InputError(
-                "E-MEASURED-NO-COVARIANCE", f"{self.where}: poses without covariance; columns of it needed"
-            )
+            fault = f"{self.where}: poses without covariance"
+            raise InputError("E-MEASURED-NO-COVARIANCE", f"{fault}; columns of it needed")
         return self.covariance if self.common is None else self.covariance - self.common @ self.common.swapaxes(1, 2)
 
     def points(self) -> np.ndarray:
@@ -167,9 +164,8 @@ class Measurements(JointTable):
     def poses(self) -> Poses:
         """Returns the measured poses world_from_tool."""
         if self.rotations is None:
-            raise InputError(
-                "E-MEASURED-NO-ORIENTATION", f"{self.where}: positions without orientation; {ORIENTED_BY} needed"
-            )
+            fault = f"{self.where}: positions without orientation"
+            raise InputError("E-MEASURED-NO-ORIENTATION", f"{fault}; {ORIENTED_BY} needed")
         return Poses(self.rotations, self.points())
 
     def lengths(self) -> tuple[np.ndarray, np.ndarray]:
@@ -207,43 +203,32 @@ def read_measurements(
     if table.has("x", LENGTHS):
         poses, columns, said = oriented(table, rotation)
         covariance = None if poses is None else table.pose_covariances()
-        data = Measurements(
-            *base,
-            table.points(),
-            None if poses is None else poses.rotation,
-            covariance,
-            None if poses is None else table.common_errors(covariance),
-            stations=tuple(table.text("station")) if "station" in table else (),
-            notes=said + unread(table, (*columns, *own)),
-            conditions=conditions,
-        )
+        places, turns, common = table.points(), None, None
+        if poses is not None:
+            turns, common = poses.rotation, table.common_errors(covariance)
+        stations = tuple(table.text("station")) if "station" in table else ()
+        notes = said + unread(table, (*columns, *own))
+        given = places, turns, covariance, common
+        data = Measurements(*base, *given, stations=stations, notes=notes, conditions=conditions)
         _require_in_reach(data, robot)
         return _usable(data, table)
     if not table.has("distance", LENGTHS):
-        raise InputError(
-            "E-MEASURED-KIND",
-            f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
-            f"the header is {table.header()}{table.open_unit('x', LENGTHS)}",
-        )
+        fault = f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed"
+        header = f"the header is {table.header()}{table.open_unit('x', LENGTHS)}"
+        raise InputError("E-MEASURED-KIND", f"{fault}; {header}")
     distances = table.quantity("distance", LENGTHS)
     if rotation is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
-        )
+        fault = f"{table.where}: --rotation {rotation}, but distances have no orientation"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; leave it out")
     rows = table.numbers("from_row") if "from_row" in table else np.ones(len(table))
-    table.refuse(
-        (rows != rows.astype(int)) | (rows < 1) | (rows > len(rows)),
-        "E-MEASURED-FROM-ROW",
-        lambda i: f"from_row is {rows[i]:g}, 1 … {len(rows)} needed",
-    )
+    nowhere, needed = (rows != rows.astype(int)) | (rows < 1) | (rows > len(rows)), f"1 … {len(rows)} needed"
+    table.refuse(nowhere, "E-MEASURED-FROM-ROW", lambda i: f"from_row is {rows[i]:g}, {needed}")
     from_row = rows.astype(int) - 1
+    missing = "distances start at the first row, which is missing, or at the row that column from_row names"
     table.refuse(
         (from_row == np.arange(len(table))) & (distances > 1e-3),
         "E-MEASURED-DISTANCES",
-        lambda i: (
-            f"the distance of a position from itself is {distances[i]:.4g} mm, 0 needed: distances start at the first "
-            "row, which is missing, or at the row that column from_row names"
-        ),
+        lambda i: f"the distance of a position from itself is {distances[i]:.4g} mm, 0 needed: {missing}",
     )
     notes = unread(table, own)
     return Measurements(*base, distances=distances, from_row=from_row, notes=notes, conditions=conditions)
@@ -261,12 +246,10 @@ def _require_in_reach(data: Measurements, robot: Robot) -> None:
         away = np.linalg.norm(seen.points() - np.median(seen.points(), axis=0), axis=1)
         worst = int(away.argmax())
         if away[worst] > 2 * reach + LONGEST_TOOL_MM:
-            raise InputError(
-                "E-MEASURED-REACH",
-                f"{data.where}: line {seen.lines[worst]}: position is {away[worst]:.4g} mm from the middle of all "
-                f"(median {np.median(away):.4g} mm), robot {robot.name} reaches {reach:.4g} mm; correct it, or the "
-                "unit of x, y, z",
-            )
+            middle = f"from the middle of all (median {np.median(away):.4g} mm)"
+            fault = f"{data.where}: line {seen.lines[worst]}: position is {away[worst]:.4g} mm {middle}"
+            reaches = f"robot {robot.name} reaches {reach:.4g} mm"
+            raise InputError("E-MEASURED-REACH", f"{fault}, {reaches}; correct it, or the unit of x, y, z")
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
@@ -297,23 +280,19 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
     """Returns the joint values (m, n) of columns ``q1_deg`` … (``_rad``; ``_mm``, ``_m`` for prismatic joints)."""
     n = len(robot.rows)
     if any(name.startswith(f"q{n + 1}_") for name in table.columns):
-        raise InputError(
-            "E-ROBOT-MISMATCH",
-            f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints; give its own file",
-        )
+        fault = f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints"
+        raise InputError("E-ROBOT-MISMATCH", f"{fault}; give its own file")
     columns = []
     for i, sliding in enumerate(robot.prismatic, 1):
         units = LENGTHS if sliding else ANGLES
         values = table.quantity(f"q{i}", units)
         if not sliding and table.unit(f"q{i}", units) == "rad":
-            table.refuse(
-                np.abs(values) > 2 * np.pi * MOST_TURNS,
-                "E-JOINT-VALUE",
-                lambda row, i=i, values=values: (
-                    f"q{i}_rad is {values[row]:g}, over {MOST_TURNS:g} turns; if these are degrees call the column "
-                    f"q{i}_deg"
-                ),
-            )
+
+            def turns(row: int, i: int = i, values: np.ndarray = values) -> str:
+                fault = f"q{i}_rad is {values[row]:g}, over {MOST_TURNS:g} turns"
+                return f"{fault}; if these are degrees call the column q{i}_deg"
+
+            table.refuse(np.abs(values) > 2 * np.pi * MOST_TURNS, "E-JOINT-VALUE", turns)
         columns.append(values)
     return np.column_stack(columns)
 
@@ -323,10 +302,8 @@ def read_conditions(table: Table, payload_kg: float | None = None, joints: int =
     mass, approach = loaded(payload_kg, len(table)).payload_kg, None
     if PAYLOAD in table:
         if payload_kg is not None:
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out",
-            )
+            fault = f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave one of them out")
         mass = table.numbers(PAYLOAD)
         possible = (mass >= 0) & (mass <= MOST_KG)
         table.refuse(~possible, "E-PAYLOAD-VALUE", lambda i: f"{PAYLOAD} is {mass[i]:g}; 0 … {MOST_KG:g} needed")
@@ -367,9 +344,8 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
 
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
     if rotation is not None and (turned is None or turned.stated):
-        raise InputError(
-            "E-OPTION-NEEDS", f"{table.where}: no columns of angles that --rotation {rotation} is of; leave it out"
-        )
+        fault = f"{table.where}: no columns of angles that --rotation {rotation} is of"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; leave it out")
     if turned is None:
         return table.poses() if table.has_rotation() else None, (), ()
     columns = ", ".join(turned.columns)
@@ -430,9 +406,8 @@ class Targets(JointTable):
     def joints(self) -> np.ndarray:
         """Returns the commanded joint values (m, n), rad or mm. Raises an error if there are none."""
         if self.q is None:
-            raise InputError(
-                "E-TARGETS-NO-JOINTS", f"{self.where}: poses without joint values; columns q1_deg … needed"
-            )
+            fault = f"{self.where}: poses without joint values"
+            raise InputError("E-TARGETS-NO-JOINTS", f"{fault}; columns q1_deg … needed")
         return self.q
 
 
@@ -458,32 +433,19 @@ def read_targets(
     if table.has("x", LENGTHS):
         poses, columns, how_oriented = oriented(table, rotation)
         if poses is None:
-            raise InputError(
-                "E-TARGETS-NO-ORIENTATION", f"{table.where}: positions without orientation; {ORIENTED_BY} needed"
-            )
+            fault = f"{table.where}: positions without orientation"
+            raise InputError("E-TARGETS-NO-ORIENTATION", f"{fault}; {ORIENTED_BY} needed")
     elif not has_joints:
-        raise InputError(
-            "E-TARGETS-NO-POSES",
-            f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
-            f"the header is {table.header()}",
-        )
+        fault = f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed"
+        raise InputError("E-TARGETS-NO-POSES", f"{fault}; the header is {table.header()}")
     elif rotation is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out"
-        )
-    tools = targets_of(table)
-    table.refuse(
-        np.array([tool not in robot.tools for tool in tools]),
-        "E-ROBOT-NO-TOOL",
-        lambda i: f"target {tools[i]!r} is not in robot {robot.name}; there are {', '.join(map(repr, robot.tools))}",
-    )
-    return Targets(
-        table.where,
-        table.lines,
-        tools,
-        poses,
-        joint_values(table, robot) if has_joints else None,
-        {column: tuple(table.text(column)) for column in NAMES if column in table},
-        how_oriented + unread(table, (*columns, PAYLOAD)),
-        read_conditions(table, payload_kg),
-    )
+        fault = f"{table.where}: --rotation {rotation}, but no positions with angles"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; leave it out")
+    tools, known = targets_of(table), ", ".join(map(repr, robot.tools))
+    unknown = np.array([tool not in robot.tools for tool in tools])
+    said = f"is not in robot {robot.name}; there are {known}"
+    table.refuse(unknown, "E-ROBOT-NO-TOOL", lambda i: f"target {tools[i]!r} {said}")
+    q = joint_values(table, robot) if has_joints else None
+    names = {column: tuple(table.text(column)) for column in NAMES if column in table}
+    notes, conditions = how_oriented + unread(table, (*columns, PAYLOAD)), read_conditions(table, payload_kg)
+    return Targets(table.where, table.lines, tools, poses, q, names, notes, conditions)

@@ -31,10 +31,8 @@ from stcal.robot.kinematics.robot_model import (
 
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
-OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
-"""Endings of files of robots that are converted first."""
-MOST_JOINTS = 60
-"""Largest number of joints, that of a humanoid with hands."""
+OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")  # endings of files of robots that are converted first
+MOST_JOINTS = 60  # largest number of joints, that of a humanoid with hands
 WRITTEN_MM = 1e-5
 """Largest difference, mm, between a written robot file and what was reported: far above that of decimals."""
 _FORM = {
@@ -83,9 +81,8 @@ class _ElasticityFile(Strict):
         """Returns the elasticity of ``count`` joints."""
         for key, values in self:
             if isinstance(values, list) and len(values) != count:
-                raise InputError(
-                    "E-ROBOT-ENTRIES", f"{where}: {key} has {len(values)} entries, {count} needed, one for each joint"
-                )
+                fault = f"{where}: {key} has {len(values)} entries"
+                raise InputError("E-ROBOT-ENTRIES", f"{fault}, {count} needed, one for each joint")
         if not 0 <= self.payload_kg <= MOST_KG:
             raise InputError("E-PAYLOAD-VALUE", f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
 
@@ -117,14 +114,12 @@ def load_robot(path: str | Path) -> Robot:
     Raises InputError: unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling
     matrix that does not fit, quaternions that are not unit; the message names the file and the place.
     """
-    if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
-        raise InputError(
-            "E-ROBOT-FORM",
-            f"{WHAT} {path}: TOML needed; `stcal robot convert {Path(path).name} robot.toml` makes it of URDF, and of "
-            "the calibration of an arm of Universal Robots",
-        )
-    data = load_toml(path, _RobotFile, WHAT, REMEDY)
     where = f"{WHAT} {path}"
+    if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
+        remedy = f"`stcal robot convert {Path(path).name} robot.toml` makes it of URDF"
+        others = "of the calibration of an arm of Universal Robots"
+        raise InputError("E-ROBOT-FORM", f"{where}: TOML needed; {remedy}, and {others}")
+    data = load_toml(path, _RobotFile, WHAT, REMEDY)
     rows, joints, n = [], [], len(data.joint)
     for i, j in enumerate(data.joint, 1):
         alpha, theta, beta = np.radians([j.alpha_deg, j.theta_deg, j.beta_deg]).tolist()
@@ -178,9 +173,8 @@ def _joint(j: _JointFile, where: str) -> Joint:
         limits.append(unlimited if value is None else value)
     lower, upper = limits
     if lower >= upper:
-        raise InputError(
-            "E-ROBOT-LIMITS", f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}; swap or correct them"
-        )
+        fault = f"{where}: min_{mine} {lower:g} is not below max_{mine} {upper:g}"
+        raise InputError("E-ROBOT-LIMITS", f"{fault}; swap or correct them")
     unit = np.pi / 180 if mine == "deg" else 1.0
     fixed = {key.partition("_")[0]: reason for key, reason in j.fixed.items()}
     return Joint(j.type, float(lower * unit), float(upper * unit), fixed)

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
@@ -58,13 +59,11 @@ class Conditions:
 
     def ignored(self, who: str) -> tuple[str, ...]:
         """Returns a note that the rigid arm ``who`` does not deflect under its payload; no note without payload."""
-        if not self.loaded:
-            return ()
-        return (f"{who} is rigid, {PAYLOAD} moves nothing (`identify --model elastic` tells what links give way by)",)
+        said = f"{who} is rigid, {PAYLOAD} moves nothing (`identify --model elastic` tells what links give way by)"
+        return (said,) if self.loaded else ()
 
 
-USUAL = Conditions()
-"""Default conditions: payload of the robot file, approach directions unknown."""
+USUAL = Conditions()  # default conditions: payload of the robot file, approach directions unknown
 
 
 def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
@@ -83,8 +82,7 @@ MOST_RAD = 2 * np.pi + 1e-6
 """Largest angle of a row, except the joint's own, rad. A larger one is taken to be in degrees."""
 
 
-MOST_TURNS = 4.0
-"""Number of turns that joints are not expected to reach: 25 rad, where degrees were meant."""
+MOST_TURNS = 4.0  # number of turns that joints are not expected to reach: 25 rad, where degrees were meant
 
 
 def warn_of_degrees(values: np.ndarray, turns: np.ndarray, what: str) -> None:
@@ -131,10 +129,8 @@ class DHRow:
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise InputError("E-ROBOT-ROW", f"row: {name} is {value!r}; a finite number needed")
             if name in ("alpha", "theta", "beta") and abs(float(value)) > MOST_RAD:
-                raise InputError(
-                    "E-ANGLE-UNIT",
-                    f"row: {name} is {value:g} rad, a turn is 6.28; if angles are degrees, convert them: np.radians",
-                )
+                fault = f"row: {name} is {value:g} rad, a turn is 6.28"
+                raise InputError("E-ANGLE-UNIT", f"{fault}; if angles are degrees, convert them: np.radians")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,14 +154,11 @@ class Joint:
     def __post_init__(self):
         require_fields(self, "joint")
         if not self.lower < self.upper:
-            raise InputError(
-                "E-ROBOT-LIMITS", f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them"
-            )
-        unknown = [name for name in self.fixed if name not in DHRow.__dataclass_fields__]
-        if unknown:
-            raise InputError(
-                "E-ROBOT-FIXED", f"joint: fixed {unknown[0]}: no dimension of a row; use {', '.join(DHRow.__slots__)}"
-            )
+            fault = f"joint: lower {self.lower:g} is not below upper {self.upper:g}"
+            raise InputError("E-ROBOT-LIMITS", f"{fault}; swap or correct them")
+        for unknown in (name for name in self.fixed if name not in DHRow.__slots__):
+            fault = f"joint: fixed {unknown}: no dimension of a row"
+            raise InputError("E-ROBOT-FIXED", f"{fault}; use {', '.join(DHRow.__slots__)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,11 +208,22 @@ class Elasticity:
             freeze(self, name, shape, f"elasticity: {name}")
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
-            raise InputError(
-                "E-ROBOT-ELASTICITY",
-                "elasticity: gravity is [0, 0, 0]; a direction in the base needed, such as [0, 0, -1]",
-            )
+            fault = "elasticity: gravity is [0, 0, 0]"
+            raise InputError("E-ROBOT-ELASTICITY", f"{fault}; a direction in the base needed, such as [0, 0, -1]")
         object.__setattr__(self, "gravity", frozen(self.gravity / length, (3,), "elasticity: gravity"))
+
+    def values(self, hysteresis: bool = False) -> np.ndarray:
+        """Returns compliance, moment and periodic of all joints, row by row, (9 n,), or (10 n,) with hysteresis."""
+        parts = [self.compliance.ravel(), self.moment.ravel(), self.periodic.ravel()]
+        return np.concatenate([*parts, *([self.hysteresis] if hysteresis else [])])
+
+    def with_values(self, values: np.ndarray) -> "Elasticity":
+        """Returns the elasticity with other :meth:`values`, (9 n,) or (10 n,)."""
+        n = len(self.moment)
+        compliance, moment, periodic, hysteresis = np.split(values, [2 * n, 5 * n, 9 * n])
+        compliance, moment, periodic = compliance.reshape(n, 2), moment.reshape(n, 3), periodic.reshape(n, 4)
+        hysteresis = hysteresis if len(hysteresis) else self.hysteresis
+        return replace(self, compliance=compliance, moment=moment, periodic=periodic, hysteresis=hysteresis)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,10 +242,8 @@ class Tree:
     def __post_init__(self):
         for joint, (after, _) in self.mounts.items():
             if not -1 <= after < joint:
-                raise InputError(
-                    "E-ROBOT-BRANCH",
-                    f"joint {joint + 1} is carried by joint {after + 1}; 0 (the base) or one that comes before needed",
-                )
+                fault = f"joint {joint + 1} is carried by joint {after + 1}"
+                raise InputError("E-ROBOT-BRANCH", f"{fault}; 0 (the base) or one that comes before needed")
 
     def after(self, joint: int) -> int:
         """The joint that carries ``joint``; −1 for the base."""
@@ -289,32 +291,25 @@ class Robot(Brief):
     unusual_size: bool = False
 
     def __post_init__(self):
+        where = f"robot {self.name}"
         for kind, parts in ((DHRow, self.rows), (Joint, self.joints)):
             for part in parts if isinstance(parts, Sequence) else (parts,):
                 if not isinstance(part, kind):
-                    raise InputError(
-                        "E-ROBOT-ENTRIES", f"robot {self.name}: {part!r} is no {kind.__name__}; one of that type needed"
-                    )
-        require_fields(self, f"robot {self.name}")
-        n = len(self.rows)
-        if len(self.joints) != n or n == 0:
-            raise InputError(
-                "E-ROBOT-ENTRIES",
-                f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed",
-            )
-        require_millimetres(longest_link(self.rows), self.unusual_size, f"robot {self.name}")
+                    fault = f"{where}: {part!r} is no {kind.__name__}"
+                    raise InputError("E-ROBOT-ENTRIES", f"{fault}; one of that type needed")
+        require_fields(self, where)
+        n, joints = len(self.rows), len(self.joints)
+        if joints != n or n == 0:
+            raise InputError("E-ROBOT-ENTRIES", f"{where}: {n} rows and {joints} joints, one row for each joint needed")
+        require_millimetres(longest_link(self.rows), self.unusual_size, where)
         coupling = np.eye(n) if self.coupling is None else self.coupling  # None: not given
-        object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
+        object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"{where}: coupling"))
         if np.linalg.cond(self.coupling) > 1e6:
-            raise InputError(
-                "E-ROBOT-COUPLING",
-                f"robot {self.name}: the coupling matrix cannot be inverted; a regular matrix needed",
-            )
-        if self.elasticity is not None and len(self.elasticity.moment) != n:
-            raise InputError(
-                "E-ROBOT-ENTRIES",
-                f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows",
-            )
+            fault = f"{where}: the coupling matrix cannot be inverted"
+            raise InputError("E-ROBOT-COUPLING", f"{fault}; a regular matrix needed")
+        if self.elasticity is not None and (given := len(self.elasticity.moment)) != n:
+            fault = f"{where}: elasticity of {given} joints, {n} needed, as many as rows"
+            raise InputError("E-ROBOT-ENTRIES", fault)
 
     @classmethod
     def from_dh(
@@ -334,32 +329,31 @@ class Robot(Brief):
         messages and reports. Raises InputError: other shapes, and whatever :class:`Robot`, :class:`DHRow` and
         :class:`Joint` refuse.
         """
-        rows = frozen(table, None, f"robot {name}: D-H table")
+        where = f"robot {name}"
+        rows = frozen(table, None, f"{where}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
-            raise InputError(
-                "E-ARRAY-SHAPE", f"robot {name}: D-H table of shape {rows.shape}; (n, 4) needed: a, alpha, d, theta"
-            )
+            fault = f"{where}: D-H table of shape {rows.shape}"
+            raise InputError("E-ARRAY-SHAPE", f"{fault}; (n, 4) needed: a, alpha, d, theta")
         n = len(rows)
         ends = np.tile([-np.inf, np.inf], (n, 1)) if limits is None else np.asarray(limits, float)
         kinds = tuple(types) or ("revolute",) * n
         if ends.shape != (n, 2) or len(kinds) != n:
-            raise InputError(
-                "E-ARRAY-SHAPE",
-                f"robot {name}: limits of shape {ends.shape}, types of {len(kinds)} joints; ({n}, 2) and {n} needed",
-            )
-        joints = tuple(
-            Joint(kind, *pair)  # type: ignore[arg-type]  # judged by Joint
-            for kind, pair in zip(kinds, ends.tolist(), strict=True)
-        )
-        warn_of_degrees(
-            np.where(np.isfinite(ends), ends, 0.0).T, np.array(kinds) == "revolute", f"robot {name}: limits"
-        )
+            fault = f"{where}: limits of shape {ends.shape}, types of {len(kinds)} joints"
+            raise InputError("E-ARRAY-SHAPE", f"{fault}; ({n}, 2) and {n} needed")
+        joints = tuple(Joint(kind, *pair) for kind, pair in zip(kinds, ends.tolist(), strict=True))
+        finite = np.where(np.isfinite(ends), ends, 0.0)
+        warn_of_degrees(finite.T, np.array(kinds) == "revolute", f"{where}: limits")
         return cls(name, convention, tuple(DHRow(*row) for row in rows.tolist()), joints)
 
     @property
     def prismatic(self) -> np.ndarray:
         """(n,) of bool."""
         return np.array([joint.type == "prismatic" for joint in self.joints])
+
+    @property
+    def shown(self) -> np.ndarray:
+        """(n,) factors from rad and mm to the units in which joint values are shown, degrees and mm."""
+        return np.where(self.prismatic, 1.0, np.degrees(1.0))
 
     def limits(self) -> np.ndarray:
         """(n, 2) lowest and highest value of the controller, rad or mm."""
@@ -387,12 +381,9 @@ class Robot(Brief):
             after, mount = self.carrier(i)
             begin = (self.world_from_base if after < 0 else ends[after]) @ mount
             pivot = Rigid(translation=pivots[i])
-            if self.convention == "modified":
-                gaps.append(begin @ across(row) @ pivot)
-                ends.append(pivot.inverse() @ along(row))
-            else:
-                gaps.append(begin @ pivot)
-                ends.append(pivot.inverse() @ (along(row) @ across(row)))
+            standard = self.convention == "standard"
+            gaps.append(begin @ pivot if standard else begin @ across(row) @ pivot)
+            ends.append(pivot.inverse() @ (along(row) @ across(row) if standard else along(row)))
         placed = Poses.of(gaps)
         chain = Chain(placed.rotation, placed.translation, tuple(ends), self.prismatic, self.coupling, None, self.tree)
         if elasticity is None:
@@ -470,28 +461,23 @@ class Chain:
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
-        found = {name: np.isin(np.arange(len(self)), self.order.path(self.carrier(name))) for name in set(targets)}
-        return np.array([found[name] for name in targets]).reshape(-1, len(self)).T
+        return self.behind()[:, [self.carrier(name) for name in targets]]
 
     def behind(self) -> np.ndarray:
         """(n, n) whether each joint carries each joint, or is it."""
-        return self.passed(np.eye(len(self))).T > 0
+        found = np.eye(len(self), dtype=bool)
+        for i in range(len(self)):
+            if self.after(i) >= 0:
+                found[:, i] |= found[:, self.after(i)]
+        return found
 
     def gathered(self, each: np.ndarray) -> np.ndarray:
         """Returns for every joint the sum, (n, …), over itself and the joints that it carries."""
-        total = np.array(each)
-        for i in range(len(self) - 1, -1, -1):
-            if self.after(i) >= 0:
-                total[self.after(i)] += total[i]
-        return total
+        return np.tensordot(self.behind(), each, 1)
 
     def passed(self, each: np.ndarray) -> np.ndarray:
         """Returns for every joint the sum, (n, …), over itself and the joints that carry it."""
-        total = np.array(each)
-        for i in range(len(self)):
-            if self.after(i) >= 0:
-                total[i] += total[self.after(i)]
-        return total
+        return np.tensordot(self.behind().T, each, 1)
 
     def branch(self, tool: str) -> "Chain":
         """Returns the chain whose flange is the one that carries the tool; other branches stay, and bend it."""
@@ -500,10 +486,29 @@ class Chain:
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
         if self.flange_joint is None and self.tree is not None:
-            raise InputError(
-                "E-ROBOT-TREE", "the robot is a tree of joints, which has no one flange; a robot file of one arm needed"
-            )
+            fault = "the robot is a tree of joints, which has no one flange"
+            raise InputError("E-ROBOT-TREE", f"{fault}; a robot file of one arm needed")
         return self.order.path(len(self) - 1 if self.flange_joint is None else self.flange_joint)
+
+    def parameters(self) -> list[tuple[int, int]]:
+        """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz.
+
+        An axis is a line: rotation about it and shift along it belong to the frames that follow, and of a prismatic
+        joint only the direction counts. With the six of one tool this is the complete, minimal and continuous set of
+        4 R + 2 P + 6 (Zhuang, Roth & Hamano 1992; Okamura & Park 1996).
+        """
+        return [(i, c) for i in range(len(self)) for c in ((0, 1) if self.prismatic[i] else (0, 1, 3, 4))]
+
+    def moved(self, step: np.ndarray) -> "Chain":
+        """Returns the chain after small motions along :meth:`parameters`, (k,)."""
+        twist = np.zeros((len(self), 6))
+        twist[tuple(np.array(self.parameters()).T)] = step
+        turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
+        translation = self.translation + np.einsum("nij,nj->ni", self.rotation, twist[:, 3:])
+        rotation = self.rotation @ turn
+        # One step of Newton's iteration for the polar factor removes rounding errors.
+        rotation = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+        return replace(self, rotation=rotation, translation=translation)
 
 
 def about_z(angle: float) -> np.ndarray:

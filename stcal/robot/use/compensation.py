@@ -10,13 +10,13 @@ from pydantic import AliasPath, BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.explain import Candidate, explain
-from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.rigid import Poses, Rigid, other_axes
 from stcal.io.json import Named, ResultFile, Shape, Vector
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS, csv_text
 from stcal.parallel import one_thread
-from stcal.robot.identification.adjustment import State, over_ranges, tips
+from stcal.robot.identification.adjustment import State, over_ranges
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import (
@@ -36,7 +36,7 @@ from stcal.robot.kinematics.robot_model import Joint, Robot
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
     """Returns base_from_tool of joint values (m, n), with each row's tool and load."""
     arm = State(replace(robot, world_from_base=Rigid()).chain(), {name: robot.tool(name) for name in targets.tools})
-    return tips(arm, q, targets.tools, targets.conditions)
+    return arm.tips(q, targets.tools, targets.conditions)
 
 
 def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
@@ -45,14 +45,11 @@ def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | N
     alike: dict[tuple[str, float | None], list[int]] = {}
     for row, pair in enumerate(zip(targets.tools, [None] * m if mass is None else mass.tolist(), strict=True)):
         alike.setdefault(pair, []).append(row)
-    q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
-    error_mm, error_rad = np.empty(m), np.empty(m)
-    for (name, kg), own in alike.items():
-        rows = np.array(own)
+    found = Inverse(np.zeros((m, len(robot.rows))), ("",) * m, np.zeros(m), np.zeros(m))
+    for (name, kg), rows in alike.items():
         part = inverse(robot, poses[rows], None if near is None else near[rows], name, kg)
-        q[rows], status[rows] = part.q, part.status
-        error_mm[rows], error_rad[rows] = part.error_mm, part.error_rad
-    return Inverse(q, tuple(status), error_mm, error_rad)
+        found = found.with_rows(rows, part)
+    return found
 
 
 UNITS = ("m", "in")
@@ -70,19 +67,13 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     apart, reach = max(map(_rms, off)), max(reach_mm(each, ends) for each in (identified, nominal))
     if apart <= USUAL_SHARE * reach:
         return ""
-    said = (
-        f"nominal robot {nominal.name} and identified robot {identified.name} are {apart:.4g} mm apart at the same "
-        "joint values (RMS),"
-    )
+    both = f"nominal robot {nominal.name} and identified robot {identified.name}"
+    said = f"{both} are {apart:.4g} mm apart at the same joint values (RMS),"
     if apart > FITS * reach:
-        raise InputError(
-            "E-ROBOT-MISMATCH",
-            f"{said} {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed; check "
-            "units, D-H rows, convention and coupling of both",
-        )
-    return (
-        f"{said} more than arms are off their drawing ({USUAL_SHARE:.0%} of the reach): are both files of this robot?"
-    )
+        fault = f"{said} {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach: files of the same robot needed"
+        raise InputError("E-ROBOT-MISMATCH", f"{fault}; check units, D-H rows, convention and coupling of both")
+    usual = f"more than arms are off their drawing ({USUAL_SHARE:.0%} of the reach)"
+    return f"{said} {usual}: are both files of this robot?"
 
 
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
@@ -106,7 +97,7 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
 
 def _rms(shift: np.ndarray) -> float:
     """Returns the RMS length of vectors (m, 3)."""
-    return float(np.sqrt((shift**2).sum(axis=1).mean()))
+    return rms(np.linalg.norm(shift, axis=1))
 
 
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
@@ -117,27 +108,23 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
         return np.inf if _rms(off[:, :3]) >= TURNED_RAD else _rms(off[:, 3:])
 
     for best, left in explain(_mistakes(robot, poses, q), misfit, min(FITS * reach, EXPLAINS * own))[:1]:
-        raise InputError(
-            "E-ROBOT-MISMATCH",
-            f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses, "
-            f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {best.words}",
-        )
+        away = f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses"
+        fault = f"{away}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach"
+        raise InputError("E-ROBOT-MISMATCH", f"{fault}; but {left:.3g} mm if {best.words}")
 
 
 def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
     """Yields frequent mistakes with the poses and the joint values that were meant."""
-    turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
-    meant = [(f"lengths were {UNIT_WORDS[u]}; call the columns x_{u} …", LENGTHS[u] * poses.translation) for u in UNITS]
-    meant += [
-        (f"x, y, z were {names}; correct order and signs of the columns of positions", places)
-        for names, places in other_axes(poses.translation)
-    ]
-    for words, places in meant:
+    for unit in UNITS:
+        words = f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …"
+        yield Candidate(words, partial(tuple, (Poses(poses.rotation, LENGTHS[unit] * poses.translation), q)))
+    for names, places in other_axes(poses.translation):
+        words = f"x, y, z were {names}; correct order and signs of the columns of positions"
         yield Candidate(words, partial(tuple, (Poses(poses.rotation, places), q)))
     inverse = "poses were inverse (base seen from the tool); give the tool in the base's frame"
     yield Candidate(inverse, lambda: (poses.inverse(), q))
     radians = "joint values were radians in columns of degrees; call the columns q1_rad …"
-    yield Candidate(radians, lambda: (poses, turned))
+    yield Candidate(radians, lambda: (poses, q * robot.shown))  # degrees in columns of radians: told where read
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
@@ -159,21 +146,18 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
     far = float(np.linalg.norm(poses.translation, axis=1).max())
     first_joint = replace(robot, world_from_base=Rigid()).chain().translation[0]
     reach = reach_mm(robot, set(targets.tools)) + float(np.linalg.norm(first_joint))
-    unit = next((unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach), None)
-    if unit is None:
-        return ()
-    return (
+    return tuple(
         f"all targets lie within {far:.3g} mm of the base's origin, where no arm works that reaches {reach:.4g} mm: if "
-        f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …",
-    )
+        f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …"
+        for unit in UNITS
+        if 0 < far * LENGTHS[unit] <= reach
+    )[:1]
 
 
 FAR_RAD, AMPLIFIED = np.radians(1.0), 10.0
 """Largest usual motion of a joint; its ratio to the error of the pose, in rad, from which the pose is near singular."""
-SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
-"""Largest plausible deviation of a tool from its drawing, mm and rad."""
-ROUND_MM = 0.01
-"""Lengths as drawn are multiples of this."""
+SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)  # largest plausible deviation of a tool from its drawing, mm and rad
+ROUND_MM = 0.01  # lengths as drawn are multiples of this
 MEANING = {
     LIMIT: "only joint values beyond the limits reach it",
     UNREACHABLE: "no joint values reach it",
@@ -298,28 +282,21 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     both = [identified] if nominal is None else [identified, nominal]
     builds = [[(joint.type, each.carrier(i)[0]) for i, joint in enumerate(each.joints)] for each in both]
     if builds[0] != builds[-1]:
-        raise InputError(
-            "E-ROBOT-MISMATCH",
-            f"nominal robot {both[-1].name} and identified robot {identified.name}: joints of different number, type "
-            "or order; files of the same robot needed",
-        )
+        who = f"nominal robot {both[-1].name} and identified robot {identified.name}"
+        fault = f"{who}: joints of different number, type or order"
+        raise InputError("E-ROBOT-MISMATCH", f"{fault}; files of the same robot needed")
     if nominal is None and targets.poses is None:
-        raise InputError(
-            "E-TARGETS-NO-POSES",
-            f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
-            "give its file with --nominal",
-        )
+        remedy = "only the nominal robot can tell which poses they command; give its file with --nominal"
+        raise InputError("E-TARGETS-NO-POSES", f"{targets.where}: joint values without poses; {remedy}")
     doubts, others = (), ()
     rigid = targets.conditions.ignored(f"robot {identified.name}") if identified.elasticity is None else ()
     if nominal is not None:
         apart = robots_apart(identified, nominal)
         doubts = ((apart,) if apart else ()) + _roles(identified, nominal)
-        turning = None if targets.q is None else np.degrees(np.abs(targets.q[:, ~identified.prismatic]))
-        if targets.poses is None and len(targets) > 2 and turning is not None and turning.max(initial=0) <= 2 * np.pi:
-            doubts += (
-                f"joint values are {turning.max(initial=0):.3g}° at most, as of radians in columns of degrees: if so, "
-                "call the columns q1_rad …",
-            )
+        if targets.poses is None and targets.q is not None and len(targets) > 2:
+            most = np.degrees(np.abs(targets.q[:, ~identified.prismatic]).max(initial=0))
+            radians = f"joint values are {most:.3g}° at most, as of radians in columns of degrees"
+            doubts += (f"{radians}: if so, call the columns q1_rad …",) if most <= 2 * np.pi else ()
         identified, nominal, others = _with_one_tool(identified, nominal, targets)
     commander = nominal or identified
     confirmed, of_targets = on_targets(commander, targets)
@@ -347,18 +324,15 @@ def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     """Returns a doubt if the files seem exchanged, or hold the same arm."""
     one, other = ((robot.rows, robot.elasticity, robot.tools) for robot in (identified, nominal))
     if one == other:
-        return (
-            f"identified robot {identified.name} and nominal robot {nominal.name} are the same, so that nothing "
-            "is compensated: give the file of identify with --robot, and the model in the controller with --nominal",
-        )
+        same = f"identified robot {identified.name} and nominal robot {nominal.name} are the same"
+        remedy = "give the file of identify with --robot, and the model in the controller with --nominal"
+        return (f"{same}, so that nothing is compensated: {remedy}",)
     lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
     drawn = [bool((np.abs(each / ROUND_MM - np.round(each / ROUND_MM)) < 1e-6).all()) for each in lengths]
     if drawn == [True, False]:
-        return (
-            f"identified robot {identified.name} has all lengths as drawn, in steps of {ROUND_MM:g} mm, and nominal "
-            f"robot {nominal.name} has not, as if they were exchanged: --robot takes the file of identify, --nominal "
-            "the model in the controller",
-        )
+        as_drawn = f"identified robot {identified.name} has all lengths as drawn, in steps of {ROUND_MM:g} mm"
+        exchanged = f"{as_drawn}, and nominal robot {nominal.name} has not, as if they were exchanged"
+        return (f"{exchanged}: --robot takes the file of identify, --nominal the model in the controller",)
     return ()
 
 
@@ -374,22 +348,18 @@ def _stayed(
         return inverse, {}
     unlimited = _between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1)))
     free = joints_of(unlimited, targets[rows], poses[rows], near[rows])
-    q, status = inverse.q.copy(), list(inverse.status)
-    error_mm, error_rad = inverse.error_mm.copy(), inverse.error_rad.copy()
-    beyond = {}
-    for k, i in enumerate(rows.tolist()):
-        if not free.usable[k]:
-            continue
-        reason = _beyond(robot, free.q[k])
-        if not reason or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
+    found, beyond = inverse, {}
+    for i, q in zip(rows[free.usable].tolist(), free.q[free.usable], strict=True):
+        reason, usable = _beyond(robot, q), inverse.usable[i]
+        if not reason or (usable and np.abs(q - inverse.q[i]).max() <= SAME_BRANCH):
             continue
         beyond[i] = reason
-        if inverse.usable[i]:
-            least, most = np.minimum(near[i], free.q[k]), np.maximum(near[i], free.q[k])
-            limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
-            at = joints_of(_between(robot, limits), targets[rows[[k]]], poses[[i]], near[[i]])
-            q[i], error_mm[i], error_rad[i], status[i] = at.q[0], at.error_mm[0], at.error_rad[0], LIMIT
-    return Inverse(q, tuple(status), error_mm, error_rad), beyond
+        if usable:
+            ends = np.column_stack([np.minimum(near[i], q), np.maximum(near[i], q)])
+            limits = ends.clip(*robot.limits().T[:, :, None])
+            at = joints_of(_between(robot, limits), targets[[i]], poses[[i]], near[[i]])
+            found = found.with_rows([i], replace(at, status=(LIMIT,)))
+    return found, beyond
 
 
 def _between(robot: Robot, limits: np.ndarray) -> Robot:
@@ -401,13 +371,11 @@ def _between(robot: Robot, limits: np.ndarray) -> Robot:
 
 def _beyond(robot: Robot, q: np.ndarray) -> str:
     """Returns the joints of (n,) that are beyond their limits, with both values, as text; empty if there is none."""
-    said = []
-    for number, (value, joint) in enumerate(zip(q.tolist(), robot.joints, strict=True), 1):
-        limit = min(max(value, joint.lower), joint.upper)
-        if abs(value - limit) > SAME_BRANCH:
-            unit, factor = (" mm", 1.0) if joint.type == "prismatic" else ("°", float(np.degrees(1.0)))
-            said.append(f"J{number} at {value * factor:.6g}{unit}, limit {limit * factor:.6g}{unit}")
-    return " and ".join(said)
+    limit, units = np.clip(q, *robot.limits().T), np.where(robot.prismatic, " mm", "°")
+    said = zip(q * robot.shown, units, limit * robot.shown, np.abs(q - limit) > SAME_BRANCH, strict=True)
+    return " and ".join(
+        f"J{i} at {value:.6g}{unit}, limit {end:.6g}{unit}" for i, (value, unit, end, far) in enumerate(said, 1) if far
+    )
 
 
 def joint_columns(robot: Robot) -> list[str]:
@@ -416,14 +384,13 @@ def joint_columns(robot: Robot) -> list[str]:
 
 
 def _by_column(found: Inverse, robot: Robot) -> list[dict[str, float] | None]:
-    columns, unit = joint_columns(robot), np.where(robot.prismatic, 1.0, np.degrees(1.0))
-    rows = zip((found.q * unit).tolist(), found.usable, strict=True)
+    rows, columns = zip((found.q * robot.shown).tolist(), found.usable, strict=True), joint_columns(robot)
     return [dict(zip(columns, q, strict=True)) if usable else None for q, usable in rows]
 
 
 def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
     """Returns a joint vector in the units of :func:`joint_columns`, to nine decimals (a millionth of a µm of arc)."""
-    return [f"{value:.9f}" for value in np.where(robot.prismatic, q, np.degrees(q))]
+    return [f"{value:.9f}" for value in q * robot.shown]
 
 
 @require_arguments

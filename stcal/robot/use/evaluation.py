@@ -26,13 +26,9 @@ from stcal.robot.identification.adjustment import (
     Observed,
     State,
     Weighting,
-    as_seen,
     frame_motions,
-    jacobian,
     observed,
     position_errors,
-    residuals,
-    tips_of,
     tool_motions,
 )
 from stcal.robot.identification.prior import PlacedFrame
@@ -47,16 +43,17 @@ SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
 """Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
-OFF, OFF_MM = 6.0, 0.1
-"""Ratio of a pose's typical error to that of most, and its size, from which on the pose is named."""
+OFF, OFF_MM = 6.0, 0.1  # ratio of a pose's typical error to that of most, and its size, from which on the pose is named
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
 NO_BETTER, WORSE = 0.8, 1.2  # times the errors of the first set: about as much, and more
 MOST_OF_IT = 0.75  # share of the squared errors of distances from which on their scale is named
-LEAST_SPREAD_MM = 20.0
-"""Largest commanded distance below which the unit is doubted."""
-SCALE_WITHIN = 0.005
-"""Largest relative difference of scale; more is another unit, or other poses."""
+LEAST_SPREAD_MM = 20.0  # largest commanded distance below which the unit is doubted
+EXCHANGED = "were the sets exchanged? The one before compensation comes first"
+NOT_COMPENSATED = (
+    "were these positions commanded with compensated joint values, and was --robot of compensate the file of identify?"
+)
+SCALE_WITHIN = 0.005  # largest relative difference of scale; more is another unit, or other poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,10 +99,9 @@ class SetResult(Part):
                         remedy = f"check units, as if the {side} ones were {words}"
             said = f"measured distances are {self.scale:.4g} times the commanded ones; {remedy}"
         elif not said and self.pairs_rms_mm > allowed:
-            said = (
-                f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs), "
-                f"{allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
-            )
+            missed = f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs)"
+            remedy = "check the order of the poses, and the robot that commanded them"
+            said = f"{missed}, {allowed:.3g} mm allowed; {remedy}"
         return said and f"set {self.name}: {said}"
 
     def figures(self) -> dict[str, float]:
@@ -148,7 +144,7 @@ class Verification(Brief):
     def reduction(self, index: int) -> dict[str, float]:
         """Returns the reduction of each figure of set ``index`` relative to the first set, per cent."""
         first, figures = self.sets[0].figures(), self.sets[index].figures()
-        return {key: 100 * (1 - figures[key] / first[key]) if first[key] > 0 else float("nan") for key in first}
+        return {key: 100 * (1 - figures[key] / value) if value > 0 else float("nan") for key, value in first.items()}
 
     def warnings(self) -> list[str]:
         """Returns warnings of missing poses and of doubtful sets."""
@@ -159,24 +155,19 @@ class Verification(Brief):
         ]
         found += [doubt for each in self.sets if (doubt := each.doubt())]
         if (most := float(self.distance_mm.max())) < LEAST_SPREAD_MM:
-            found.append(
-                f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
-                "the names of their columns say, correct these"
-            )
+            remedy = "if lengths are in another unit than the names of their columns say, correct these"
+            found.append(f"commanded positions lie within {most:.3g} mm of the first one; {remedy}")
         first = self.sets[0]
         for each in (each for each in self.sets if not each.doubt()):
             by_scale, ratio = abs(each.scale - 1) * each.pairs_mm, each.pairs_rms_mm / max(first.pairs_rms_mm, 1e-12)
             against = f"{each.pairs_rms_mm:.3g} against {first.pairs_rms_mm:.3g} mm (RMS of all pairs)"
-            causes = {
-                f"measured distances are {each.scale:.5f} times the commanded ones, which is most of its error: check "
-                "the instrument's scale": by_scale**2 > MOST_OF_IT * each.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2,
-                f"errs more than set {first.name}, the first in the file, {against}: were the sets exchanged? The one "
-                "before compensation comes first": each is not first and ratio > WORSE,
-                f"errs as set {first.name} does, {against}: were these positions commanded with compensated joint "
-                "values, and was --robot of compensate the file of identify?": each is not first
-                and WORSE >= ratio > NO_BETTER,
-            }
-            found += [f"set {each.name}: {words}" for words, applies in causes.items() if applies]
+            if by_scale**2 > MOST_OF_IT * each.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2:
+                times = f"measured distances are {each.scale:.5f} times the commanded ones"
+                found.append(f"set {each.name}: {times}, which is most of its error: check the instrument's scale")
+            if each is not first and ratio > NO_BETTER:
+                worse = f"errs more than set {first.name}, the first in the file, {against}: {EXCHANGED}"
+                alike = f"errs as set {first.name} does, {against}: {NOT_COMPENSATED}"
+                found.append(f"set {each.name}: {worse if ratio > WORSE else alike}")
         return found
 
 
@@ -198,14 +189,12 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
     if "pose" in table:
         names, first = tuple(table.text("pose")), {}
         before = [first.setdefault(key, row) for row, key in enumerate(zip(sets, names, strict=True))]
-        table.refuse(
-            np.array(before) != np.arange(len(table)),
-            "E-TABLE-ROW-REPEATED",
-            lambda i: (
-                f"pose {names[i]} of set {sets[i]} stands on line {table.lines[before[i]]} already; give the sets "
-                "different names"
-            ),
-        )
+
+        def again(i: int) -> str:
+            fault = f"pose {names[i]} of set {sets[i]} stands on line {table.lines[before[i]]} already"
+            return f"{fault}; give the sets different names"
+
+        table.refuse(np.array(before) != np.arange(len(table)), "E-TABLE-ROW-REPEATED", again)
         return names
     places, numbers, times = {}, [], Counter()
     for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
@@ -227,22 +216,17 @@ def verify(data: MeasuredPoses) -> Verification:
     missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
     common = [name for name in every if not any(name in lacking for lacking in missing.values())]
     if len(common) < 3:
-        raise InputError(
-            "E-VERIFY-FEW",
-            f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
-            "at least 3 needed; are the commanded positions of the sets the same?",
-        )
+        which = f"{'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}"
+        remedy = "at least 3 needed; are the commanded positions of the sets the same?"
+        raise InputError("E-VERIFY-FEW", f"{data.where}: {len(common)} poses in {which}; {remedy}")
     index = {group: np.array([own[name] for name in common]) for group, own in rows.items()}
     first, at = next(iter(index.items()))
     for group, own in index.items():
         apart = np.abs(data.commanded[own] - data.commanded[at]).max(axis=1)
         if apart.max() > SAME_MM:
             k = int(apart.argmax())
-            raise InputError(
-                "E-VERIFY-COMMANDED",
-                f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {first} and {group} "
-                f"(line {data.lines[own[k]]}); the same commands needed",
-            )
+            fault = f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {first} and {group}"
+            raise InputError("E-VERIFY-COMMANDED", f"{fault} (line {data.lines[own[k]]}); the same commands needed")
     sets = []
     for group, own in index.items():
         copied = group != first and (data.measured[own] == data.measured[at]).all()
@@ -282,9 +266,8 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
         sums += ((seen - wanted) ** 2).sum(), seen @ wanted, wanted @ wanted, i
     squares, product, commanded_squares, pairs = sums.tolist()
     if commanded_squares == 0:
-        raise InputError(
-            "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
-        )
+        fault = f"{data.where}: set {name}: all commanded positions are the same"
+        raise InputError("E-VERIFY-ALIKE", f"{fault}; different ones needed")
     size = np.abs(error)
     if not elsewhere and len(names) <= MOST_COMPARED:
         elsewhere = _elsewhere(commanded, measured, names)
@@ -304,8 +287,7 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5
 """False-alarm probability per row, and factor on its limit, as a model's residuals have longer tails than noise."""
-LEAST_MM = 1e-3
-"""Error below which a row is never wrong, as no instrument shows less."""
+LEAST_MM = 1e-3  # error below which a row is never wrong, as no instrument shows less
 UNSEEN, CHANCE = 1e-12, 0.05
 """Least relative visibility of parameters, below which σ is huge; probability of calling one of two equals better."""
 
@@ -450,18 +432,15 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
     fit: Fit = frozenset(part for part in ("base", "tool") if part in refit.split("-"))
     named = {name: replace(robot, name=name) for name, robot in robots.items()}
     for name, robot in named.items():
-        if len(robot.rows) != data.q.shape[1]:
-            raise InputError(
-                "E-ROBOT-MISMATCH",
-                f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints",
-            )
+        if (joints := len(robot.rows)) != data.q.shape[1]:
+            fault = f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {joints} joints"
+            raise InputError("E-ROBOT-MISMATCH", fault)
     seen = observed(data, None if data.positions is None else "position")
     what = f"parameters of {' and '.join(sorted(fit))}"
     seen.require_more_than(_parameters(seen, fit), what, "or fit less (--refit)")
     states, wrong = _fitted(list(named.values()), seen, fit)
-    found = tuple(
-        _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
-    )
+    pairs = zip(named.values(), states, strict=True)
+    found = tuple(_evaluated(robot, state, seen, fit, wrong) for robot, state in pairs)
     return Evaluation(refit, seen, found, wrong, _differences(found, ~wrong))
 
 
@@ -477,7 +456,7 @@ def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[Sta
     for _ in range(5):
         kept = measured[~wrong].data
         states = [start(robot, kept, fit) for robot in robots]
-        errors = np.array([position_errors(residuals(state, measured)) for state in states])
+        errors = np.array([position_errors(state.residuals(measured)) for state in states])
         sigma = min(robust_sigma(each[~wrong], width, freedom / width / len(measured)) for each in errors)
         now = errors.min(0) > max(SURELY * sigma * length_limit(width, FALSE_ALARM / len(measured)), LEAST_MM)
         left_out = set(targets[measured.first]) - set(targets[measured.first[~now]])
@@ -489,18 +468,18 @@ def _fitted(robots: list[Robot], measured: Observed, fit: Fit) -> tuple[list[Sta
 
 def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
     base = state.chain.gap(0) @ replace(robot, world_from_base=Rigid()).chain().gap(0).inverse()
-    in_base, rotation = residuals(state, measured), np.zeros(0)
+    in_base, rotation = state.residuals(measured), np.zeros(0)
     if measured.data.rotations is not None:
         whole = observed(measured.data, "pose")
-        rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
+        rotation = np.linalg.norm(state.residuals(whole)[:, :3], axis=1)
     good = measured[np.flatnonzero(~wrong)]
-    tip, moves = tips_of(state, good.data), [np.zeros((len(good.data), 6, 0))]
+    tip, moves = state.tips_of(good.data), [np.zeros((len(good.data), 6, 0))]
     if "base" in fit and good.kind != "distance":
         moves.append(frame_motions(tip, base.translation))
     if "tool" in fit:
         moves += [tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools]
-    fitted, one = as_seen(state, good, tip, np.concatenate(moves, axis=2)), Weighting(1.0, 1.0)
-    seeks = np.concatenate([fitted, jacobian(state, good)], axis=2)
+    fitted, one = state.as_seen(good, tip, np.concatenate(moves, axis=2)), Weighting(1.0, 1.0)
+    seeks = np.concatenate([fitted, state.jacobian(good)], axis=2)
     if in_base.shape[1] == 3:
         stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
         in_base = np.einsum("nji,nj->ni", np.array(stations), in_base) @ base.rotation
@@ -510,7 +489,7 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
         residuals=in_base,
         good=~wrong,
         rotation_rad=rotation,
-        placed=_placed(state, base, residuals(state, good), fitted, fit, good.kind != "distance"),
+        placed=_placed(state, base, state.residuals(good), fitted, fit, good.kind != "distance"),
         left=left(state, base, good, one, fitted),
         beyond=left(state, base, good, one, seeks),
     )
@@ -525,12 +504,10 @@ def _placed(
     seen, directions = np.linalg.eigh((flat / size).T @ (flat / size))
     inverse = directions / np.maximum(seen, UNSEEN) @ directions.T / size / size[:, None]
     covariance = found.ravel() @ found.ravel() / max(found.size - k, 1) * inverse
-    at, placed = 0, []
-    if with_base:
-        at = 6 * ("base" in fit)
-        placed.append(PlacedFrame("base", base, np.sqrt(np.diag(covariance)[:6]) if at else np.full(6, np.nan)))
+    at, unknown = 6 * (with_base and "base" in fit), np.full(6, np.nan)
+    placed = [PlacedFrame("base", base, np.sqrt(np.diag(covariance)[:6]) if at else unknown)] if with_base else []
     for name, tool in state.tools.items():
-        sigma = np.full(6, np.nan)
+        sigma = unknown.copy()
         if "tool" in fit:
             own = tool.rotation @ covariance[at : at + 3, at : at + 3] @ tool.rotation.T
             sigma[3:], at = np.sqrt(np.diag(own)), at + 3

@@ -29,10 +29,8 @@ from stcal.robot.use.compensation import joint_cells, joint_columns
 
 RANDOM_SETS, TEST_POSES = 20, 200
 """Number of random sets for comparison, and of random poses at which the identified robot's position is predicted."""
-DRAWS = 200
-"""Number of joint vectors drawn for each candidate in the box, before the box counts as out of reach."""
-GAIN = 1e-9
-"""Least growth of log det that counts as an improvement."""
+DRAWS = 200  # number of joint vectors drawn for each candidate in the box, before the box counts as out of reach
+GAIN = 1e-9  # least growth of log det that counts as an improvement
 
 
 class DesignFile(ResultFile):
@@ -108,21 +106,14 @@ class DesignOptions:
     def __post_init__(self):
         require_fields(self, "design", seed=0)
         if self.count < 1 or self.candidates <= self.count:
-            raise InputError(
-                "E-DESIGN-OPTIONS",
-                f"design: {self.count} poses of {self.candidates} candidates; more candidates than poses needed",
-            )
+            fault = f"design: {self.count} poses of {self.candidates} candidates"
+            raise InputError("E-DESIGN-OPTIONS", f"{fault}; more candidates than poses needed")
         if not (1e-9 <= self.sigma_mm <= 1e4 and 1e-12 <= self.sigma_rad <= 4):
-            raise InputError(
-                "E-SIGMA-VALUE",
-                f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad; positive numbers needed, "
-                "1e-9 to 1e4 mm and 1e-12 to 4 rad",
-            )
+            fault = f"design: σ of {self.sigma_mm:g} mm and {self.sigma_rad:g} rad"
+            raise InputError("E-SIGMA-VALUE", f"{fault}; positive numbers needed, 1e-9 to 1e4 mm and 1e-12 to 4 rad")
         if self.box is not None and not (len(self.box) == 6 and np.less(self.box[:3], self.box[3:]).all()):
-            raise InputError(
-                "E-DESIGN-OPTIONS",
-                f"design: box {self.box}; xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum",
-            )
+            remedy = "xmin,ymin,zmin,xmax,ymax,zmax needed, each minimum below its maximum"
+            raise InputError("E-DESIGN-OPTIONS", f"design: box {self.box}; {remedy}")
 
 
 @require_arguments
@@ -160,11 +151,8 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     rows = rows @ basis
     needed = -(-determined // rows.shape[1])
     if options.count < needed:
-        raise DegenerateError(
-            "E-DESIGN-FEW",
-            f"design: {options.count} poses with {rows.shape[1]} values each for {determined} parameters; "
-            f"at least {needed} needed, some tens advisable",
-        )
+        fault = f"design: {options.count} poses with {rows.shape[1]} values each for {determined} parameters"
+        raise DegenerateError("E-DESIGN-FEW", f"{fault}; at least {needed} needed, some tens advisable")
     chosen, exchanges = choose(rows, options.count)
     sets = [rng.choice(len(q), options.count, replace=False) for _ in range(RANDOM_SETS)]
     predict = identification_jacobian(robot, q[:TEST_POSES], options.observe, tool=options.tool)[:, -3:] * scale @ basis
@@ -184,32 +172,24 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) -> np.ndarray:
     """Returns random joint vectors (candidates, n) within limits (one turn if unlimited), with the tool in the box."""
     low, high = robot.limits().T
-    open_ended = robot.prismatic & ~np.isfinite(high - low)
-    if open_ended.any():
-        raise InputError(
-            "E-ROBOT-LIMITS",
-            f"robot {robot.name}: joint {np.flatnonzero(open_ended)[0] + 1} is prismatic without limits; "
-            "min_mm and max_mm needed",
-        )
+    for joint in np.flatnonzero(robot.prismatic & ~np.isfinite(high - low)) + 1:
+        fault = f"robot {robot.name}: joint {joint} is prismatic without limits"
+        raise InputError("E-ROBOT-LIMITS", f"{fault}; min_mm and max_mm needed")
     low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
     high = np.where(np.isfinite(high), high, low + 2 * np.pi)
-    batches: list[np.ndarray] = []
-    count, drawn, box = 0, 0, options.box
-    while count < options.candidates:
-        if box is not None and drawn >= DRAWS * options.candidates:
-            raise InputError(
-                "E-DESIGN-BOX",
-                f"design: of {drawn} random joint vectors {count} bring the tool into the box {box} mm, "
-                f"{options.candidates} needed; widen it (it is in the robot's base) or ask for fewer candidates",
-            )
-        q = rng.uniform(low, high, (options.candidates, len(low)))
+    wanted, box, found, drawn = options.candidates, options.box, np.zeros((0, len(low))), 0
+    while len(found) < wanted:
+        if box is not None and drawn >= DRAWS * wanted:
+            fault = f"design: of {drawn} random joint vectors {len(found)} bring the tool into the box {box} mm"
+            remedy = "widen it (it is in the robot's base) or ask for fewer candidates"
+            raise InputError("E-DESIGN-BOX", f"{fault}, {wanted} needed; {remedy}")
+        q = rng.uniform(low, high, (wanted, len(low)))
         drawn += len(q)
         if box is not None:
             at = forward(robot, q, options.tool).translation
             q = q[((at >= box[:3]) & (at <= box[3:])).all(axis=1)]
-        batches.append(q)
-        count += len(q)
-    return np.concatenate(batches)[: options.candidates]
+        found = np.concatenate([found, q])
+    return found[:wanted]
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, Weighting, jacobian, observed
+from stcal.robot.identification.adjustment import State, Weighting, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions
 from stcal.robot.identification.unexplained import left
@@ -24,7 +24,7 @@ QUICK = IdentifyOptions(folds=0)
 def left_of(true: Robot, data: Measurements, kind):
     """Of the true robot, with what any fit of its parameters takes up taken out."""
     state, seen = State(true.chain(), dict(true.tools)), observed(data, kind)
-    return left(state, true.world_from_base, seen, NOISE, jacobian(state, seen))
+    return left(state, true.world_from_base, seen, NOISE, state.jacobian(seen))
 
 
 @pytest.mark.parametrize(

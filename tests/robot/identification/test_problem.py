@@ -8,7 +8,7 @@ import pytest
 from stcal.adjust.blocks import Components, Equations
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import problem
-from stcal.robot.identification.adjustment import Weighting, jacobian, moved, observed, residuals
+from stcal.robot.identification.adjustment import Weighting, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.problem import ArmProblem, Spread, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
@@ -38,8 +38,8 @@ def test_it_ends_where_the_weighted_gradient_is_zero(case):
     """In units of its own σ, and of Huber's cost: weight times residual."""
     state, seen = case
     found = ArmProblem(seen, WEIGHTING).solve(state)
-    white = WEIGHTING.whiten(residuals(found.state, seen), seen)
-    slope = WEIGHTING.whiten(jacobian(found.state, seen), seen)
+    white = WEIGHTING.whiten(found.state.residuals(seen), seen)
+    slope = WEIGHTING.whiten(found.state.jacobian(seen), seen)
     length = np.linalg.norm(white, axis=1)
     limit = huber_limit(seen.kind)
     assert found.weights == pytest.approx(np.minimum(1, limit / length))
@@ -71,8 +71,8 @@ def test_what_is_common_to_all_observations_is_whitened_too():
 def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
     state, seen = case
     monkeypatch.setattr(problem, "MAX_STEPS", 1)
-    count = jacobian(state, seen).shape[2]
-    far = moved(state, np.full(count, 0.05), seen.kind)
+    count = state.jacobian(seen).shape[2]
+    far = state.moved(np.full(count, 0.05), seen.kind)
     refuses("E-NO-MINIMUM … identification … 1", ArmProblem(seen, WEIGHTING).solve, far)
 
 

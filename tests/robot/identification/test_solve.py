@@ -8,7 +8,7 @@ import pytest
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, jacobian, moved, observed, residuals, tip_jacobian, tips
+from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.result import Identified, IdentifyOptions
@@ -45,10 +45,10 @@ def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
         data = first[rows]
         data = replace(data, positions=data.positions + rng.normal(0, 0.01, (160, 3)))
         found, q = identify(mh80(), data, IdentifyOptions("position", folds=0)), joint_vectors(true, 50, rng)
-        at, motion = tip_jacobian(found.state, q, ("",) * 50, "position")
+        at, motion = found.state.tip_jacobian(q, ("",) * 50, "position")
         motion = motion[:, 3:, : len(found.names)]
         covariance = motion @ found.covariance @ np.swapaxes(motion, 1, 2)
-        off = at.translation - tips(State(true.chain(), dict(true.tools)), q, ("",) * 50).translation
+        off = at.translation - State(true.chain(), dict(true.tools)).tips(q, ("",) * 50).translation
         squares.append(np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0]).mean() / 3)
     assert 0.05 < np.mean(squares) < 1.95
 
@@ -78,11 +78,11 @@ def test_derivatives_are_those_of_differences(kind, tree):
     names = MARKERS * 4 if tree else ("a", "b") * 6
     data = measured(true, joint_vectors(true, 12, rng), rng, 0, 0, names)
     state, seen = State(true.chain(), dict(true.tools)), observed(data, kind)
-    analytic = jacobian(state, seen)
+    analytic = state.jacobian(seen)
     for k in range(analytic.shape[2]):
         step = np.zeros(analytic.shape[2])
         step[k] = 1e-6
-        ahead, behind = (residuals(moved(state, sign * step, seen.kind), seen) for sign in (1, -1))
+        ahead, behind = (state.moved(sign * step, seen.kind).residuals(seen) for sign in (1, -1))
         assert (behind - ahead) / 2e-6 == pytest.approx(
             analytic[:, :, k], abs=2e-5 * max(np.abs(analytic[:, :, k]).max(), 1)
         )
@@ -93,7 +93,7 @@ def test_held_out_error_is_that_of_new_poses():
     true, data = simulated(5, 60)
     found = identify(mh80(), data, IdentifyOptions(repeats=1))
     q = joint_vectors(true, 500, np.random.default_rng(7))
-    own, of = (tips(each, q, ("",) * 500) for each in (found.state, State(true.chain(), dict(true.tools))))
+    own, of = (each.tips(q, ("",) * 500) for each in (found.state, State(true.chain(), dict(true.tools))))
     model = np.linalg.norm(of.translation - own.translation, axis=1)
     # mean length of the noise alone is 1.6 σ; the model's own error comes on top, in squares
     expected = np.hypot(0.05 * np.sqrt(8 / np.pi), model.mean())
@@ -105,8 +105,8 @@ def squares(found: Identified, true: Robot, seed: int, kind: str = "position"):
     """Of the parameters' errors over their covariance, by exact poses: their mean; and the σ of what they do there."""
     q = joint_vectors(true, 100, np.random.default_rng(seed))
     exact = observed(measured(true, q, np.random.default_rng(0), 0, 0), kind)
-    slope = jacobian(found.state, exact).reshape(-1, len(found.names))
-    away = np.linalg.lstsq(slope, residuals(found.state, exact).ravel(), rcond=None)[0]
+    slope = found.state.jacobian(exact).reshape(-1, len(found.names))
+    away = np.linalg.lstsq(slope, found.state.residuals(exact).ravel(), rcond=None)[0]
     return away @ np.linalg.solve(found.covariance, away) / len(away), (slope @ away).std()
 
 
@@ -207,7 +207,7 @@ def test_an_arm_whose_rows_are_singular_is_identified():
     # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
     assert 0.06 < found.fitted_mm.mean() < 0.09
     again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
-    assert again.difference(tips(found.state, data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
+    assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 @pytest.mark.slow

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import State, curvature, jacobian, moved, observed, residuals, tips
+from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identified_report import joints_figure
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import elasticity_values, forward, joint_frames
+from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.forward import jacobian as by_joints
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
@@ -66,17 +66,17 @@ def test_derivatives_of_an_elastic_tree_are_those_of_differences():
     robot = elastic(two_arms(), rng, 1e-3)
     data = measured(robot, joint_vectors(robot, 3, rng), rng, 0.0, 0.0, MARKERS)
     state, seen = State(robot.chain(), dict(robot.tools), elastic=True), observed(data)
-    derivative, pull = jacobian(state, seen), rng.normal(size=(3, 6))
-    bent, count = curvature(state, seen, pull), state.elastic_count
+    derivative, pull = state.jacobian(seen), rng.normal(size=(3, 6))
+    bent, count = state.curvature(seen, pull), state.elastic_count
     for k in range(0, count, 3):
         step = np.zeros(derivative.shape[2])
-        step[k - count] = max(1e-3 * abs(elasticity_values(robot.elasticity)[k]), 1e-9)
-        ahead, behind = (moved(state, sign * step, "pose") for sign in (1, -1))
-        by_difference = (residuals(behind, seen) - residuals(ahead, seen)) / (2 * step[k - count])
+        step[k - count] = max(1e-3 * abs(robot.elasticity.values()[k]), 1e-9)
+        ahead, behind = (state.moved(sign * step, "pose") for sign in (1, -1))
+        by_difference = (behind.residuals(seen) - ahead.residuals(seen)) / (2 * step[k - count])
         size = max(np.abs(by_difference).max(), np.abs(derivative[:, :, k - count]).max())
         assert np.abs(derivative[:, :, k - count] - by_difference).max() < 1e-3 * size + 1e-6
         if k < 28:  # compliances
-            change = (jacobian(ahead, seen) - jacobian(behind, seen))[:, :, 28 - count : 70 - count]
+            change = (ahead.jacobian(seen) - behind.jacobian(seen))[:, :, 28 - count : 70 - count]
             expected = np.einsum("rw,rwk->k", pull, change) / (2 * step[k - count])
             assert np.abs(bent[k, 28:70] - expected).max() < 1e-3 * np.abs(bent).max()
 
@@ -116,7 +116,7 @@ def test_joints_are_drawn_with_the_rows_that_they_move_and_a_target_on_no_branch
     robot, rng = two_arms(), np.random.default_rng(3)
     seen = observed(seen_by(robot, rng, each=4))
     state = State(robot.chain(), dict(robot.tools))
-    drawn = joints_figure(state, seen, residuals(state, seen), np.ones(12, bool), ())
+    drawn = joints_figure(state, seen, state.residuals(seen), np.ones(12, bool), ())
     dots = re.findall(r'd="([^"]*)" stroke="[^"]*" stroke-opacity', drawn.svg())
     points = [path.count("M") for path in dots]
     assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
@@ -185,10 +185,10 @@ def test_rows_of_an_elastic_tree_keep_the_place_about_which_a_link_gives_way(tmp
     assert again.tree.carriers == robot.tree.carriers
     q, targets = joint_vectors(robot, 8, rng), MARKERS * 2
     q, targets = q[: len(targets)], targets[: len(q)]
-    wanted = tips(State(bent, dict(robot.tools)), q, targets)
-    found = tips(State(again.chain(), dict(again.tools)), q, targets)
+    wanted = State(bent, dict(robot.tools)).tips(q, targets)
+    found = State(again.chain(), dict(again.tools)).tips(q, targets)
     assert np.abs(found.difference(wanted)).max() < 1e-8
     slid = replace(again, elasticity=replace(again.elasticity, pivot=np.zeros_like(again.elasticity.pivot)))
-    assert np.abs(tips(State(slid.chain(), dict(slid.tools)), q, targets).difference(wanted)).max() > 1e-3
+    assert np.abs(State(slid.chain(), dict(slid.tools)).tips(q, targets).difference(wanted)).max() > 1e-3
     pivots = [joint_frames(each, q)[1][0] for each in (bent, again.chain())]
     assert np.abs(pivots[1] - pivots[0]).max() < 1e-8

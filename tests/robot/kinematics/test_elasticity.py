@@ -9,15 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import forward
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import (
-    chain_parameters,
-    elasticity_jacobian,
-    elasticity_values,
-    flange_poses,
-    links,
-    moved_chain,
-    with_values,
-)
+from stcal.robot.kinematics.forward import elasticity_jacobian, flange_poses, links
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import Conditions, Elasticity, Robot, loaded, mh80
 from stcal.robot.simulated import joint_vectors
@@ -53,12 +45,12 @@ def loose() -> Robot:
 def test_derivatives_are_those_of_small_changes():
     robot, q, rng = loose(), vectors(loose()), np.random.default_rng(6)
     chain, conditions = robot.chain(), Conditions(rng.uniform(0, 50, 20), rng.choice([-1.0, 1.0], (20, 6)))
-    values = elasticity_values(chain.elasticity, hysteresis=True)
-    assert (with_values(chain.elasticity, values).hysteresis == robot.elasticity.hysteresis).all()
+    values = chain.elasticity.values(hysteresis=True)
+    assert (chain.elasticity.with_values(values).hysteresis == robot.elasticity.hysteresis).all()
     values[54:] *= 1e-2
 
     def tips(moved) -> Poses:
-        bending = replace(chain, elasticity=with_values(chain.elasticity, moved))
+        bending = replace(chain, elasticity=chain.elasticity.with_values(moved))
         return flange_poses(bending, q, conditions) @ TOOL
 
     found = elasticity_jacobian(chain, q, tips(values), ALONE, conditions, hysteresis=True)
@@ -76,8 +68,8 @@ def test_rows_of_an_adjusted_chain_keep_its_deflections():
     """Axes off by 1 mm and 1 mrad: frames turn and slide by as little, deflections of 0.2 mm change by under 1 µm."""
     robot, rng = bent(), np.random.default_rng(2)
     chain = robot.chain()
-    step = np.array([rng.normal(0, 1e-3 if c < 3 else 1.0) for _, c in chain_parameters(chain)])
-    moved = moved_chain(chain, step)
+    step = np.array([rng.normal(0, 1e-3 if c < 3 else 1.0) for _, c in chain.parameters()])
+    moved = chain.moved(step)
     rows = robot_from_chain(moved, {"": TOOL}, robot)
     q = vectors(robot)
     reached = (flange_poses(moved, q) @ TOOL).difference(flange_poses(rows.chain(), q) @ rows.tools[""])
@@ -138,8 +130,8 @@ def test_a_file_reads_back_the_same_and_rows_made_of_a_chain_know_the_payload(tm
     assert again.elasticity.payload_kg == 12.5
     assert again.elasticity.hysteresis == pytest.approx(hysteresis, rel=1e-15)
     assert np.abs(forward(again, q).difference(forward(robot, q))).max() < 1e-9
-    step = np.random.default_rng(3).normal(0, 1e-3, len(chain_parameters(robot.chain())))
-    moved = moved_chain(robot.chain(), step)
+    step = np.random.default_rng(3).normal(0, 1e-3, len(robot.chain().parameters()))
+    moved = robot.chain().moved(step)
     found = robot_from_chain(moved, {"": TOOL}, robot)
     assert found.elasticity.payload_centre == pytest.approx(np.ones(3), abs=1.0)  # rows put the flange elsewhere
     heavy = loaded(60.0, len(q))

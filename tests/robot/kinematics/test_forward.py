@@ -10,15 +10,7 @@ from hypothesis import strategies as st
 from stcal.errors import InputError, InputNote
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.forward import (
-    CHUNK,
-    chain_jacobian,
-    chain_parameters,
-    flange_poses,
-    forward,
-    jacobian,
-    moved_chain,
-)
+from stcal.robot.kinematics.forward import CHUNK, chain_jacobian, flange_poses, forward, jacobian
 from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 
@@ -83,10 +75,10 @@ def test_chain_jacobian_is_that_of_differences(convention):
     robot = arm(3, 6, convention)
     chain, q = robot.chain(), np.random.default_rng(1).normal(size=(4, 6))
     analytic = chain_jacobian(chain, q, flange_poses(chain, q))
-    for k in range(len(chain_parameters(chain))):
+    for k in range(len(chain.parameters())):
         step = np.zeros(analytic.shape[2])
         step[k] = 1e-6
-        ends = [flange_poses(moved_chain(chain, sign * step), q) for sign in (1, -1)]
+        ends = [flange_poses(chain.moved(sign * step), q) for sign in (1, -1)]
         slope = ends[0].difference(ends[1]) / 2e-6
         assert slope == pytest.approx(analytic[:, :, k], abs=1e-5 * max(1.0, np.abs(analytic[:, :, k]).max()))
 
@@ -103,7 +95,7 @@ def test_rows_of_a_moved_chain_make_its_poses(seed, convention):
         base = replace(base, rows=rows)
     rng = np.random.default_rng(seed)
     robot = made(base, rng, 2.0, 5e-3)
-    chain = moved_chain(robot.chain(), rng.normal(size=24) * np.tile([5e-3, 5e-3, 2.0, 2.0], 6))
+    chain = robot.chain().moved(rng.normal(size=24) * np.tile([5e-3, 5e-3, 2.0, 2.0], 6))
     tools = {"": Rigid.exp(rng.normal(size=6) * [1, 1, 1, 100, 100, 100])}
     again = robot_from_chain(chain, tools, base)
     q = joint_vectors(base, 20, rng)
