@@ -1,8 +1,9 @@
 """The joint adjustment as blocks and factors: all groups share circles, common shape of the board, and intrinsics; each
 has poses of its cameras, dots, and a pose of its board of its own."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -183,7 +184,7 @@ class Setting:
             if self.common:
                 shape = a.block(SHAPE, values[SHAPE])
             if not parts:
-                a.know(OfTarget(circles, self))
+                a.know(circles, *of_target(self))
                 a.prior(camera, np.zeros((1, len(self.prior))), self.prior)
                 if self.common:
                     a.factor(
@@ -337,38 +338,34 @@ class KnownShape:
         return Told(self.value[self.sized :], (of_pose + of_points)[modes, modes], np.zeros_like(spread), spread)
 
 
-@dataclass(slots=True, eq=False)
-class OfTarget:
-    """What is known of the circles: flatness of faces, known distances, faces of known shape."""
+def of_target(
+    setting: Setting,
+) -> tuple[Callable[[Vector], float], Callable[[Vector], tuple[np.ndarray, np.ndarray]]]:
+    """Returns cost and equations of what is known of the circles: flatness of faces, known distances, faces of known
+    shape."""
 
-    block: Block
-    setting: Setting
-    last: tuple[Vector | None, list, list] = (None, [], [])  # circles, and the rows and shapes at them
+    @lru_cache(maxsize=1)  # both of a state are asked for
+    def known(circles: Vector) -> tuple[list[KnownRows], list[KnownShape]]:
+        xyz = circles.array
+        return [*planes(xyz, setting), *bars(xyz, setting)], list(shapes(xyz, setting))
 
-    def _known(self, values: Mapping[str, Any]) -> tuple[list, list]:
-        """Returns rows and shapes at a state; both cost and equations of it are asked for."""
-        if self.last[0] is not values[CIRCLES]:
-            xyz, setting = values[CIRCLES].array, self.setting
-            self.last = values[CIRCLES], [*planes(xyz, setting), *bars(xyz, setting)], list(shapes(xyz, setting))
-        return self.last[1:]
+    def cost(circles: Vector) -> float:
+        rows, faces = known(circles)
+        return sum(face.cost() for face in faces) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
-    def cost(self, values: Mapping[str, Any]) -> float:
-        rows, known = self._known(values)
-        return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
-
-    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        size = values[CIRCLES].array.size
+    def equations(circles: Vector) -> tuple[np.ndarray, np.ndarray]:
+        size = circles.array.size
         normal, right = np.zeros((size, size)), np.zeros(size)
-        rows, known = self._known(values)
-        for members, slope, gap, sigma in rows:
+        rows, faces = known(circles)
+        parts = [(members, slope.T @ slope / s**2, slope.T @ gap / s**2) for members, slope, gap, s in rows]
+        parts += [(face.members, face.normal(), face.slope()) for face in faces]
+        for members, square, pull in parts:
             place = coordinates(members)
-            normal[np.ix_(place, place)] += slope.T @ slope / sigma**2
-            right[place] -= slope.T @ gap / sigma**2
-        for shape in known:
-            place = coordinates(shape.members)
-            normal[np.ix_(place, place)] += shape.normal()
-            right[place] -= shape.slope()
+            normal[np.ix_(place, place)] += square
+            right[place] -= pull
         return normal, right
+
+    return cost, equations
 
 
 KnownRows = tuple[np.ndarray, np.ndarray, np.ndarray, float]
