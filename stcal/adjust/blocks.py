@@ -277,10 +277,11 @@ class Factor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """Knowledge of a kept :class:`Vector` block; see :meth:`Adjustment.know`."""
+    """Knowledge of a kept :class:`Vector` block: functions of its members."""
 
     block: Block
-    cost: Callable[[Vector], float]
+    cost: Callable[[Vector], float]  # in σ²
+    # normal matrix (n·dim, n·dim) and right side (n·dim,): minus half the gradient of the cost
     equations: Callable[[Vector], tuple[np.ndarray, np.ndarray]]
 
 

@@ -83,9 +83,8 @@ class Adjustment:
         fixed : numbers of the members that stay at their start
         """
         if any(name == block.name or (eliminate and block.eliminate) for block in self.blocks):
-            raise InputError(
-                "E-OPTION-COMBINATION", f"block {name}: another one has this name, or is eliminated; one of a kind"
-            )
+            fault = f"block {name}: another one has this name, or is eliminated"
+            raise InputError("E-OPTION-COMBINATION", f"{fault}; one of a kind")
         held = np.zeros(len(start), bool)
         held[np.asarray(fixed, int)] = True
         self.blocks.append(Block(name, start, eliminate, held))
@@ -128,19 +127,14 @@ class Adjustment:
         def away(members: Vector) -> np.ndarray:
             return (members.array - mean).ravel()
 
-        self.know(block, lambda v: float(away(v) @ weight @ away(v)), lambda v: (weight, -weight @ away(v)))
+        self.know(Known(block, lambda v: float(away(v) @ weight @ away(v)), lambda v: (weight, -weight @ away(v))))
 
-    def know(
-        self,
-        block: Block,
-        cost: Callable[[Vector], float],
-        equations: Callable[[Vector], tuple[np.ndarray, np.ndarray]],
-    ) -> None:
-        """Add knowledge of a kept :class:`Vector` block: ``cost`` of its members, in σ²; ``equations`` : normal matrix
-        (n·dim, n·dim) and right side (n·dim,), minus half the gradient of the cost."""
+    def know(self, known: Known) -> None:
+        """Add knowledge of a kept block that has equations of its own."""
+        block = known.block
         if block.eliminate:
             raise InputError("E-OPTION-COMBINATION", f"block {block.name}: eliminated, its prior must be a factor")
-        self.priors.append(Known(block, cost, equations))
+        self.priors.append(known)
 
     def solve(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Solution":
         """Return the solution of least cost, from the start or from ``values``.
