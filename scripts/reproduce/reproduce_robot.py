@@ -227,7 +227,7 @@ def photograph(arm: Arm, target: TargetCircles, q: np.ndarray, rng: np.random.Ge
         image = see(scene, pose, tuple(scene.target_from_face), NOISE_PX, rng)
         if not enough(image.labels):
             continue
-        seen = pose_from_circles(image.labels, image.centre_px, image.covariance_px2, target, scene.camera)
+        seen = pose_from_circles(image, target, scene.camera)
         if seen.status == "certain":
             found.append(seen)
             rows.append(i)

@@ -4,7 +4,7 @@ components by restricted maximum likelihood (REML, Patterson & Thompson 1971).""
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -47,12 +47,9 @@ class Equations:
 
     def filled(self, flat: np.ndarray) -> "Equations":
         """Return equations of the same unknowns with the numbers of :meth:`flat`."""
-        parts, at = [], 0
-        for each in fields(self):
-            own = getattr(self, each.name)
-            parts.append(flat[at : at + np.size(own)].reshape(np.shape(own)))
-            at += np.size(own)
-        return Equations(*parts)
+        shapes = [np.shape(getattr(self, each.name)) for each in fields(self)]
+        parts = np.split(flat, np.cumsum([np.prod(shape, dtype=int) for shape in shapes])[:-1])
+        return Equations(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
     def alone(self, held: float = 0.0) -> "tuple[np.ndarray, np.ndarray, Reduction]":
         """Return normal matrix and right side of the kept unknowns alone, and the elimination of the others.
@@ -178,19 +175,6 @@ PoseStack = Poses  # members that are poses, moved by left perturbations
 STEP = 1e-6  # step of numerical derivatives, as a share of 1, or of the unknown's size where that is more
 
 
-class Values(Protocol):
-    """The members of a block, such as a :class:`Vector` or :class:`~stcal.geometry.rigid.Poses`."""
-
-    @property
-    def dim(self) -> int: ...
-
-    def __len__(self) -> int:
-        """Return the number of members."""
-        ...
-
-    def moved(self, step: np.ndarray) -> Any: ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Vector:
     """Members without curvature: ``array`` (n, dim)."""
@@ -206,6 +190,10 @@ class Vector:
 
     def moved(self, step: np.ndarray) -> "Vector":
         return Vector(self.array + step)
+
+
+Values = Vector | Poses
+"""The members of a block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,49 +266,23 @@ class Factor:
         found = []
         for i, values in enumerate(own):
             columns = []
-            size = np.abs(values.array).max(initial=1.0) if isinstance(values, Vector) else 1.0
-            for k in range(values.dim):
-                step = np.zeros((len(values), values.dim))
-                step[:, k] = STEP * size
-                ends = [self.residuals(*own[:i], values.moved(s), *own[i + 1 :]) for s in (step, -step)]
-                columns.append((ends[0] - ends[1]) / (2 * STEP * size))
+            size = STEP * (np.abs(values.array).max(initial=1.0) if isinstance(values, Vector) else 1.0)
+            for step in size * np.eye(values.dim):
+                moved = (values.moved(np.tile(way, (len(values), 1))) for way in (step, -step))
+                ahead, behind = (self.residuals(*own[:i], each, *own[i + 1 :]) for each in moved)
+                columns.append((ahead - behind) / (2 * size))
             found.append(np.stack(columns, axis=-1))
         return found
 
 
-class Known(Protocol):
-    """Knowledge of a kept block: any cost with its equations."""
-
-    @property
-    def block(self) -> Block: ...
-
-    def cost(self, values: Mapping[str, Any]) -> float:
-        """Return the cost of a state, in σ²."""
-        ...
-
-    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return normal matrix (n·dim, n·dim) and right side (n·dim,): minus half the gradient of the cost."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """Knowledge of the members of a :class:`Vector` block: ``mean`` (n, dim), and inverse covariance (n·dim, n·dim)."""
+class Known:
+    """Knowledge of a kept :class:`Vector` block: functions of its members."""
 
     block: Block
-    mean: np.ndarray
-    weight: np.ndarray
-
-    def away(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Return the members minus their mean, (n·dim,)."""
-        return (values[self.block.name].array - self.mean).ravel()
-
-    def cost(self, values: Mapping[str, Any]) -> float:
-        away = self.away(values)
-        return float(away @ self.weight @ away)
-
-    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        return self.weight, -self.weight @ self.away(values)
+    cost: Callable[[Vector], float]  # in σ²
+    # normal matrix (n·dim, n·dim) and right side (n·dim,): minus half the gradient of the cost
+    equations: Callable[[Vector], tuple[np.ndarray, np.ndarray]]
 
 
 def numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
@@ -334,17 +296,14 @@ class FactorRows:
     ``length`` and ``weight`` (r,)."""
 
     factor: Factor
-    places: tuple[slice | None, ...]
     slopes: list[np.ndarray]
     residual: np.ndarray
     length: np.ndarray
     weight: np.ndarray
 
     @classmethod
-    def of(
-        cls, factor: Factor, values: Mapping[str, Any], sigma: Mapping[str, float], kept: Mapping[str, slice]
-    ) -> "FactorRows":
-        """Return the rows of a factor about a state; ``kept`` : places of the kept blocks among the unknowns."""
+    def of(cls, factor: Factor, values: Mapping[str, Any], sigma: Mapping[str, float]) -> "FactorRows":
+        """Return the rows of a factor about a state."""
         white = factor.white(values, sigma)
         length = np.sqrt((white**2).sum(1))
         weight = factor.loss.weight(length)
@@ -353,8 +312,7 @@ class FactorRows:
         for (block, members), slope in zip(factor.on, slopes, strict=True):
             if block.fixed.any():
                 slope[block.fixed[numbers(members, slope)]] = 0.0
-        places = tuple(kept.get(block.name) for block, _ in factor.on)
-        return cls(factor, places, slopes, white * root[:, None], length, weight)
+        return cls(factor, slopes, white * root[:, None], length, weight)
 
     def of_kinds(self, kinds: Collection[str]) -> "FactorRows | None":
         own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
@@ -370,11 +328,11 @@ class FactorRows:
             total = total + slope[part] @ (way[0] if index is None else way[index[part]])
         return total
 
-    def add(self, sums: Equations) -> None:
-        """Add the rows to the matrices and right sides of equations."""
+    def add(self, sums: Equations, places: Mapping[str, slice]) -> None:
+        """Add the rows to the matrices and right sides of equations; ``places`` : of the kept blocks in them."""
         normal, mixed = sums.normal, sums.cross.reshape(-1, sums.cross.shape[2])
-        ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
-        for i, ((own, members), place, slope) in enumerate(ends):
+        ends = [(places.get(own.name), slope) for (own, _), slope in zip(self.factor.on, self.slopes, strict=True)]
+        for i, ((own, members), (place, slope)) in enumerate(zip(self.factor.on, ends, strict=True)):
             square, pull = blocks_of(slope, -self.residual, numbers(members, slope), len(own.start))
             if place is None:
                 sums.block[:] += square
@@ -383,12 +341,9 @@ class FactorRows:
                 at = _unknowns(place, np.arange(len(own.start)), slope)
                 normal[at[:, :, None], at[:, None]] += square
                 sums.right[place] += pull.ravel()
-            for j, (_, other_place, other) in enumerate(ends[:i]):
-                pairs, products = self._products(i, j)
-                one, two = (
-                    _unknowns(which, number, each)
-                    for which, number, each in zip((place, other_place), pairs, (slope, other), strict=True)
-                )
+            for j, (other_place, other) in enumerate(ends[:i]):
+                (first, second), products = self._products(i, j)
+                one, two = _unknowns(place, first, slope), _unknowns(other_place, second, other)
                 back = np.swapaxes(products, 1, 2)
                 if place is None:
                     mixed[one[:, :, None], two[:, None]] += products

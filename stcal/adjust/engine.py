@@ -21,8 +21,8 @@ from stcal.adjust.blocks import (
     FactorRows,
     Huber,
     Known,
-    Prior,
     Values,
+    Vector,
     numbers,
     sigma_factor,
 )
@@ -83,9 +83,8 @@ class Adjustment:
         fixed : numbers of the members that stay at their start
         """
         if any(name == block.name or (eliminate and block.eliminate) for block in self.blocks):
-            raise InputError(
-                "E-OPTION-COMBINATION", f"block {name}: another one has this name, or is eliminated; one of a kind"
-            )
+            fault = f"block {name}: another one has this name, or is eliminated"
+            raise InputError("E-OPTION-COMBINATION", f"{fault}; one of a kind")
         held = np.zeros(len(start), bool)
         held[np.asarray(fixed, int)] = True
         self.blocks.append(Block(name, start, eliminate, held))
@@ -123,14 +122,18 @@ class Adjustment:
 
     def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
         """Add knowledge of a kept :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
-        self.know(Prior(block, np.asarray(mean), np.asarray(weight)))
+        mean, weight = np.asarray(mean), np.asarray(weight)
+
+        def away(members: Vector) -> np.ndarray:
+            return (members.array - mean).ravel()
+
+        self.know(Known(block, lambda v: float(away(v) @ weight @ away(v)), lambda v: (weight, -weight @ away(v))))
 
     def know(self, known: Known) -> None:
         """Add knowledge of a kept block that has equations of its own."""
-        if known.block.eliminate:
-            raise InputError(
-                "E-OPTION-COMBINATION", f"block {known.block.name}: eliminated, its prior must be a factor"
-            )
+        block = known.block
+        if block.eliminate:
+            raise InputError("E-OPTION-COMBINATION", f"block {block.name}: eliminated, its prior must be a factor")
         self.priors.append(known)
 
     def solve(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Solution":
@@ -159,7 +162,7 @@ class Adjustment:
             if not np.isfinite(white).all():
                 return np.inf
             total += float(factor.loss.cost(np.sqrt((white**2).sum(1))).sum())
-        return total + sum(prior.cost(values) for prior in self.priors)
+        return total + sum(prior.cost(values[prior.block.name]) for prior in self.priors)
 
     def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
         """Return the state after a step of all unknowns, those of kept blocks first."""
@@ -183,14 +186,10 @@ class Solution:
     problem: Adjustment
     values: dict[str, Any]
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
-        return self._cost
-
-    @cached_property
-    def _cost(self) -> float:
-        of_priors = sum(prior.cost(self.values) for prior in self.problem.priors)
+        of_priors = sum(prior.cost(self.values[prior.block.name]) for prior in self.problem.priors)
         return sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in self.rows) + of_priors
 
     @cached_property
@@ -210,13 +209,19 @@ class Solution:
         return max((at.stop for at in self.places.values()), default=0)
 
     @cached_property
+    def held(self) -> np.ndarray:
+        """Whether each kept unknown (k,) is fixed."""
+        fixed = [np.repeat(block.fixed, block.start.dim) for block in self.problem.blocks if not block.eliminate]
+        return np.concatenate([*fixed, np.zeros(0, bool)])
+
+    @cached_property
     def dropped(self) -> Block | None:
         return next((block for block in self.problem.blocks if block.eliminate), None)
 
     @cached_property
     def rows(self) -> list[FactorRows]:
         """Whitened and weighted rows of all factors."""
-        return [FactorRows.of(factor, self.values, self.problem.sigma, self.places) for factor in self.problem.factors]
+        return [FactorRows.of(factor, self.values, self.problem.sigma) for factor in self.problem.factors]
 
     def equations(self, kinds: Collection[str] | None = None) -> Equations:
         """Return the equations of the residuals of some kinds, or of all, without prior knowledge."""
@@ -224,7 +229,7 @@ class Solution:
         sums = Equations.nothing(self.kept, (len(dropped.start), dropped.start.dim) if dropped else (0, 1))
         square, count = 0.0, 0
         for rows in self._of(kinds):
-            rows.add(sums)
+            rows.add(sums, self.places)
             square, count = square + float((rows.residual**2).sum()), count + rows.residual.size
         return replace(sums, square=square, count=count)
 
@@ -237,12 +242,10 @@ class Solution:
         sums = self.equations()
         for prior in self.problem.priors:
             at = self.places[prior.block.name]
-            of_prior, pull = prior.equations(self.values)
+            of_prior, pull = prior.equations(self.values[prior.block.name])
             sums.normal[at, at] += of_prior
             sums.right[at] += pull
-        held = np.concatenate(
-            [np.repeat(b.fixed, b.start.dim) for b in self.problem.blocks if not b.eliminate] or [np.zeros(0, bool)]
-        )
+        held = self.held
         sums.normal[held], sums.normal[:, held], sums.right[held] = 0.0, 0.0, 0.0  # of priors
         sums.normal[held, held] = 1.0
         own = np.einsum("mii->mi", sums.block)
@@ -282,10 +285,7 @@ class Solution:
             found = np.linalg.inv(self.normal)
         except LinAlgError:
             found = generalised_inverse(self.normal)
-        for block in self.problem.blocks:
-            if not block.eliminate and block.fixed.any():
-                held = np.flatnonzero(np.repeat(block.fixed, block.start.dim)) + self.places[block.name].start
-                found[held, held] = 0.0
+        found[self.held, self.held] = 0.0
         return found
 
     def covariance(self, block: Block) -> np.ndarray:

@@ -57,9 +57,9 @@ class Cell:
         images, left_out = [], []
         for i, pose in enumerate(self.poses(q)):
             image = see(self.scene, pose, tuple(self.scene.target_from_face), NOISE_PX, self.rng)
-            name, seen = f"a/{i:03d}.png", (image.labels, image.centre_px, image.covariance_px2)
+            name = f"a/{i:03d}.png"
             try:
-                images.append(MeasuredImage(name, pose_from_circles(*seen, self.target, self.scene.camera)))
+                images.append(MeasuredImage(name, pose_from_circles(image, self.target, self.scene.camera)))
             except DegenerateError as error:
                 left_out.append(Skipped(name, str(error)))
         common = common_errors([each.pose for each in images], self.target, None)

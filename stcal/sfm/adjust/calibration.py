@@ -44,20 +44,14 @@ class AdjustOptions:
     def __post_init__(self):
         require_fields(self, "options")
         if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"--flatness {self.flatness_mm:g}: a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off",
-            )
+            fault = f"a σ in mm, {LEAST:g} to {MOST_FLATNESS_MM:g} needed, or off"
+            raise InputError("E-OPTION-RANGE", f"--flatness {self.flatness_mm:g}: {fault}")
         if self.solve == "paper" and (self.eccentricity or self.frame != "three-point"):
-            raise InputError(
-                "E-OPTION-CONFLICT",
-                "--solve paper: three-point frames without eccentricity, as published; leave frame out, or use chain",
-            )
+            fault = "--solve paper: three-point frames without eccentricity, as published"
+            raise InputError("E-OPTION-CONFLICT", f"{fault}; leave frame out, or use chain")
         if self.refine_camera and self.solve != "joint":
-            raise InputError(
-                "E-OPTION-NEEDS",
-                f"--refine-camera: part of the joint adjustment, the solve is {self.solve}; use --solve joint",
-            )
+            fault = f"--refine-camera: part of the joint adjustment, the solve is {self.solve}"
+            raise InputError("E-OPTION-NEEDS", f"{fault}; use --solve joint")
 
 
 MIN_REDUNDANCY = 30.0
@@ -136,11 +130,9 @@ def calibrate(
     faces, notes = _faces(metric, camera, target, options)
     unlinked = chain.unlinked_faces(faces, options.reference_face)
     faces = [face for face in faces if face.face not in unlinked]
-    notes += [
-        f"face {face_id}: left out, never linked to reference face {options.reference_face}; add a group that shows it "
-        "together with a face that is linked"
-        for face_id in unlinked
-    ]
+    why = f"left out, never linked to reference face {options.reference_face}"
+    remedy = "add a group that shows it together with a face that is linked"
+    notes += [f"face {face_id}: {why}; {remedy}" for face_id in unlinked]
     try:
         calibrated = chain.chain_faces(faces, target, options.reference_face, published)
     except MappingError as error:  # a face without a frame may be why
@@ -162,27 +154,14 @@ def calibrate(
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
+        move_px = f"{joint.last_move_px:.1g} px in the last step, less than {SETTLED_PX:g} px needed"
+        remedy = "look at the checks for what contradicts the rest, take it out and run again"
         if not joint.settled:
-            notes.append(
-                f"joint adjustment: not settled, projections still moved by {joint.last_move_px:.1g} px in the last "
-                f"step, less than {SETTLED_PX:g} px needed; look at the checks for what contradicts the rest, take it "
-                "out and run again"
-            )
-        if state.differ > NOTED:
-            notes.append(
-                f"photographs differ {state.differ:.1f} times more than their pixels explain: σ are larger by that"
-            )
-    return Calibration(
-        target=calibrated,
-        scales=scales,
-        faces=tuple(faces),
-        joint=joint,
-        sigma_factors=factors,
-        models=tuple(metric),
-        camera=camera,
-        notes=tuple(notes),
-        circle_sigma_px=circle_sigma_px,
-    )
+            notes.append(f"joint adjustment: not settled, projections still moved by {move_px}; {remedy}")
+        differ = f"photographs differ {state.differ:.1f} times more than their pixels explain"
+        notes += [f"{differ}: σ are larger by that"] if state.differ > NOTED else []
+    found = calibrated, scales, tuple(faces), joint, factors, tuple(metric), camera, tuple(notes)
+    return Calibration(*found, circle_sigma_px=circle_sigma_px)
 
 
 def calibrate_board(
@@ -190,16 +169,9 @@ def calibrate_board(
 ) -> Calibration:
     """Returns the scale from models of the board alone, in its frame, without faces (Zhang & Wei 2017, §4.1)."""
     scales = {model.group: find_scale(model, board, options.solve == "paper") for model in models}
-    return Calibration(
-        target=CalibratedTarget(options.reference_face, {}, {}, {name: Rigid() for name in scales}),
-        scales=scales,
-        faces=(),
-        joint=None,
-        sigma_factors=image_sigma_factors(models, camera),
-        models=tuple(model.metric(scales[model.group].board_from_world) for model in models),
-        camera=camera,
-        notes=(),
-    )
+    target = CalibratedTarget(options.reference_face, {}, {}, {name: Rigid() for name in scales})
+    metric = tuple(model.metric(scales[model.group].board_from_world) for model in models)
+    return Calibration(target, scales, (), None, image_sigma_factors(models, camera), metric, camera, notes=())
 
 
 def on_luminous_surface(
@@ -213,16 +185,11 @@ def on_luminous_surface(
     joint = calibration.joint
     if joint is None:
         raise InputError("E-RIM-SOLVE", "rims are corrected by the joint adjustment alone; use --solve joint")
-    outward = _outward(joint, calibration.target.target_from_face)
-    height = np.array([rim_mm.get(label, 0.0) for label in joint.labels])
-    moved = replace(
-        joint,
-        xyz_model=joint.xyz_model - 0.5 * height[:, None] * outward,
-        covariance_mm2=joint.covariance_mm2
-        + rim_covariance_mm2(joint, calibration.target.target_from_face, rim_mm, sigma_mm),
-    )
-    surface = calibrated_target(moved, calibration.target, target, frame)
-    surface = replace(surface, position_sources_mm=calibration.target.position_sources_mm)
+    seen, height = calibration.target, np.array([rim_mm.get(label, 0.0) for label in joint.labels])
+    xyz = joint.xyz_model - 0.5 * height[:, None] * _outward(joint, seen.target_from_face)
+    covariance = joint.covariance_mm2 + rim_covariance_mm2(joint, seen.target_from_face, rim_mm, sigma_mm)
+    surface = calibrated_target(replace(joint, xyz_model=xyz, covariance_mm2=covariance), seen, target, frame)
+    surface = replace(surface, position_sources_mm=seen.position_sources_mm)
     models = tuple(m.moved(surface.target_from_group[m.group]) for m in joint.models)
     return replace(calibration, target=surface, models=models, rim_mm=dict(rim_mm), rim_sigma_mm=sigma_mm)
 
@@ -267,11 +234,10 @@ def _faces(
         face = target.face(face_id)
         unseen = chain.missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
         if unseen:
-            notes.append(
-                f"face {face_id}: frame circle {', '.join(f'{face_id}:{c}' for c in unseen)} not mapped; it stands "
-                "where the design has it against the face's other circles, and σ carries how far circles are off the "
-                "design"
-            )
+            names = ", ".join(f"{face_id}:{circle}" for circle in unseen)
+            place = "it stands where the design has it against the face's other circles"
+            doubt = "and σ carries how far circles are off the design"
+            notes.append(f"face {face_id}: frame circle {names} not mapped; {place}, {doubt}")
     return [face for group_faces, _ in results for face in group_faces], notes
 
 

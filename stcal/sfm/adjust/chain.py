@@ -1,8 +1,10 @@
 """Face frames from circle centres, the faces of each group, and their chaining into the target frame."""
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -58,20 +60,19 @@ def with_unmapped(
         return dict(xyz)
     known = dict(zip(face.ids, face.places_mm(face.ids), strict=True)) if known is None else known
     common = [circle for circle in xyz if circle in known]
-    names = " and ".join(f"{face.id}:{circle}" for circle in missing)
     if len(common) < MIN_PLACING:
-        raise DegenerateError(
-            "E-FACE-FRAME-CIRCLES",
-            f"face {face.id}: frame circle {names} not mapped, and {len(common)} other circles, {MIN_PLACING} needed; "
-            "add views that show it",
-        )
+        raise _unmapped(face, missing, f", and {len(common)} other circles, {MIN_PLACING} needed")
     try:
         model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
     except DegenerateError as error:
-        raise DegenerateError(
-            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
-        ) from error
+        raise _unmapped(face, missing) from error
     return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
+
+
+def _unmapped(face: FaceDesign, missing: Sequence[str], more: str = "") -> DegenerateError:
+    names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+    words = f"face {face.id}: frame circle {names} not mapped{more}; add views that show it"
+    return DegenerateError("E-FACE-FRAME-CIRCLES", words)
 
 
 def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
@@ -79,15 +80,12 @@ def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray])
     square, redundancy = 0.0, 0
     for face in target.faces:
         centres = {label.circle: place for label, place in xyz.items() if label.face == face.id}
-        if len(centres) < MIN_PLACING:
-            continue
         mapped, design = np.array(list(centres.values())), face.places_mm(centres)
-        try:
-            away = align_rigid(mapped, design).inverse() @ mapped - design
-        except DegenerateError:
-            continue
-        square += float((away[:, :2] ** 2).sum())
-        redundancy += 2 * len(centres) - 3
+        with suppress(DegenerateError):
+            if len(centres) >= MIN_PLACING:
+                away = align_rigid(mapped, design).inverse() @ mapped - design
+                square += float((away[:, :2] ** 2).sum())
+                redundancy += 2 * len(centres) - 3
     return float(np.sqrt(square / redundancy)) if redundancy else 0.0
 
 
@@ -106,10 +104,7 @@ def face_frames(
     if face.sigma_mm is not None:
         return _fitted(face, circles, xyz)
     if missing := missing_frame_circles(face, circles):
-        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-        raise DegenerateError(
-            "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
-        )
+        raise _unmapped(face, missing)
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_plane(xyz, towards)
@@ -130,11 +125,8 @@ def _fitted(face: FaceDesign, circles: Sequence[str], xyz: np.ndarray) -> Poses:
     design = face.places_mm(circles)
     spread = np.linalg.svd(design - design.mean(0), compute_uv=False) if len(design) >= MIN_KNOWN else np.zeros(2)
     if spread[1] <= 1e-6 * spread[0]:
-        raise DegenerateError(
-            "E-FACE-FRAME-CIRCLES",
-            f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} needed that are not on one "
-            "line; add views that show it",
-        )
+        fault = f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} needed that are not on one line"
+        raise DegenerateError("E-FACE-FRAME-CIRCLES", f"{fault}; add views that show it")
     middle = xyz.mean(1)
     rotation, _ = best_rotations(np.einsum("kni,nj->kij", xyz - middle[:, None], design - design.mean(0)))
     return Poses(rotation, middle - rotation @ design.mean(0))
@@ -169,18 +161,9 @@ def faces_of_group(
         except DegenerateError as error:
             notes.append(f"group {model.group}: {error}")
             continue
-        r = frame.rotation
-        faces.append(
-            FaceInGroup(
-                model.group,
-                face.id,
-                frame,
-                tuple(model.labels[i] for i in members),
-                frame.inverse() @ xyz[members],
-                r.T @ information[members] @ r,
-                len(seen_by),
-            )
-        )
+        labels, own = tuple(model.labels[i] for i in members), frame.inverse() @ xyz[members]
+        turned = frame.rotation.T @ information[members] @ frame.rotation
+        faces.append(FaceInGroup(model.group, face.id, frame, labels, own, turned, len(seen_by)))
     if not faces and not notes:
         notes.append(
             f"group {model.group}: no face mapped (two images must see it); add views that show faces and board"
@@ -221,18 +204,15 @@ class CalibratedTarget(Brief):
     position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
     def with_larger_sigma(self, factor: float) -> "CalibratedTarget":
-        def times(by: float, values: dict) -> dict:
-            return {key: times(by, own) if isinstance(own, dict) else by * own for key, own in values.items()}
+        def times(by: float, values: Any) -> Any:
+            if isinstance(values, dict):
+                return {key: times(by, own) for key, own in values.items()}
+            return None if values is None else by * values
 
-        return replace(
-            self,
-            face_covariance=times(factor**2, self.face_covariance),
-            circle_covariance=times(factor**2, self.circle_covariance),
-            distance_sigma_mm=times(factor, self.distance_sigma_mm),
-            scale_sigma=None if self.scale_sigma is None else factor * self.scale_sigma,
-            covariance_mm2=None if self.covariance_mm2 is None else factor**2 * self.covariance_mm2,
-            position_sources_mm=times(factor, self.position_sources_mm),
-        )
+        linear, square = ("distance_sigma_mm", "scale_sigma", "position_sources_mm"), factor**2
+        covariances = ("face_covariance", "circle_covariance", "covariance_mm2")
+        larger = {name: times(factor, getattr(self, name)) for name in linear}
+        return replace(self, **larger, **{name: times(square, getattr(self, name)) for name in covariances})
 
 
 def chain_faces(
@@ -244,19 +224,15 @@ def chain_faces(
     target.face(reference)
     mapped = {face.face for face in faces}
     if reference not in mapped:
-        raise MappingError(
-            "E-FACE-REFERENCE",
-            f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
-            f"{', '.join(sorted(mapped)) or 'none'} with --reference-face",
-        )
+        fault, others = f"reference face {reference}: not mapped in any group", ", ".join(sorted(mapped)) or "none"
+        remedy = f"add a group that shows it, or choose one of {others} with --reference-face"
+        raise MappingError("E-FACE-REFERENCE", f"{fault}; {remedy}")
     shortest = {face_id: next(iter(_chains(faces, reference, face_id)), None) for face_id in sorted(mapped)}
     ways = {face_id: way for face_id, way in shortest.items() if way}
     if len(ways) < len(mapped):
-        raise MappingError(
-            "E-FACE-UNLINKED",
-            f"face {', '.join(sorted(shortest.keys() - ways))}: never linked to reference face {reference}; "
-            f"add a group that shows it together with {reference} or a face that is linked",
-        )
+        fault = f"face {', '.join(sorted(shortest.keys() - ways))}: never linked to reference face {reference}"
+        remedy = f"add a group that shows it together with {reference} or a face that is linked"
+        raise MappingError("E-FACE-UNLINKED", f"{fault}; {remedy}")
     from_face, from_group = {face_id: _along(way, faces) for face_id, way in ways.items()}, {}
     for face in sorted(faces, key=lambda face: len(ways[face.face][1])):
         from_group.setdefault(face.group, from_face[face.face] @ face.group_from_face.inverse())
@@ -280,24 +256,20 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
     found = {}
     for face_id, pose in calibrated.target_from_face.items():
         if face_id != calibrated.reference_face:
-            ways = _chains(faces, calibrated.reference_face, face_id)
-            along = [_along(way, faces) for way in ways]
-            found[face_id] = tuple(
-                FaceChain(
-                    *way,
-                    float(np.linalg.norm(chained.translation - pose.translation)),
-                    (chained @ pose.inverse()).angle_rad(),
-                )
-                for way, chained in zip(ways, along, strict=True)
-            )
+            chains = []
+            for way in _chains(faces, calibrated.reference_face, face_id):
+                chained = _along(way, faces)
+                apart_mm = float(np.linalg.norm(chained.translation - pose.translation))
+                chains.append(FaceChain(*way, apart_mm, (chained @ pose.inverse()).angle_rad()))
+            found[face_id] = tuple(chains)
     return found
 
 
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
     """Returns the simple ways from one face to another, the shortest first, and those with one face more."""
-    by_group: dict[str, list[str]] = {}
+    by_group: dict[str, list[str]] = defaultdict(list)
     for face in faces:
-        by_group.setdefault(face.group, []).append(face.face)
+        by_group[face.group].append(face.face)
     queue, complete = [((start,), ())], []
     for way, groups in queue:
         if way[-1] == goal:
@@ -364,12 +336,12 @@ def _adjust(
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
     """Returns circle centres in the target frame: weighted means over the groups, taken in the face frame."""
-    weight: dict[CircleLabel, np.ndarray] = {}
-    total: dict[CircleLabel, np.ndarray] = {}
+    weight: dict[CircleLabel, np.ndarray] = defaultdict(lambda: np.zeros((3, 3)))
+    total: dict[CircleLabel, np.ndarray] = defaultdict(lambda: np.zeros(3))
     for own in faces:
         for label, xyz, information in zip(own.labels, own.xyz_face, own.information, strict=True):
-            weight[label] = weight.get(label, 0) + information
-            total[label] = total.get(label, 0) + information @ xyz
+            weight[label] += information
+            total[label] += information @ xyz
     return {
         label: target_from_face[face.id] @ np.linalg.solve(weight[label], total[label])
         for face in target.faces

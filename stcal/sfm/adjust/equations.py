@@ -3,12 +3,13 @@ has poses of its cameras, dots, and a pose of its board of its own."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.blocks import Block, Huber, Known, Vector
 from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError
@@ -96,13 +97,6 @@ class GroupPart:
     def name(self, block: str) -> str:
         return f"{block} of {self.model.group}"
 
-    def values(self) -> dict[str, Any]:
-        return {
-            self.name(POSES): Poses.of(self.model.camera_from_model),
-            self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
-            self.name(BOARD): Poses.of([self.model_from_board]),
-        }
-
     def at(self, values: Mapping[str, Any]) -> MetricModel:
         points = np.empty_like(self.model.xyz_model)
         points[self.circles] = values[CIRCLES].array[self.circle_place]
@@ -111,10 +105,6 @@ class GroupPart:
 
     def board_at(self, values: Mapping[str, Any]) -> Rigid:
         return values[self.name(BOARD)][0]
-
-    def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
-        return self.board_at(values).inverse() @ values[self.name(DOTS)].array - self.design
 
     def place(self) -> np.ndarray:
         """Returns the place (n,) of the point of each observation among all circles, or among the group's dots."""
@@ -163,16 +153,21 @@ class Setting:
     def values(self, xyz: np.ndarray, start: Camera) -> dict[str, Any]:
         """Returns all unknowns at the start, with circles (c, 3) and intrinsics of ``start``."""
         away = np.linalg.pinv(self.basis) @ (start.parameters() - self.given.parameters())
-        own = {name: array for group in self.groups for name, array in group.values().items()}
-        return {CIRCLES: Vector(xyz), CAMERA: Vector(away[None]), **own}
+        values: dict[str, Any] = {CIRCLES: Vector(xyz), CAMERA: Vector(away[None])}
+        for group in self.groups:
+            values[group.name(POSES)] = Poses.of(group.model.camera_from_model)
+            values[group.name(DOTS)] = Vector(group.model.xyz_model[group.dots])
+            values[group.name(BOARD)] = Poses.of([group.model_from_board])
+        return values
 
     def camera(self, values: Mapping[str, Any]) -> Camera:
-        return self.camera_at(*(values[CAMERA],) * bool(self.basis.shape[1]))
+        return self.camera_at(values[CAMERA]) if self.basis.shape[1] else self.given
 
-    def camera_at(self, *away: Vector) -> Camera:
-        """Returns the camera with parameters away from the given ones."""
-        moves = (self.basis @ of_basis.array[0] for of_basis in away)
-        return self.given.with_parameters(sum(moves, self.given.parameters())) if away else self.given
+    def camera_at(self, away: Vector | None = None) -> Camera:
+        """Returns the camera with parameters away from the given ones, if they are adjusted."""
+        if away is None:
+            return self.given
+        return self.given.with_parameters(self.given.parameters() + self.basis @ away.array[0])
 
     def joined(self, values: Mapping[str, Any]) -> Joined:
         """Returns the problem of all groups at a state: that of :meth:`values`, and a common shape if there is one."""
@@ -183,7 +178,7 @@ class Setting:
             if self.common:
                 shape = a.block(SHAPE, values[SHAPE])
             if not parts:
-                a.know(OfTarget(circles, self))
+                a.know(of_target(circles, self))
                 a.prior(camera, np.zeros((1, len(self.prior))), self.prior)
                 if self.common:
                     a.factor(
@@ -258,7 +253,7 @@ class KnownShape:
         xyz: np.ndarray,
         weight: np.ndarray,
         size_sigma: float,
-        amplitude: float = AMPLITUDES[0],
+        amplitude: float,
     ) -> "KnownShape":
         """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size; ``amplitude`` : of the
         smooth deviations of its print."""
@@ -309,8 +304,7 @@ class KnownShape:
         """Returns the right-hand side (3n,) that a stated size one σ off brings, model frame; 0 for an exact size."""
         if not self.sized:
             return np.zeros(self.off_mm.size)
-        weighted = self.weight.reshape(-1, 1) * self.by_pose
-        force = weighted @ self._to_pose()[1][:, 6] * np.sqrt(self.prior[6])
+        force = self._to_pose()[0][6] * np.sqrt(self.prior[6])
         return (force.reshape(-1, 3) @ self.rotation.T).ravel()
 
     def _in_face(self, covariance_mm2: np.ndarray) -> np.ndarray:
@@ -337,38 +331,31 @@ class KnownShape:
         return Told(self.value[self.sized :], (of_pose + of_points)[modes, modes], np.zeros_like(spread), spread)
 
 
-@dataclass(slots=True, eq=False)
-class OfTarget:
-    """What is known of the circles: flatness of faces, known distances, faces of known shape."""
+def of_target(block: Block, setting: Setting) -> Known:
+    """Returns what is known of the circles: flatness of faces, known distances, faces of known shape."""
 
-    block: Block
-    setting: Setting
-    last: tuple[Vector | None, list, list] = (None, [], [])  # circles, and the rows and shapes at them
+    @lru_cache(maxsize=1)  # both of a state are asked for
+    def known(circles: Vector) -> tuple[list[KnownRows], list[KnownShape]]:
+        xyz = circles.array
+        return [*planes(xyz, setting), *bars(xyz, setting)], list(shapes(xyz, setting))
 
-    def _known(self, values: Mapping[str, Any]) -> tuple[list, list]:
-        """Returns rows and shapes at a state; both cost and equations of it are asked for."""
-        if self.last[0] is not values[CIRCLES]:
-            xyz, setting = values[CIRCLES].array, self.setting
-            self.last = values[CIRCLES], [*planes(xyz, setting), *bars(xyz, setting)], list(shapes(xyz, setting))
-        return self.last[1:]
+    def cost(circles: Vector) -> float:
+        rows, faces = known(circles)
+        return sum(face.cost() for face in faces) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
-    def cost(self, values: Mapping[str, Any]) -> float:
-        rows, known = self._known(values)
-        return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
-
-    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        size = values[CIRCLES].array.size
+    def equations(circles: Vector) -> tuple[np.ndarray, np.ndarray]:
+        size = circles.array.size
         normal, right = np.zeros((size, size)), np.zeros(size)
-        rows, known = self._known(values)
-        for members, slope, gap, sigma in rows:
+        rows, faces = known(circles)
+        parts = [(members, slope.T @ slope / s**2, slope.T @ gap / s**2) for members, slope, gap, s in rows]
+        parts += [(face.members, face.normal(), face.slope()) for face in faces]
+        for members, square, pull in parts:
             place = coordinates(members)
-            normal[np.ix_(place, place)] += slope.T @ slope / sigma**2
-            right[place] -= slope.T @ gap / sigma**2
-        for shape in known:
-            place = coordinates(shape.members)
-            normal[np.ix_(place, place)] += shape.normal()
-            right[place] -= shape.slope()
+            normal[np.ix_(place, place)] += square
+            right[place] -= pull
         return normal, right
+
+    return Known(block, cost, equations)
 
 
 KnownRows = tuple[np.ndarray, np.ndarray, np.ndarray, float]

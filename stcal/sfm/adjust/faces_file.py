@@ -62,10 +62,9 @@ class JointCovariance(Part):
 
     @model_validator(mode="after")
     def _is_covariance(self) -> Self:
-        size = 3 * len(self.labels)
+        size, count = 3 * len(self.labels), len(self.upper_triangle)
         needed = size * (size + 1) // 2
-        if len(self.upper_triangle) != needed:
-            count = len(self.upper_triangle)
+        if count != needed:
             raise mistake(f"upper_triangle of {count} numbers, {needed} needed for {size}×{size}")
         try:
             require_covariance(self.matrix(), size, CovarianceRows.of(self.labels, "xyz"))
@@ -206,9 +205,8 @@ class TargetCircles(Brief):
             raise InputError(error.code, f"circles' covariance: {error}; make the run again") from error
         object.__setattr__(self, "place", {label: i for i, label in enumerate(self.labels)})
         if len(self.place) < c or not (self.radius > 0).all():
-            raise InputError(
-                "E-LABEL-REPEATED", "circles: a label twice, or a radius that is not positive; correct them"
-            )
+            fault = "circles: a label twice, or a radius that is not positive"
+            raise InputError("E-LABEL-REPEATED", f"{fault}; correct them")
         if not (np.isfinite(self.sigma_factor) and self.sigma_factor > 0):
             raise InputError("E-OPTION-RANGE", f"σ factor {self.sigma_factor}: a positive number needed")
         normal, planes = np.zeros((c, 3)), {}
@@ -228,9 +226,8 @@ class TargetCircles(Brief):
 
     def of_face(self, face: FaceDesign) -> tuple[np.ndarray, np.ndarray]:
         """Returns the circles of a face: centres in the target frame, (k, 3), and in that of its design, (k, 3)."""
-        own = [i for i, label in enumerate(face.labels()) if label in self.place]
-        xyz = self.xyz[[self.place[face.labels()[i]] for i in own]]
-        return xyz, np.column_stack([face.xy_mm[own], np.zeros(len(own))])
+        labels = [label for label in face.labels() if label in self.place]
+        return self.xyz[[self.place[label] for label in labels]], face.places_mm(label.circle for label in labels)
 
     @classmethod
     def of(cls, target: CalibratedTarget, design: TargetDesign, sigma_factor: float = 1.0) -> "TargetCircles":

@@ -109,9 +109,8 @@ class Adjusted:
         ``sigma0``: of the residuals if None."""
         setting, solution, values = self.setting, self.solution, self.solution.values
         groups, xyz = setting.groups, values[CIRCLES].array
-        flat = sum(len(members) - 3 for members, *_ in equations.planes(xyz, setting)) + sum(
-            1 for _ in equations.bars(xyz, setting)
-        )
+        flat = len(list(equations.bars(xyz, setting)))
+        flat += sum(len(members) - 3 for members, *_ in equations.planes(xyz, setting))
         for shape in equations.shapes(xyz, setting):
             flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
         observations = sum(2 * len(g.model.image_index) + 3 * len(g.dots) for g in groups) + flat
@@ -121,20 +120,12 @@ class Adjusted:
             sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
         covariance = max(1.0, sigma0) ** 2 * solution.inverse
         intrinsics = solution.parts[0].places[equations.CAMERA]
-        return JointResult(
-            tuple(self.models),
-            {g.model.group: g.board_at(values) for g in groups},
-            setting.labels,
-            xyz,
-            covariance[: xyz.size, : xyz.size],
-            sigma0,
-            setting.common,
-            self.camera,
-            covariance[intrinsics, intrinsics],
-            redundancy,
-            self.move_px,
-            *setting.factors,
-        ).with_larger_sigma(self.enlarged)
+        boards = {g.model.group: g.board_at(values) for g in groups}
+        circles = setting.labels, xyz, covariance[: xyz.size, : xyz.size]
+        lens = self.camera, covariance[intrinsics, intrinsics]
+        more = redundancy, self.move_px, *setting.factors
+        result = JointResult(tuple(self.models), boards, *circles, sigma0, setting.common, *lens, *more)
+        return result.with_larger_sigma(self.enlarged)
 
     def extensible(self) -> "Extensible":
         """Returns the covariances of the points; σ₀ is 1."""
@@ -167,7 +158,8 @@ def adjusted(
 ) -> Adjusted:
     """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
     (one plate) or not (a film, a screen), if ``common`` is None."""
-    setting, values = _start(models, board, camera, flatness_mm, prior, common or 0.0, start)
+    begin = unmoved(models, board, camera, flatness_mm, prior, common or 0.0, start)
+    setting, values = begin.setting, begin.solution.values
     if common is None:
         setting = replace(setting, huber=HUBER * _robust_sigma(setting, values))
         if faces_of_known_shape(board):
@@ -183,7 +175,8 @@ def adjust_part(
     """Adjusts a part of the models of a ``whole`` joint result, with its weights, camera, factors and common share."""
     # Of a single group, the variance of its board is the same whatever share of it other groups have.
     common = whole.board_common if len(models) > 1 else 0.0
-    setting, values = _start(models, board, whole.camera, flatness_mm, None, common)
+    begin = unmoved(models, board, whole.camera, flatness_mm, None, common)
+    setting, values = begin.setting, begin.solution.values
     factors = ShapeFactors(whole.print_factor, whole.bend_factor, whole.print_amplitude)
     setting = replace(setting, huber=HUBER * _robust_sigma(setting, values), factors=factors)
     return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
@@ -229,10 +222,22 @@ def unmoved(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
+    start: Camera | None = None,
 ) -> Adjusted:
-    """Returns the adjustment of models at their true positions, which do not move; arguments as of :func:`adjusted`."""
-    setting, values = _start(models, board, camera, flatness_mm, prior, common)
-    return Adjusted(setting, setting.joined(values).at(values), 0.0)
+    """Returns the adjustment of models that do not move, without down-weighting; arguments as of :func:`adjusted`."""
+    labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
+    basis, weight = np.zeros((len(PARAMETER_NAMES), 0)), np.zeros((0, 0))
+    if prior:
+        basis, weight = intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
+    groups = tuple(_group(model, board, labels) for model in models)
+    flatness_mm = np.inf if flatness_mm is None else flatness_mm
+    setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis, weight, np.inf)
+    total, count = np.zeros((len(labels), 3)), np.zeros(len(labels))
+    for group in groups:  # circles begin at their means over the groups
+        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
+        np.add.at(count, group.circle_place, 1)
+    setting, values = _with_common(setting, setting.values(total / count[:, None], start or camera), common)
+    return Adjusted(setting, setting.joined(values).at(values), move_px=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,30 +259,6 @@ class Extensible:
         return (half**2).sum(0)
 
 
-def _start(
-    models,
-    board: BoardDesign,
-    camera: Camera,
-    flatness_mm: float | None,
-    prior: CameraPrior | None,
-    common: float = 0.0,
-    start: Camera | None = None,
-) -> tuple[Setting, Values]:
-    """Returns a setting without down-weighting, and the start."""
-    labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
-    basis, weight = np.zeros((len(PARAMETER_NAMES), 0)), np.zeros((0, 0))
-    if prior:
-        basis, weight = intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
-    groups = tuple(_group(model, board, labels) for model in models)
-    flatness_mm = np.inf if flatness_mm is None else flatness_mm
-    setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis, weight, np.inf)
-    total, count = np.zeros((len(labels), 3)), np.zeros(len(labels))
-    for group in groups:  # circles begin at their means over the groups
-        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
-        np.add.at(count, group.circle_place, 1)
-    return _with_common(setting, setting.values(total / count[:, None], start or camera), common)
-
-
 def _with_common(setting: Setting, values: Values, common: float) -> tuple[Setting, Values]:
     """Returns setting and state with a shape of the board that all groups have in common, if ``common`` is not 0."""
     setting = replace(setting, common=common)
@@ -295,26 +276,15 @@ def _minimise(setting: Setting, values: Values, settled: float) -> Adjusted:
     )
     move = float(np.abs(after - before).max(initial=0.0))
     if not move <= MAX_MOVE_PX:  # true of NaN, too
-        raise ConvergenceError(
-            "E-NO-MINIMUM",
-            f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
-            "compare with --solve chain and look at the outliers",
-        )
+        fault = f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps"
+        raise ConvergenceError("E-NO-MINIMUM", f"{fault}; compare with --solve chain and look at the outliers")
     return Adjusted(setting, solution, move)
 
 
 def _descent(setting: Setting, values: Values, settled: float) -> Minimum[Values, JoinedSolution]:
     joined = setting.joined(values)
-    return minimise(
-        dict(values),
-        joined.at,
-        joined.moved,
-        cost=joined.cost,
-        damping=DAMPING,
-        least_damping=DAMPING,
-        settled=settled,
-        max_steps=MAX_STEPS,
-    )
+    options: dict[str, Any] = {"damping": DAMPING, "least_damping": DAMPING, "max_steps": MAX_STEPS}
+    return minimise(dict(values), joined.at, joined.moved, cost=joined.cost, settled=settled, **options)
 
 
 def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> GroupPart:
@@ -322,24 +292,15 @@ def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
     if len(dots) < MIN_DOTS and not (faces_of_known_shape(board) or known_distances(board)):
-        raise ScaleError(
-            "E-SCALE-FEW-DOTS",
-            f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
-            "photograph the board with the faces",
-        )
+        fault = f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed"
+        raise ScaleError("E-SCALE-FEW-DOTS", f"{fault}; photograph the board with the faces")
     if 0 < len(dots) < MIN_DOTS:  # the scale is then from the target itself
         return _group(model.without(np.isin(model.point_index, dots)), board, labels)
     design = board.places_mm(model.labels[i] for i in dots)
-    cells = dot_cells(model.labels[i] for i in dots)
-    return GroupPart(
-        model,
-        align_rigid(model.xyz_model[dots], design) if len(dots) else Rigid(),
-        design,
-        dots,
-        circles,
-        cells[:, 0] * board.columns + cells[:, 1] if len(dots) else np.zeros(0, int),
-        np.array([place[model.labels[i]] for i in circles], int),
-    )
+    cells = dot_cells(model.labels[i] for i in dots) @ [board.columns, 1] if len(dots) else np.zeros(0, int)
+    start = align_rigid(model.xyz_model[dots], design) if len(dots) else Rigid()
+    circle_place = np.array([place[model.labels[i]] for i in circles], int)
+    return GroupPart(model, start, design, dots, circles, cells, circle_place)
 
 
 def _robust_sigma(setting: Setting, values: Values) -> float:
@@ -354,7 +315,8 @@ def _common_share(setting: Setting, values: Values) -> float:
     """Returns the covariance between the groups' board residuals over their variance; 0 if it is not significant."""
     by_dot = np.full((len(setting.groups), setting.board.rows * setting.board.columns, 3), np.nan)
     for own, group in zip(by_dot, setting.groups, strict=True):
-        own[group.cells] = group.board_residual(values)
+        dots = group.board_at(values).inverse() @ values[group.name(equations.DOTS)].array
+        own[group.cells] = dots - group.design
     product, square, count = 0.0, 0.0, 0
     for one, two in combinations(by_dot, 2):
         both = np.isfinite(one) & np.isfinite(two)

@@ -1,6 +1,7 @@
 """One group: scale, bundle adjustment alternating with the circles' eccentricity, and the free network with its score
 tests (Rao 1948; Baarda 1968)."""
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -78,11 +79,9 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
     if len(members) < MIN_DOTS and (own := _of_faces(model, board) or _of_distances(model, board)) is not None:
         return own
     if len(members) < MIN_DOTS:
-        raise ScaleError(
-            "E-SCALE-FEW-DOTS",
-            f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces; "
-            "check that the camera file belongs to the images and the board file to the board",
-        )
+        fault = f"{where}: {len(members)} board dots mapped, {MIN_DOTS} needed; photograph the board with the faces"
+        remedy = "check that the camera file belongs to the images and the board file to the board"
+        raise ScaleError("E-SCALE-FEW-DOTS", f"{fault}; {remedy}")
     labels = [model.labels[i] for i in members]
     cells = dot_cells(labels)
     xyz_board = board.places_mm(labels)
@@ -102,14 +101,8 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
     mean_ratio = float((apart[0] / apart[1]).mean())
     if by_rows:
         board_from_world = Similarity(mean_ratio, align_rigid(xyz_board, mean_ratio * xyz_world))
-    return Scale(
-        board_from_world,
-        mean_ratio,
-        rows,
-        tuple(labels),
-        board_from_world @ xyz_world - xyz_board,
-        float(board_from_world.scale * board.sigma_mm / spread),
-    )
+    residuals, sigma = board_from_world @ xyz_world - xyz_board, board_from_world.scale * board.sigma_mm / spread
+    return Scale(board_from_world, mean_ratio, rows, tuple(labels), residuals, float(sigma))
 
 
 def _of_faces(model: WorldModel, board: BoardDesign) -> Scale | None:
@@ -128,10 +121,9 @@ def _of_faces(model: WorldModel, board: BoardDesign) -> Scale | None:
     if not scales:
         return None
     scale = float(np.exp(np.average(np.log(scales), weights=weights)))
-    residuals = [align_rigid(design, scale * xyz) @ (scale * xyz) - design for design, xyz in parts]
+    residuals = np.concatenate([align_rigid(design, scale * xyz) @ (scale * xyz) - design for design, xyz in parts])
     sigma = scale / float(np.sqrt(np.sum(weights)))
-    whole = Similarity(scale, Rigid())
-    return Scale(whole, scale, (0, 0), tuple(labels), np.concatenate(residuals), sigma, "faces")
+    return Scale(Similarity(scale, Rigid()), scale, (0, 0), tuple(labels), residuals, sigma, "faces")
 
 
 def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
@@ -157,14 +149,12 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
     if not isinstance(board, ScaleReference) or not any(face.of_tags for face in board.faces):
         return board
     labels = [label for face in board.faces if face.of_tags for label in face.labels()]
-    sides = dict(zip(labels[::4], labels[1::4], strict=True))
-    lengths: dict[str, list[float]] = {}
+    lengths: dict[str, list[float]] = defaultdict(list)
     for image in observations:
         place = dict(zip(image.labels, image.centre_px, strict=True))
-        for first, second in sides.items():
+        for first, second in zip(labels[::4], labels[1::4], strict=True):
             if first in place and second in place:
-                length = float(np.linalg.norm(place[first] - place[second]))
-                lengths.setdefault(first.face, []).append(length)
+                lengths[first.face].append(float(np.linalg.norm(place[first] - place[second])))
     faces = []
     for face in board.faces:
         moved = 2 * EDGE_SIGMA_PX / float(np.median(lengths[face.id])) if face.id in lengths else 0.0
@@ -189,11 +179,8 @@ NO_PARAMETERS = np.zeros((len(PARAMETER_NAMES), 0))
 def adjust(model: M, camera: Camera) -> M:
     """Minimises the weighted reprojection error of the corrected centres over poses and points."""
     if not model.images:
-        raise MappingError(
-            "E-GROUP-FEW-IMAGES",
-            f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common; add images, until two "
-            "show each face beside a neighbour",
-        )
+        fault = f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common"
+        raise MappingError("E-GROUP-FEW-IMAGES", f"{fault}; add images, until two show each face beside a neighbour")
     a, poses = Adjustment(), Poses.of(model.camera_from_model)
     few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
     cameras = a.block("poses", poses, eliminate=not few)
@@ -258,6 +245,10 @@ this multiple of their own σ, are named and left out."""
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
 MAX_OUTLIER_SHARE = 0.1
+CONTRADICTS = (
+    "check that nothing but the camera moved, and that the camera file belongs to the images (without --camera it is "
+    "found from the board's dots)"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,9 +264,8 @@ def refine(
     """Alternates between the eccentricity of the circles and bundle adjustment until the corrections settle."""
     radius = target.radius_of() | board.radius_of()
     model = adjust(model, camera)
-    observations = len(model.image_index)
+    observations, rounds = len(model.image_index), 0
     outliers: list[Outlier] = []
-    rounds = 0
     while rounds < MAX_ROUNDS:  # rounds that find outliers do not count: their number is limited separately
         rounds += 1
         shift = np.zeros_like(model.shift_px)
@@ -290,23 +280,18 @@ def refine(
             if len(new_outliers):
                 outliers += new_outliers
                 if len(outliers) > MAX_OUTLIER_SHARE * observations:  # the model is wrong, not the observations
-                    raise MappingError(
-                        "E-GROUP-CONTRADICTS",
-                        f"group {model.group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} "
-                        f"observations contradict the others, first {outliers[0].image} {outliers[0].label} by "
-                        f"{outliers[0].residual_px:.1f} px; check that nothing but the camera moved, and that the "
-                        "camera file belongs to the images (without --camera it is found from the board's dots)",
-                    )
+                    share = f"more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} observations"
+                    first = f"{outliers[0].image} {outliers[0].label} by {outliers[0].residual_px:.1f} px"
+                    fault = f"group {model.group}: {share} contradict the others, first {first}"
+                    raise MappingError("E-GROUP-CONTRADICTS", f"{fault}; {CONTRADICTS}")
                 model = adjust(model.without(is_outlier), camera)
                 rounds -= 1
                 continue
         if change <= SETTLED_PX:
             return Refined(model, rounds, tuple(outliers))
-    raise ConvergenceError(
-        "E-NO-MINIMUM",
-        f"group {model.group}: the eccentricity still changes by {change:.2g} px after {MAX_ROUNDS} rounds, "
-        f"{SETTLED_PX:g} needed; check the radii in the target and board files",
-    )
+    fault = f"the eccentricity still changes by {change:.2g} px after {MAX_ROUNDS} rounds, {SETTLED_PX:g} needed"
+    remedy = "check the radii in the target and board files"
+    raise ConvergenceError("E-NO-MINIMUM", f"group {model.group}: {fault}; {remedy}")
 
 
 def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, float], mm_per_unit: float) -> np.ndarray:
@@ -319,11 +304,9 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
             normal[members] = fit_plane(model.xyz_model[members]).normal
         except DegenerateError as error:
             surface = "the board" if key == "board" else f"face {key}"
-            raise MappingError(
-                "E-GROUP-FEW-CIRCLES",
-                f"group {model.group}: {surface}: {len(members)} circles mapped, 3 needed for its plane that are not "
-                f"on one line; add views that show {surface}",
-            ) from error
+            fault = f"{surface}: {len(members)} circles mapped, 3 needed for its plane that are not on one line"
+            text = f"group {model.group}: {fault}; add views that show {surface}"
+            raise MappingError("E-GROUP-FEW-CIRCLES", text) from error
     radius = np.array([radius_mm[label] for label in model.labels]) / mm_per_unit
     rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
     xyz = model.xyz_camera()
@@ -397,10 +380,8 @@ class Network:
 
     def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns squared residuals over σ² and redundancy of each image, (m,)."""
-        square, redundancy = np.zeros((2, len(self.model.images)))
-        np.add.at(square, self.model.image_index, (self.residual**2).sum(1))
-        np.add.at(redundancy, self.model.image_index, self.redundancy)
-        return square, redundancy
+        image, count = self.model.image_index, len(self.model.images)
+        return np.bincount(image, (self.residual**2).sum(1), count), np.bincount(image, self.redundancy, count)
 
     def covariance_of(self, points: np.ndarray) -> np.ndarray:
         """Returns the covariance of some of the points, (3k, 3k)."""
@@ -503,7 +484,6 @@ def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
     scale = np.sqrt(np.where(own > 0, own, np.inf))  # a parameter that rounding alone determines counts for nothing
     value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
     held = value > MIN_SHARE
-    half = vector[:, held] / np.sqrt(value[held])
-    half = half / scale[:, None]
+    half = vector[:, held] / np.sqrt(value[held]) / scale[:, None]
     along = half.T @ right
     return ScoreTest(half @ along, half @ half.T, float(along @ along), int(held.sum()))

@@ -7,9 +7,10 @@ from itertools import combinations
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.sfm.adjust import chain, equations
 from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
 from stcal.sfm.adjust.equations import BOARD, CIRCLES, DOTS
@@ -36,8 +37,8 @@ class Derivatives:
 
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """Returns 6×6 by face from the covariance (3c, 3c) of the circles, in any datum."""
-        parts = {face: (by_circles, self.face_designed[face]) for face, by_circles in self.faces.items()}
-        return {face: self._covariance(covariance_mm2, *own) for face, own in parts.items()}
+        parts = ((face, own, self.face_designed[face]) for face, own in self.faces.items())
+        return {face: self._covariance(covariance_mm2, own, designed) for face, own, designed in parts}
 
     def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
         """Returns σ of the distance between the origins of every two faces."""
@@ -76,11 +77,8 @@ def calibrated_target(
         variances = {
             kind: np.maximum(np.diag(matrix), 0.0) for kind, matrix in _parts_of(state, positions.T)[0].items()
         }
-        for i, face in enumerate(own.faces):
-            of_kind = {
-                kind: result.sigma_scale * np.sqrt(v[3 * i : 3 * i + 3]) for kind, v in variances.items() if v.any()
-            }
-            sources[face] = of_kind
+        sigma = {kind: result.sigma_scale * np.sqrt(v).reshape(-1, 3) for kind, v in variances.items() if v.any()}
+        sources = {face: {kind: each[i] for kind, each in sigma.items()} for i, face in enumerate(own.faces)}
     return CalibratedTarget(
         reference_face=start.reference_face,
         target_from_face=own.target_from_face,
@@ -111,9 +109,9 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
     }
     poses = {moved: frames(np.zeros((1, len(rows), 3)))[0] for moved, (rows, _, frames) in faces.items()}
     target_from_model = poses[start.reference_face].inverse()
-    mapped, c = 3 * len(result.labels), len(result.labels)  # after the circles come the placed ones, by two coordinates
+    mapped = at = 3 * len(result.labels)  # after the circles come the placed ones, by two coordinates
     width = mapped + 2 * sum(p for _, p, _ in faces.values())
-    by_face, circles, at = {face_id: np.zeros((6, width)) for face_id in poses}, np.zeros((c, 3, width)), mapped
+    by_model = {face_id: np.zeros((6, width)) for face_id in poses}  # of model_from_face
     for moved, (rows, p, frames) in faces.items():
         m, columns = 3 * len(rows), np.append(equations.coordinates(rows), at + np.arange(2 * p))
         at += 2 * p
@@ -121,34 +119,28 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
         shifts = np.zeros((m + 2 * p, p, 3))  # in the plane of the face, where the design gives their places
         shifts[m:] = np.einsum("pq,ja->pjqa", np.eye(p), poses[moved].rotation[:, :2].T).reshape(2 * p, p, 3)
         ahead, behind = (frames(sign * STEP_MM * moves, sign * STEP_MM * shifts) for sign in (1, -1))
-        if moved != start.reference_face:
-            twist = (target_from_model @ ahead).difference(target_from_model @ behind)
-            by_face[moved][:, columns] = twist.T / (2 * STEP_MM)
-            rotated = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
-            circles[np.ix_(rows, np.arange(3), columns)] = rotated
-            continue
-        ahead, behind = ahead.inverse(), behind.inverse()
-        for face_id, pose in poses.items():
-            if face_id != moved:
-                by_face[face_id][:, columns] = (ahead @ pose).difference(behind @ pose).T / (2 * STEP_MM)
-        for sign, target_from_moved in ((1, ahead), (-1, behind)):
-            xyz = np.tile(result.xyz_model, (len(moves), 1, 1))
-            xyz[:, rows] += sign * STEP_MM * moves
-            placed = xyz @ np.swapaxes(target_from_moved.rotation, 1, 2) + target_from_moved.translation[:, None]
-            circles[:, :, columns] += sign * np.transpose(placed, (1, 2, 0)) / (2 * STEP_MM)
+        by_model[moved][:, columns] = ahead.difference(behind).T / (2 * STEP_MM)
+    frame, origin, turn = by_model[start.reference_face], poses[start.reference_face], target_from_model.rotation
+
+    def in_target(place: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """Returns how a place (3,) changes in the target frame, which moves too; ``move`` (3, w) in the model."""
+        return turn @ (move - frame[3:] + skew(place - origin.translation) @ frame[:3])
+
+    by_face = {
+        face_id: np.vstack([turn @ (by[:3] - frame[:3]), in_target(poses[face_id].translation, by[3:])])
+        for face_id, by in by_model.items()
+    }
+    moves = np.eye(mapped, width).reshape(-1, 3, width)
+    circles = np.array([in_target(*each) for each in zip(result.xyz_model, moves, strict=True)])
     sigma = 0.0
     if width > mapped:
         sigma = chain.placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
-    return Derivatives(
-        {face_id: target_from_model @ pose for face_id, pose in poses.items()},
-        target_from_model @ result.xyz_model,
-        target_from_model,
-        {face_id: jacobian[:, :mapped] for face_id, jacobian in by_face.items()},
-        circles[:, :, :mapped],
-        {face_id: jacobian[:, mapped:] for face_id, jacobian in by_face.items()},
-        circles[:, :, mapped:],
-        sigma,
+    places = {face_id: target_from_model @ pose for face_id, pose in poses.items()}
+    by_mapped, designed = (
+        ({face_id: jacobian[:, part] for face_id, jacobian in by_face.items()}, circles[:, :, part])
+        for part in (slice(mapped), slice(mapped, None))
     )
+    return Derivatives(places, target_from_model @ result.xyz_model, target_from_model, *by_mapped, *designed, sigma)
 
 
 def _moved_face(
@@ -191,16 +183,12 @@ class Contributions:
 def widened_result(state: Adjusted, covariance: dict[str, np.ndarray] | None = None) -> JointResult:
     """Returns the result of an adjustment, with covariances by how much its photographs differ."""
     joint, variance = state.result(), state.differ**2
-    if variance > 1:
-        of_kind = covariance or _parts_of(state)[0]
-        added = (1 - 1 / variance) * joint.sigma_scale**2 * (of_kind[CIRCLES] + of_kind[DOTS])
-        joint = replace(
-            joint,
-            covariance_mm2=joint.covariance_mm2 + (added + added.T) / 2,
-            camera_covariance=variance * joint.camera_covariance,
-            differ=state.differ,
-        )
-    return joint
+    if variance <= 1:
+        return joint
+    of_kind = covariance or _parts_of(state)[0]
+    added = (1 - 1 / variance) * joint.sigma_scale**2 * (of_kind[CIRCLES] + of_kind[DOTS])
+    wider, of_camera = joint.covariance_mm2 + (added + added.T) / 2, variance * joint.camera_covariance
+    return replace(joint, covariance_mm2=wider, camera_covariance=of_camera, differ=state.differ)
 
 
 def contributions_of(state: Adjusted) -> Contributions:
@@ -208,13 +196,9 @@ def contributions_of(state: Adjusted) -> Contributions:
     covariance, by_scale, by_intrinsics = _parts_of(state)
     joint = widened_result(state, covariance)
     variance = joint.sigma_scale**2
-    return Contributions(
-        joint,
-        {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in covariance.items()},
-        by_scale,
-        by_intrinsics,
-        {kind: state.differ * joint.sigma_scale * centre_sigma_px(state, kind) for kind in (CIRCLES, DOTS)},
-    )
+    parts = {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in covariance.items()}
+    sigma_px = {kind: state.differ * joint.sigma_scale * centre_sigma_px(state, kind) for kind in (CIRCLES, DOTS)}
+    return Contributions(joint, parts, by_scale, by_intrinsics, sigma_px)
 
 
 Parts = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]
@@ -225,11 +209,12 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
     """Returns the parts for quantities with derivatives (3c, k) by the circles, or for the 3c coordinates if None."""
     setting, solution = state.setting, state.solution
     camera, xyz = state.camera, solution.values[CIRCLES].array
-    k = xyz.size if quantities is None else quantities.shape[1]
+    along_all = np.eye(xyz.size) if quantities is None else quantities
+    k = along_all.shape[1]
     covariance = {kind: np.zeros((k, k)) for kind in OBSERVED}
     by_scale, by_intrinsics = np.zeros(k), np.zeros((k, len(PARAMETER_NAMES)))
     for group, model, part in zip(setting.groups, state.models, solution.whole, strict=True):
-        along = part.inverse[:, : xyz.size] if quantities is None else part.inverse[:, : xyz.size] @ quantities
+        along = part.inverse[:, : xyz.size] @ along_all
         pitch = (group.design @ group.board_at(solution.values).rotation.T / setting.own_sigma_mm()).ravel()
         for rows, batch, total in part.effects(along):
             (kind,), flat = rows.factor.kinds, total.reshape(-1, k)
@@ -240,7 +225,7 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
                 seen = model.observed(group.observations(kind)[batch])
                 lens = seen.whiten(seen.by_parameters(camera)) * np.sqrt(rows.weight[batch])[:, None, None]
                 by_intrinsics += flat.T @ lens.reshape(len(flat), -1)
-    inverse = solution.inverse[:, : xyz.size] if quantities is None else solution.inverse[:, : xyz.size] @ quantities
+    inverse = solution.inverse[:, : xyz.size] @ along_all
     intrinsics = inverse[solution.parts[0].places[equations.CAMERA]]
     covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
     for kind, known in ((FLATNESS, equations.planes), (DISTANCES, equations.bars)):
@@ -257,9 +242,8 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
 
 def centre_sigma_px(state: Adjusted, kind: str) -> float:
     """Returns the RMS of the centres' σ per axis, as used for the weights."""
-    each = [group.model.sigma_px()[group.observations(kind)] ** 2 for group in state.setting.groups]
-    square = np.concatenate(each)
-    return float(np.sqrt(square.mean())) if len(square) else 0.0
+    sigma = np.concatenate([group.model.sigma_px()[group.observations(kind)] for group in state.setting.groups])
+    return rms(sigma) if len(sigma) else 0.0
 
 
 def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Adjusted:
@@ -289,8 +273,6 @@ def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign,
             pull = expected @ released(residual, rows_of.square(points))
             scatter += np.outer(pull, pull)
             told += expected @ expected.T
-    ratios = []
-    for i in range(0, len(faces), 6):
-        own_part = np.ix_(range(i, i + 6), range(i, i + 6))
-        ratios.append(np.trace(np.linalg.lstsq(told[own_part], scatter[own_part], rcond=None)[0]) / 6)
+    own_parts = [(slice(i, i + 6), slice(i, i + 6)) for i in range(0, len(faces), 6)]
+    ratios = [np.trace(np.linalg.lstsq(told[own], scatter[own], rcond=None)[0]) / 6 for own in own_parts]
     return replace(state, differ=max(1.0, float(np.sqrt(np.mean(ratios))) / max(1.0, result.sigma0)))

@@ -12,7 +12,7 @@ from stcal.adjust.blocks import Vector
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.explain import Candidate, explain
-from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.camera import COLMAP_MODELS, FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Poses
 from stcal.io.cameras.camera_model import OF_IMAGES, CameraModel
@@ -110,7 +110,7 @@ class HeldOut:
         """Returns the RMS per coordinate without gross errors."""
         most = CLIP_SIGMAS * self.factor
         kept = [px[np.abs(own).max(axis=1) < most] for px, own in zip(self.residuals_px, self.in_sigma, strict=True)]
-        return float(np.sqrt((np.concatenate(kept) ** 2).mean()))
+        return rms(np.concatenate(kept))
 
     def squares(self, factor: float) -> np.ndarray:
         """Returns the mean square of each view in σ times ``factor``, (v,). Residuals beyond 5 count as 5."""
@@ -168,13 +168,11 @@ def choose_model(
     fared = {model: outcome for model, outcome in both.items() if isinstance(outcome, HeldOut)}
     why |= {model: str(outcome or "too few views") for model, outcome in both.items() if model not in fared}
     if not fared:
-        for fit in fits.values():
-            if isinstance(fit, StcalError) and not tried:
-                raise fit
-        raise DegenerateError(
-            "E-CALIBRATE-FEW-VIEWS",
-            f"--model auto: {len(views)} views, {MIN_TRAINING + 1} needed; add views, or choose a --model",
-        )
+        errors = [fit for fit in fits.values() if isinstance(fit, StcalError)]
+        if errors and not tried:
+            raise errors[0]
+        fault = f"--model auto: {len(views)} views, {MIN_TRAINING + 1} needed"
+        raise DegenerateError("E-CALIBRATE-FEW-VIEWS", f"{fault}; add views, or choose a --model")
     factor = min(entry.factor for entry in fared.values())  # one σ for all models: that of the model that fits best
     squares = {model: entry.squares(factor) for model, entry in fared.items()}
     best = min(squares, key=lambda model: squares[model].mean())
@@ -254,22 +252,17 @@ def without_gross_errors(
                 break
             own = own.select(np.delete(np.arange(len(own)), worst))
         if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
-            reason = (
-                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
-                "other views put them"
-            )
+            far = f"{len(view) - len(own)} of {len(view)} corners lie more than {limits}"
+            reason = f"{far} from where the camera and the other views put them"
             skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
             continue
         kept.append(own)
         off += [(view.name, label) for label in view.labels if label not in own.labels]
     if not off:
         return kept, skipped, []
-    image, label = off[0]
-    warning = (
-        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
-        f"{limits} from where the camera and all views put them; look whether something hides the board there"
-    )
-    return kept, skipped, [warning]
+    left_out = f"{len(off)} corners in {len(dict(off))} views are left out, first {' '.join(off[0])}"
+    why = f"they lie more than {limits} from where the camera and all views put them"
+    return kept, skipped, [f"{left_out}: {why}; look whether something hides the board there"]
 
 
 MIN_VIEWS = 3
@@ -361,10 +354,8 @@ def calibrated(
     if colmap_model == AUTO:
         return of_chosen_model(lambda model: calibrated(find, images, board, model, workers, rounds), board, workers)
     if colmap_model not in COLMAP_MODELS:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
-        )
+        fault = f"camera model {colmap_model}: not supported"
+        raise InputError("E-CAMERA-MODEL", f"{fault}; use one of {', '.join(COLMAP_MODELS)} or {AUTO}")
     files, not_images = find_images(images)
     camera = intrinsics.start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
@@ -410,18 +401,13 @@ def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera
     views = intrinsics.board_views(detection.images, board, camera)
     if not first:
         views, _ = correct_defocus(views, camera, pattern_of_board(board))
-    shown, repeated = {view.name for view in views}, "the board is in view more than once"
-    without = (
-        Skipped(
-            each.file.name,
-            repeated
-            if "board" in each.detection.repeated
-            else "; ".join(["no board recognised", *each.detection.notes[:1]]),
-        )
-        for each in detection.images
-        if each.file.name not in shown
-    )
-    return views, (*detection.skipped, *without)
+    shown, skipped = {view.name for view in views}, list(detection.skipped)
+    for each in detection.images:
+        why = "; ".join(["no board recognised", *each.detection.notes[:1]])
+        if "board" in each.detection.repeated:
+            why = "the board is in view more than once"
+        skipped += [] if each.file.name in shown else [Skipped(each.file.name, why)]
+    return views, tuple(skipped)
 
 
 def camera_of_dots(
@@ -495,44 +481,34 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
     images = {file.name for file in files}  # other files are skipped too, and explain nothing
     why = next((f"; {each.name}: {each.reason}" for each in skipped if each.name in images), "")
     if not views:
-        raise DetectionError(
-            "E-BOARD-NOT-FOUND",
-            f"camera: no board recognised in {len(files)} images{why}; check the board file (rows, columns, "
-            "corner, polarity, radius) and keep a third of the dots in view at least",
-        )
-    raise DegenerateError(
-        "E-CALIBRATE-FEW-VIEWS",
-        f"camera: {len(views)} of {len(files)} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}; "
-        "add views in which it is tilted by 20° to 40°",
-    )
+        fault = f"camera: no board recognised in {len(files)} images{why}"
+        remedy = "check the board file (rows, columns, corner, polarity, radius)"
+        raise DetectionError("E-BOARD-NOT-FOUND", f"{fault}; {remedy} and keep a third of the dots in view at least")
+    fault = f"camera: {len(views)} of {len(files)} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}"
+    raise DegenerateError("E-CALIBRATE-FEW-VIEWS", f"{fault}; add views in which it is tilted by 20° to 40°")
 
 
 def require_determined(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> None:
     """Checks that the views determine the focal length and that the lens model fits them."""
-    rms = weighted_rms_px(result)
-    if rms > MAX_RESIDUAL_PX:
+    misfit_px = weighted_rms_px(result)
+    if misfit_px > MAX_RESIDUAL_PX:
         found = explain(larger_models(result, views, board), weighted_rms_px, MAX_RESIDUAL_PX)
         other = "choose a --model with more parameters, check the board file, use images of one focus and zoom"
-        remedy = found[0][0].words if found else other
-        raise DegenerateError(
-            "E-CALIBRATE-MISFIT",
-            f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
-            f"allowed; {remedy}",
-        )
+        remedy, allowed = found[0][0].words if found else other, f"{MAX_RESIDUAL_PX:g} px allowed"
+        fault = f"camera: dots are {misfit_px:.1f} px RMS from where {result.colmap_model} puts them, {allowed}"
+        raise DegenerateError("E-CALIBRATE-MISFIT", f"{fault}; {remedy}")
     relative = float(result.sigma()[0] / result.camera.focal[0])
     if relative > MAX_FOCAL_SIGMA:
         normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_model])
         spread_deg = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
-        raise DegenerateError(
-            "E-CALIBRATE-UNDETERMINED",
-            f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, "
-            f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {spread_deg:.0f}°); "
-            "add views in which the board is tilted by 20° to 40°, about different axes",
-        )
+        needed = f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {spread_deg:.0f}°)"
+        fault = f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, {needed}"
+        remedy = "add views in which the board is tilted by 20° to 40°, about different axes"
+        raise DegenerateError("E-CALIBRATE-UNDETERMINED", f"{fault}; {remedy}")
 
 
 def residual_rms_px(result: Intrinsics) -> float:
-    return float(np.sqrt((result.residuals_px() ** 2).mean()))
+    return rms(result.residuals_px())
 
 
 def weighted_rms_px(result: Intrinsics) -> float:

@@ -128,12 +128,10 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     lens, held = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model), summary.held_out_rms_px
     digits = {name: 4 if name[0] in "fc" else 7 for name in summary.parameters}
     rows = [[n, *(number(own[k], digits[n]) for k in ("value", "sigma"))] for n, own in summary.parameters.items()]
-    models = [
-        ["*" if own.model == summary.model else "", own.model, str(own.parameters)]
-        + [number(v, 4) for v in (own.rms_px, own.worse, own.worse_sigma)]
-        + [own.why]
-        for own in summary.models
-    ]
+    models = []
+    for own in summary.models:
+        numbers = [number(v, 4) for v in (own.rms_px, own.worse, own.worse_sigma)]
+        models.append(["*" * (own.model == summary.model), own.model, str(own.parameters), *numbers, own.why])
     images = [[v["image"], v["dots"], number(v["tilt_deg"], 1), number(v["rms_px"], 4)] for v in summary.images]
     outliers = [[o["image"], o["label"], number(o["residual_px"], 3), number(o["weight"], 2)] for o in summary.outliers]
     left_out = [[own.name, own.reason] for own in summary.left_out]
@@ -194,15 +192,12 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     )
 
 
-def _image_axes(camera: Camera) -> Axes:
-    drawing = Drawing(5.6, 0.6 + 4.4 * camera.height / camera.width)
-    box = drawing.panels(top=20, right=44)[0]
-    return Axes(drawing, box, (-0.5, camera.width - 0.5), (camera.height - 0.5, -0.5))
-
-
 def sigma_map(result: CameraCalibration) -> Drawing:
     """Returns a figure of σ of projections over the image as shades, with the measured dots."""
-    camera, axes = result.intrinsics.camera, _image_axes(result.intrinsics.camera)
+    camera = result.intrinsics.camera
+    drawing = Drawing(5.6, 0.6 + 4.4 * camera.height / camera.width)
+    box = drawing.panels(top=20, right=44)[0]
+    axes = Axes(drawing, box, (-0.5, camera.width - 0.5), (camera.height - 0.5, -0.5))
     sigma = result.projection.sigma_px.reshape(GRID[::-1])
     step = round_below(float(sigma.max()) / 8)
     bands = max(1, int(np.ceil(sigma.max() / step)))
@@ -210,9 +205,9 @@ def sigma_map(result: CameraCalibration) -> Drawing:
     for model in result.intrinsics.models:
         axes.marks(*model.measured_px.T, kind="dot", size=0.8, colour="#ffffff", opacity=0.5)
     axes.frame("x, px", "y, px")
-    _, top, right, bottom = axes.box
-    axes.drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, "σ, px", VIRIDIS)
-    return axes.drawing
+    _, top, right, bottom = box
+    drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, "σ, px", VIRIDIS)
+    return drawing
 
 
 def residual_map(result: CameraCalibration) -> Drawing:

@@ -12,6 +12,7 @@ from stcal.adjust.blocks import Huber, Vector, sigma_factor
 from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
 from stcal.geometry.clusters import ByClusters
 from stcal.geometry.least_squares import minimise
@@ -106,26 +107,16 @@ class Fit:
 
     def robust_minimum(self) -> "Fit":
         """Returns the fit of least cost, with Huber's limit by its residuals."""
+        options: dict[str, Any] = {"damping": START_DAMPING, "settled": EXACTLY, "max_steps": MAX_STEPS}
         begin = self.linear()
-        joined = begin.problem
-        solution = minimise(
-            begin.values,
-            lambda values: LinearFit(joined, values, self),
-            joined.moved,
-            cost=joined.cost,
-            damping=START_DAMPING,
-            settled=EXACTLY,
-            max_steps=MAX_STEPS,
-        )
+        solution = minimise(begin.values, begin.at, begin.problem.moved, cost=begin.problem.cost, **options)
         if not solution.converged:  # a direction that hardly changes the images has a large σ
             move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
             if not move < CREEPING_PX:
-                raise ConvergenceError(
-                    "E-NO-MINIMUM",
-                    f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
-                    "needed; look at the images, add views that fill the image and are tilted, or choose a simpler "
-                    "--model",
-                )
+                fault = f"projections still move by {move:.1g} px after {solution.steps} steps"
+                views = "look at the images, add views that fill the image and are tilted"
+                remedy = f"{CREEPING_PX:g} px needed; {views}, or choose a simpler --model"
+                raise ConvergenceError("E-NO-MINIMUM", f"camera: {fault}, {remedy}")
         fit = solution.linear.fit
         return replace(fit, huber=HUBER * max(robust_sigma(np.concatenate(fit.lengths()), 2), LEAST_ROBUST))
 
@@ -135,6 +126,9 @@ class LinearFit(JoinedSolution):
     """The adjustment linearised about a state; only the lens is damped, as dots and poses are optimal for each step."""
 
     begin: Fit  # at any state
+
+    def at(self, values: dict[str, Any]) -> "LinearFit":
+        return replace(self, values=values)
 
     @cached_property
     def fit(self) -> Fit:
@@ -192,29 +186,25 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
         return camera
     conics = []
     for image in observations:
-        h = _homography(image, board, camera)
-        first, second = h[:, 0], h[:, 1]
-        first, second = np.array([first, second]) / np.sqrt(np.linalg.norm(first[:2]) * np.linalg.norm(second[:2]))
+        columns = _homography(image, board, camera)[:, :2].T
+        first, second = columns / np.sqrt(np.linalg.norm(columns[:, :2], axis=1).prod())
         conics += [_conic(first, second), _conic(first, first) - _conic(second, second)]
     rows = np.array(conics)
     equal, constants = rows[:, 0] + rows[:, 1], -rows[:, 4]
     square = float(equal @ equal)
     inverse = float(equal @ constants) / square if square else 0.0  # (assumed focal / focal)²
-    low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
+    longer = max(camera.width, camera.height)
+    low, high = FOCAL_LIMITS * np.array(longer) / camera.focal[0]
     largest = sorted(observations, key=len)[-TRIED_VIEWS:]
 
     def misfit_px(tried: Camera) -> float:
-        off = 0.0
-        for image in largest:
-            pose = start_pose(image, board, tried)
-            seen = tried.project(pose @ board.places_mm(image.labels))
-            off += float(np.sqrt(((seen - image.centre_px) ** 2).sum(1).mean()))
-        return off
+        poses = [(image, start_pose(image, board, tried)) for image in largest]
+        off = [tried.project(pose @ board.places_mm(image.labels)) - image.centre_px for image, pose in poses]
+        return sum(map(rms, off))
 
     if high**-2 < inverse < low**-2:
         usual = replace(camera, focal=camera.focal / np.sqrt(inverse))
     else:  # the one of several that fits best, by the mean over views of the RMS distance
-        longer = max(camera.width, camera.height)
         usual = min((replace(camera, focal=np.full(2, share * longer)) for share in TRIED_FOCALS), key=misfit_px)
     free = _of_any_pixels(rows, camera, low, high) if len(observations) >= LEAST_FREE else None
     return free if free is not None and misfit_px(free) < FAR_BETTER * misfit_px(usual) else usual
@@ -381,27 +371,21 @@ def adjust_intrinsics(
         # A single view cannot tell errors of the print from those of its centres: it is taken for one of this board.
         groups[largest] += [replace(view, group=largest) for view in groups.pop(name)]
     models = tuple(model_of_views(members, board, start) for members in groups.values())
-    fit = Fit(
-        models=models,
-        camera=start,
-        start=start,
-        basis=basis,
-        weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
-        places={m.group: m.xyz_model for m in models},
-        modes={m.group: PrintModes.of(m.xyz_model[:, :2]) for m in models},
-        sigma_mm=board.sigma_mm,
-    )
+    weight = np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model))
+    places = {m.group: m.xyz_model for m in models}
+    modes = {m.group: PrintModes.of(m.xyz_model[:, :2]) for m in models}
+    fit = Fit(models, start, start, basis, weight, places, modes, board.sigma_mm)
     try:
         return _adjusted(fit, board, colmap_model)
     except ConvergenceError:
         if held:
             raise
     # A focal length far off makes the rest of the lens wander: it comes first, alone, and one for both axes.
-    focal, weight = intrinsic_basis("SIMPLE_PINHOLE")[:, :1], np.full((1, 1), start.focal[0] ** -2.0)
-    alone = replace(fit, basis=focal, weight=weight)
+    focal = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
+    alone = replace(fit, basis=focal, weight=np.full((1, 1), start.focal[0] ** -2.0))
     for _ in range(FOCAL_ROUNDS):
         alone = alone.robust_minimum()
-    begun = replace(alone, basis=basis, weight=fit.weight, huber=fit.huber)
+    begun = replace(alone, basis=basis, weight=weight, huber=fit.huber)
     return replace(_adjusted(begun, board, colmap_model), restarted=True)
 
 
@@ -409,17 +393,11 @@ def _intrinsics(last: LinearFit, colmap_model: str, factors: BoardSigmaFactors, 
     fit, spread = last.fit, ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
     if fit.basis.shape[1]:
         spread = last.by_clusters(last.problem.parts[0].blocks[LENS])
-    by_photographs = {each.name: getattr(spread, each.name) for each in fields(spread)}
+    of_both = {name: getattr(fit, name) for name in ("camera", "models", "huber")}
+    of_both |= {each.name: getattr(spread, each.name) for each in fields(spread)}
+    redundancy = fit.redundancy()
     return Intrinsics(
-        camera=fit.camera,
-        colmap_model=colmap_model,
-        **by_photographs,
-        models=fit.models,
-        factors=factors,
-        huber=fit.huber,
-        redundancy=fit.redundancy(),
-        settled=settled,
-        fit=fit,
+        colmap_model=colmap_model, factors=factors, redundancy=redundancy, settled=settled, fit=fit, **of_both
     )
 
 
@@ -522,11 +500,9 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
     try:
         ideal = camera.normalised_from_pixel(image_grid(camera))
     except ConvergenceError as error:
-        raise DegenerateError(
-            "E-CAMERA-FOLDED",
-            "camera: the distortion folds over in a part of the image without dots; add views that fill the image "
-            "to its corners, or choose a --model with fewer parameters",
-        ) from error
+        fault = "camera: the distortion folds over in a part of the image without dots"
+        remedy = "add views that fill the image to its corners, or choose a --model with fewer parameters"
+        raise DegenerateError("E-CAMERA-FOLDED", f"{fault}; {remedy}") from error
     jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
     x, y = ideal.T
     rotation = np.stack([np.stack([-x * y, 1 + x * x, -y], axis=-1), np.stack([-1 - y * y, x * y, x], axis=-1)], axis=1)

@@ -1,5 +1,6 @@
 """Checks of the board, the radii of circles and the scale."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -8,7 +9,8 @@ import numpy as np
 
 from stcal.design import BoardDesign, known_distances
 from stcal.errors import DegenerateError
-from stcal.geometry.rigid import align_similarity, skew
+from stcal.geometry.normal_equations import free_motions
+from stcal.geometry.rigid import align_similarity
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import DotLabel, Label, dot_cells
 from stcal.sfm.adjust.refine import MIN_DOTS, Network, known_points
@@ -29,7 +31,7 @@ def radius_checks(evidence: Evidence) -> list[Check]:
     the areas of the ellipses and the positions and planes of the circles: medians over all images and groups."""
     design_mm, before_mm = evidence.radius_mm, _before_circles_mm(evidence)
     by_name = {image.name: image for image in evidence.images}
-    found: dict[Label, list[np.ndarray]] = {}  # (2, v) of a group: measured over designed radius, designed radius in px
+    found: dict[Label, list[np.ndarray]] = defaultdict(list)  # (2, v) of a group: ratio to the design, its radius in px
     for network in evidence.networks:
         views = radius_views(network.model, by_name, design_mm, evidence.calibration.camera)
         for k, label in enumerate(network.model.labels):
@@ -37,17 +39,16 @@ def radius_checks(evidence: Evidence) -> list[Check]:
                 own, radius = views.point_index == k, design_mm[label]
                 hidden = lost_radius_mm(before_mm[label], views.tan_tilt[own], radius) / radius
                 faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / radius
-                found.setdefault(label, []).append(np.stack([views.ratio[own] + hidden + faded, views.size_px[own]]))
+                found[label].append(np.stack([views.ratio[own] + hidden + faded, views.size_px[own]]))
     blur_px = float(np.median([*evidence.blur_px.values()] or [0.0]))
-    kinds: dict[str, dict[Label, np.ndarray]] = {}
+    kinds: dict[str, dict[Label, np.ndarray]] = defaultdict(dict)
     for label, parts in found.items():
         kind = f"{'dots' if isinstance(label, DotLabel) else 'circles'} of radius {design_mm[label]:g} mm"
-        kinds.setdefault(kind, {})[label] = np.median(np.concatenate(parts, axis=1), axis=1)
+        kinds[kind][label] = np.median(np.concatenate(parts, axis=1), axis=1)
     single, whole = [], []
     for kind, members in kinds.items():
         ratio, size_px = np.array(list(members.values())).T
-        usual = float(np.median(ratio))
-        size = float(np.median(size_px))
+        usual, size = float(np.median(ratio)), float(np.median(size_px))
         # A blur of σ moves the steepest place of an edge of radius r by σ²/2r.
         bias_px, by_blur_px = (usual - 1) * size, max(blur_px**2 - SHARP_PX**2, 0.0) / (2 * size)
         allowed_px = np.hypot(EDGE_BIAS_PX, by_blur_px)
@@ -55,8 +56,7 @@ def radius_checks(evidence: Evidence) -> list[Check]:
         if len(members) >= MIN_PEERS:
             sigma = float(np.hypot(robust_sigma(np.abs(ratio - usual)), RADIUS_TOLERANCE))
             freedom = max(MAD_EFFICIENCY * len(members) - 1, 2.0)
-            for label, value in zip(members, ratio.tolist(), strict=True):
-                away = value - usual
+            for label, away in zip(members, (ratio - usual).tolist(), strict=True):
                 off_um = MICRO * away * float(design_mm[label])
                 single.append(Trial(label, off_um, "µm", (away / sigma) ** 2, 1, freedom))
     remedy = "a damaged or dirty circle, a wrong label or another radius: look at the overlays, correct target.toml"
@@ -165,10 +165,7 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     turn = np.kron(np.eye(len(dots)), board_from_model.scale * board_from_model.rigid.rotation)
     of_images = network.noise() * network.covariance_of(dots)
     covariance = turn @ of_images @ turn.T + board.sigma_mm**2 * np.eye(3 * len(dots))
-    middle = design - design.mean(0)
-    free = np.concatenate(
-        [-skew(middle), np.broadcast_to(np.eye(3), (len(dots), 3, 3)), middle[:, :, None]], axis=2
-    ).reshape(-1, 7)
+    free = free_motions(design, scale=True)
     # The similarity is eliminated as an unknown, so that the weights annihilate it.
     inverse = np.linalg.inv(covariance)
     along = inverse @ free
@@ -204,16 +201,16 @@ def pitch_check(evidence: Evidence) -> Check:
     weighted, weight, square, freedom = 0.0, 0.0, 0.0, 0
     circled = target.with_faces(printed=False).faces  # the others have told the scale
     for face in circled:
-        indices = [i for i, label in enumerate(face.labels()) if label in calibrated.circles]
-        if len(indices) < MIN_DOTS:
+        labels = [label for label in face.labels() if label in calibrated.circles]
+        if len(labels) < MIN_DOTS:
             continue
-        design = np.column_stack([face.xy_mm[indices], np.zeros(len(indices))])
-        xyz = np.array([calibrated.circles[face.labels()[i]] for i in indices])
+        design = face.places_mm(label.circle for label in labels)
+        xyz = np.array([calibrated.circles[label] for label in labels])
         fit = align_similarity(xyz, design)
         spread = float(((design - design.mean(0)) ** 2).sum())
         weighted, weight = weighted + spread * (fit.scale - 1), weight + spread
         residuals = fit.inverse() @ xyz - design
-        square, freedom = square + float((residuals[:, :2] ** 2).sum()), freedom + 2 * len(indices) - 4
+        square, freedom = square + float((residuals[:, :2] ** 2).sum()), freedom + 2 * len(labels) - 4
     if not freedom:
         return impossible("pitch", f"no face with {MIN_DOTS} circles", "add views of the faces" if circled else "")
     size = weighted / weight
@@ -235,8 +232,7 @@ MOST_PRINT_FACTOR = 10.0
 def scales_check(evidence: Evidence) -> Check:
     """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
     networks, board, joint = evidence.networks, evidence.board, evidence.joint
-    key, (title, _) = "scales", CHECKS["scales"]
-    print_factor = 1.0 if joint is None else joint.print_factor
+    print_factor, title = 1.0 if joint is None else joint.print_factor, CHECKS["scales"][0]
     remedy = "another size than stated: measure a side of each print, and correct target.toml or state size_sigma_mm"
     name, times = _alone(networks, board) or ("", 1.0)
     of_name = f"correct the size of {name}, or state size_sigma_mm of the prints larger"
@@ -246,10 +242,10 @@ def scales_check(evidence: Evidence) -> Check:
         grown = TestedValue("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
         if name:
             size = TestedValue(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
-            return Check(key, title, "failed", fits, (size, grown), 1, (name,), of_name)
+            return Check("scales", title, "failed", fits, (size, grown), 1, (name,), of_name)
         why = "the size or drawing of the print is another one, or its σ too small"
         reason = f"{grown.name} at {grown.words()}: {why}"
-        return Check(key, title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
+        return Check("scales", title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
     trials: list[Trial] = []
     for network in networks:
         names, log_scale, gradient, variance = _sources(network, board, print_factor)
@@ -260,27 +256,23 @@ def scales_check(evidence: Evidence) -> Check:
         away = log_scale - float(weight.sum(0) @ log_scale / weight.sum())
         spread = np.diag(covariance) - 1 / weight.sum()
         freedom = float(network.redundancy.sum())
-        trials += [
-            Trial(source, PPM * off, "ppm", off**2 / own, 1, freedom)
-            for source, off, own in zip(names, away.tolist(), spread.tolist(), strict=True)
-            if own > 0
-        ]
+        for source, off, own in zip(names, away.tolist(), spread.tolist(), strict=True):
+            trials += [Trial(source, PPM * off, "ppm", off**2 / own, 1, freedom)] if own > 0 else []
     if not trials:
-        return impossible(key, "only one source of the scale", "state a known distance with scale")
-    check = assess(key, trials, "sources of the scale", remedy)
+        return impossible("scales", "only one source of the scale", "state a known distance with scale")
+    check = assess("scales", trials, "sources of the scale", remedy)
     if check.names and name:
-        reason = f"{fits}; {check.reason}"
-        check = replace(check, reason=reason, names=(name,), remedy=of_name)
+        return replace(check, reason=f"{fits}; {check.reason}", names=(name,), remedy=of_name)
     return check
 
 
 def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float] | None:
     """Returns the one source that contradicts all others, which agree, and its size over the stated one."""
-    off: dict[str, list[float]] = {}
+    off: dict[str, list[float]] = defaultdict(list)
     for network in networks:
         names, log_scale, *_ = _sources(network, board, 1.0)
-        for name, value in zip(names, (log_scale - np.median(log_scale)).tolist() if names else (), strict=True):
-            off.setdefault(name, []).append(value)
+        for name, value in zip(names, log_scale.tolist(), strict=True):
+            off[name].append(value - float(np.median(log_scale)))
     ratio = {name: float(np.median(values)) for name, values in off.items()}
     if len(ratio) < LEAST_AGREEING + 1:
         return None
@@ -291,7 +283,7 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
 
 def _sources(
     network: Network, board: BoardDesign, print_factor: float
-) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Sequence[str], np.ndarray, np.ndarray, np.ndarray]:
     """Returns the s sources of the scale: their names, the logarithm of the model's scale over the known size (s,), its
     gradient by the points (s, 3p), and the variance of the known size (s,)."""
     model = network.model
@@ -303,7 +295,7 @@ def _sources(
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     if len(dots) >= MIN_DOTS:
         parts.append(("board", dots, board.places_mm(model.labels[i] for i in dots), board.sigma_mm, 0.0))
-    names, values, gradients = [], [], []
+    sources: list[tuple[str, float, np.ndarray, float]] = []
     for name, members, design, sigma_mm, size_sigma in parts:
         with suppress(DegenerateError):
             found = align_similarity(model.xyz_model[members], design)
@@ -311,9 +303,8 @@ def _sources(
             square = float((middle**2).sum())
             gradient = np.zeros((len(model.labels), 3))
             gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
-            names.append(name)
-            values.append((np.log(found.scale), sigma_mm**2 / square + size_sigma**2))
-            gradients.append(gradient.ravel())
+            variance = sigma_mm**2 / square + size_sigma**2
+            sources.append((name, np.log(found.scale), gradient.ravel(), variance))
     place = {label: i for i, label in enumerate(model.labels)}
     for known in known_distances(board):
         if known.first in place and known.second in place:
@@ -322,8 +313,7 @@ def _sources(
             gradient = np.zeros((len(model.labels), 3))
             gradient[i] = apart / float(apart @ apart)
             gradient[j] = -gradient[i]
-            names.append(f"distance {known.first} to {known.second}")
-            values.append((np.log(np.linalg.norm(apart) / known.mm), (known.sigma_mm / known.mm) ** 2))
-            gradients.append(gradient.ravel())
-    log_scale, variance = np.array(values).reshape(-1, 2).T
-    return names, log_scale, np.array(gradients), variance
+            name, log_scale = f"distance {known.first} to {known.second}", np.log(np.linalg.norm(apart) / known.mm)
+            sources.append((name, log_scale, gradient.ravel(), (known.sigma_mm / known.mm) ** 2))
+    names, *numbers = zip(*sources, strict=True) if sources else [()] * 4
+    return names, *(np.array(each) for each in numbers)

@@ -1,5 +1,6 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -8,7 +9,6 @@ from itertools import combinations
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
 from stcal.design import faces_of_known_shape
@@ -65,14 +65,9 @@ def _unfixed(models: Sequence[MetricModel]) -> DegenerateError:
     return DegenerateError("E-GROUPS-UNFIXED", f"{len(models)} groups do not fix the target; add images")
 
 
-def _difference(a: Rigid, b: Rigid) -> np.ndarray:
-    """Returns rotation (rad) and translation (mm) of a against b, in the frame of both, as covariances of faces do."""
-    return np.concatenate([Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.translation - b.translation])
-
-
 def _face_trial(name: str, a: Rigid, b: Rigid, covariance: np.ndarray, redundancy: float) -> Trial:
     """Returns the trial of two independent poses of a face; ``covariance`` : (6, 6) of their difference."""
-    apart = _difference(a, b)
+    apart = a.difference(b)
     statistic = float(apart @ np.linalg.solve(covariance, apart))
     return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
 
@@ -90,16 +85,11 @@ def halves_check(evidence: Evidence, joint: JointResult) -> Check:
     except StcalError as error:
         return impossible("halves", f"half of the images do not determine the result ({error})", "add images")
     redundancy = sum(half.redundancy for half in halves if isinstance(half, JointResult))
-    trials = [
-        _face_trial(
-            f"face {face}",
-            first.target_from_face[face],
-            second.target_from_face[face],
-            first.face_covariance[face] + second.face_covariance[face],
-            redundancy,
-        )
-        for face in faces[1:]
-    ]
+    trials = []
+    for face in faces[1:]:
+        covariance = first.face_covariance[face] + second.face_covariance[face]
+        poses = first.target_from_face[face], second.target_from_face[face]
+        trials.append(_face_trial(f"face {face}", *poses, covariance, redundancy))
     remedy = "images of one group contradict one another: look for one that is blurred, or in which something moved"
     return assess("halves", trials, "faces", remedy, covered=True)
 
@@ -115,14 +105,12 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
     named only if the others agree without it, and do not if another one is left out instead."""
     whole, faces = evidence.calibration.target, _faces(evidence)
     members = {m.group: {f.face for f in evidence.calibration.faces if f.group == m.group} for m in joint.models}
-    removable = [
-        g
-        for g in members
-        if len(members) > 1 and _linked([s for other, s in members.items() if other != g], faces[0]) >= set(faces)
-    ]
     trials: list[Trial] = []
     curing = []
-    for group in removable:
+    for group in members:
+        others = [shown for other, shown in members.items() if other != group]
+        if not others or set(faces) - _linked(others, faces[0]):
+            continue
         part = _adjusted(evidence, joint, (m for m in joint.models if m.group != group))
         if isinstance(part, StcalError):
             continue
@@ -135,11 +123,9 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
             continue
         scale = (joint.sigma_scale / part.sigma_scale) ** 2
         for face in faces[1:]:
-            change = _difference(without.target_from_face[face], whole.target_from_face[face])
-            larger = scale * without.face_covariance[face]
-            name = f"face {face} without group {group}"
-            trial = _nested_trial(name, change, larger, whole.face_covariance[face], part.redundancy)
-            trials += [trial] if trial else []
+            change = without.target_from_face[face].difference(whole.target_from_face[face])
+            covariances = scale * without.face_covariance[face], whole.face_covariance[face]
+            trials += _nested_trial(f"face {face} without group {group}", change, *covariances, part.redundancy)
     if not trials:
         return impossible("groups", "every group holds a face that no other links", _loop_remedy(evidence))
     check = assess("groups", trials, "faces", "", covered=True)
@@ -161,17 +147,15 @@ def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int,
     return max(joint.sigma0**2 * joint.redundancy - square, 0.0), round(joint.redundancy - free), free
 
 
-def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial | None:
-    """Returns the trial of the change of a face; None if what was left out tells nothing of that face."""
+def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> list[Trial]:
+    """Returns the trial of the change of a face; none if what was left out tells nothing of that face."""
     root = np.linalg.cholesky(larger)
     half = np.linalg.solve(root, np.linalg.solve(root, larger - smaller).T)
     value, vector = np.linalg.eigh((half + half.T) / 2)
     held = value > EXPLAINED
-    if not held.any():
-        return None
     along = vector[:, held].T @ np.linalg.solve(root, change)
-    statistic = float((along**2 / value[held]).sum())
-    return Trial(name, MICRO * float(np.linalg.norm(change[3:])), "µm", statistic, int(held.sum()), redundancy)
+    statistic, value_um = float((along**2 / value[held]).sum()), MICRO * float(np.linalg.norm(change[3:]))
+    return [Trial(name, value_um, "µm", statistic, int(held.sum()), redundancy)] if held.any() else []
 
 
 def _linked(members: list[set[str]], start: str) -> set[str]:
@@ -238,14 +222,10 @@ def agreement_check(evidence: Evidence, joint: JointResult) -> Check:
     if joint.settled:
         return check
     last = TestedValue("last step", joint.last_move_px, SETTLED_PX, "px", None)
-    return replace(
-        check,
-        verdict="suspicious" if check.verdict == "passed" else check.verdict,
-        reason=f"{check.reason}; not settled, {last.name} at {last.words()}",
-        measured=(*check.measured, last),
-        names=(*check.names, last.name),
-        remedy=remedy,
-    )
+    verdict = "suspicious" if check.verdict == "passed" else check.verdict
+    reason, names = f"{check.reason}; not settled, {last.name} at {last.words()}", (*check.names, last.name)
+    measured = (*check.measured, last)
+    return replace(check, verdict=verdict, reason=reason, measured=measured, names=names, remedy=remedy)
 
 
 def flatness_check(evidence: Evidence) -> Check:
@@ -256,11 +236,11 @@ def flatness_check(evidence: Evidence) -> Check:
         return impossible("flatness", "the run was asked not to use flatness", "state it with --flatness")
     printed = {face.id for face in faces_of_known_shape(evidence.board)}
     factor = evidence.joint.bend_factor if evidence.joint else 1.0
-    heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = {}
+    heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = defaultdict(list)
     for network in networks:
         for face, members in network.model.points_by_face().items():
             if face != "board" and len(members) > 3:
-                heights.setdefault(face, []).append(_heights(network, members))
+                heights[face].append(_heights(network, members))
     redundancy = float(sum(n.redundancy.sum() for n in networks))
     trials = []
     for face, parts in heights.items():

@@ -1,8 +1,8 @@
 """Checks of images, labels, single observations and camera from the residuals of the free networks."""
 
 import shlex
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import bdtrc, chdtri
 
 from stcal.errors import StcalError
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import PARAMETER_NAMES, intrinsic_basis
 from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.labels import Label
@@ -60,8 +61,8 @@ def camera_check(evidence: Evidence) -> Check:
         test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
         estimate, sigma = test.estimate, np.sqrt(np.diag(test.covariance))
     names = [PARAMETER_NAMES[i] for i in intrinsic_basis(model).argmax(0)]
-    rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
-    check = assess("camera", [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
+    value = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
+    check = assess("camera", [Trial("camera", value, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
         TestedValue(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
         for name, value, s in zip(names, estimate, sigma, strict=True)
@@ -71,9 +72,9 @@ def camera_check(evidence: Evidence) -> Check:
     return replace(check, reason=reason, measured=check.measured + single)
 
 
-def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns :meth:`~stcal.sfm.adjust.refine.Network.score` of parameters that all groups have in common."""
-    normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
+def summed(equations: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the sums of :meth:`~stcal.sfm.adjust.refine.Network.score` of parameters that groups have in common."""
+    normal, right = zip(*equations, strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
@@ -81,7 +82,7 @@ def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
     """Returns the score test of parameters that all groups have in common, and its degrees of freedom of noise. Where
     images scatter about the common estimate by more than their pixels do (Cochran's Q), its squares count by as many
     times less, as those of σ from how photographs differ."""
-    test = solve_score(*summed(networks, columns))
+    test = solve_score(*summed(n.score(columns(n)) for n in networks))
     scatter, freedom = 0.0, -test.freedom
     for network in networks:
         for normal, right in zip(*network.score_by_image(columns(network)), strict=True):
@@ -137,10 +138,10 @@ def image_check(evidence: Evidence) -> Check:
     for network in evidence.networks:
         square, redundancy = network.square_by_image()
         others = redundancy.sum() - redundancy
-        for i, name in enumerate(network.model.images):
-            if redundancy[i] >= 1 and others[i] >= 1:
-                ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / others[i], 1e-12)
-                found.append((name, float(ratio), float(redundancy[i]), float(others[i])))
+        for name, own, free, rest in zip(network.model.images, square, redundancy, others, strict=True):
+            if free >= 1 and rest >= 1:
+                ratio = own / free / max((square.sum() - own) / rest, 1e-12)
+                found.append((name, float(ratio), float(free), float(rest)))
     logs = np.log([max(ratio, 1e-12) for _, ratio, _, _ in found])
     by_chance = float(np.mean([2 / own + 2 / others for _, _, own, others in found])) if found else 1.0
     scattered = robust_sigma(np.abs(logs - np.median(logs))) ** 2 if len(found) > 1 else 0.0
@@ -162,18 +163,17 @@ def sharpness_check(evidence: Evidence) -> Check:
         usual = np.array([np.median(log_sigma[model.point_index == p]) for p in range(len(model.labels))])
         away = log_sigma - usual[model.point_index]
         sigma |= {name: float(np.median(away[r])) for name, r in zip(model.images, model.rows_by_image(), strict=True)}
-        log_blur = {n: np.log(evidence.blur_px[n]) for n in model.images if evidence.blur_px.get(n, 0) > 0}
-        blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
+        log_blur = {n: float(np.log(evidence.blur_px[n])) for n in model.images if evidence.blur_px.get(n, 0) > 0}
+        blur |= {name: value - np.median(list(log_blur.values())) for name, value in log_blur.items()}
     trials = []
     for log_ratios, unit in ((sigma, "× σ"), (blur, "× blur")):
         if log_ratios:
             values, freedom = np.array(list(log_ratios.values())), max(MAD_EFFICIENCY * len(log_ratios) - 1, 2.0)
             least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(values), 1, freedom))
             spread = max(robust_sigma(np.abs(values - np.median(values))), least)
-            trials += [
-                Trial(name, float(np.exp(value)), unit, max(value / spread, 0.0) ** 2, 1, freedom, True)
-                for name, value in log_ratios.items()
-            ]
+            for name, value in log_ratios.items():
+                statistic = float(max(value / spread, 0.0)) ** 2
+                trials.append(Trial(name, float(np.exp(value)), unit, statistic, 1, freedom, ratio=True))
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight and do no harm"
     return assess("sharpness", trials, "values", remedy, "suspicious")
 
@@ -185,13 +185,13 @@ def evenness_check(evidence: Evidence) -> Check:
         return impossible("evenness", "corners alone, which have no rim", "")
     uneven = {image.name: image.uneven_px for image in evidence.images}
     focal_px = float(np.sqrt(evidence.calibration.camera.focal.prod()))
-    shifts_of_label: dict[str, list[float]] = {}
+    shifts_of_label: dict[str, list[float]] = defaultdict(list)
     for network in evidence.networks:
         model = network.model
         depth = model.xyz_camera()[:, 2] / focal_px
         for k, (i, p) in enumerate(zip(model.image_index, model.point_index, strict=True)):
             shift_px = float(np.linalg.norm(uneven[model.images[i]][model.keypoint[k]]))
-            shifts_of_label.setdefault(model.labels[p], []).append(MICRO * depth[k] * shift_px)
+            shifts_of_label[model.labels[p]].append(MICRO * depth[k] * shift_px)
     trials = []
     for label, shifts in shifts_of_label.items():
         count = sum(shift > 0 for shift in shifts)
@@ -214,14 +214,12 @@ def moved_check(evidence: Evidence) -> Check:
         normal, right = network.score_by_image(columns)
         redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
         suspects = []
+        squares, redundancies = network.square_by_image()
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
             faces, test = of_faces[model.point_index[rows]].sum(), solve_score(normal[i], right[i])
             if test.freedom and min(faces, len(rows) - faces) >= MIN_CIRCLES:
-                own = float((network.residual[rows] ** 2).sum()), float(network.redundancy[rows].sum())
-                noise = max(
-                    (total - test.statistic) / max(freedom - test.freedom, 1.0)
-                    for total, freedom in (own, (square, redundancy))
-                )
+                of_both = (squares[i], redundancies[i]), (square, redundancy)
+                noise = max((own - test.statistic) / max(free - test.freedom, 1.0) for own, free in of_both)
                 statistic, shift_um = test.statistic / max(noise, 1.0), MICRO * float(np.linalg.norm(test.estimate[3:]))
                 trials.append(Trial(name, shift_um, "µm", statistic, test.freedom, redundancy - test.freedom))
                 suspects.append(i)
@@ -278,10 +276,8 @@ def labels_check(evidence: Evidence) -> Check:
         return check
     swapped, guilt = _exchanged(evidence), _images_of_outliers(evidence)
     lost = [name for own in guilt for name in own.culprits]
-    named = [f"{o.image} {o.label}" for o in outliers]
-    measured = [
-        TestedValue(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
-    ]
+    measured = [TestedValue(f"{o.image} {o.label}", o.residual_px, o.limit_px, "px", None) for o in outliers]
+    named = [own.name for own in measured]
     verdict, reason = "suspicious", f"{len(outliers)} left out, first {named[0]}: {measured[0].words()}"
     if guilt:
         verdict = "failed"
@@ -289,9 +285,8 @@ def labels_check(evidence: Evidence) -> Check:
         reason = f"{len(outliers)} left out, {'; '.join(words)}"
         remedy = "target or board moved between the images of a group, or zoom or focus changed: take it again"
         if lost:
-            remedy = (
-                f"the target stood elsewhere, or they are of another group: leave them out: {without_image(lost[0])}"
-            )
+            remedy = "the target stood elsewhere, or they are of another group: leave them out"
+            remedy = f"{remedy}: {without_image(lost[0])}"
     if swapped:
         verdict, reason = "failed", f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
@@ -314,15 +309,15 @@ def _images_of_outliers(evidence: Evidence) -> list[Guilt]:
 
 def _exchanged(evidence: Evidence) -> list[str]:
     """Returns ``image: label and label`` of every pair of outliers that are at each other's places."""
-    by_image: dict[str, list[Label]] = {}
+    by_image: dict[str, list[Label]] = defaultdict(list)
     for outlier in evidence.outliers:
-        by_image.setdefault(outlier.image, []).append(outlier.label)
+        by_image[outlier.image].append(outlier.label)
     observed, camera = {image.name: image for image in evidence.images}, evidence.calibration.camera
     pairs = []
     for network in evidence.networks:
         model = network.model
         for name, pose in zip(model.images, model.camera_from_model, strict=True):
-            labels = [label for label in by_image.get(name, ()) if label in model.labels]
+            labels = [label for label in by_image[name] if label in model.labels]
             place = {x: camera.project((pose @ model.xyz_model[model.labels.index(x)])[None])[0] for x in labels}
             measured = dict(zip(observed[name].labels, observed[name].centre_px, strict=True))
             for a, b in combinations(labels, 2):
@@ -343,7 +338,7 @@ def control_check(evidence: Evidence) -> Check:
         return impossible("control", "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible("control", "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, significance.by_eccentricity))
+    test = solve_score(*summed(n.score(significance.by_eccentricity(n)) for n in networks))
     if not test.freedom:
         return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy, share = sum(n.redundancy.sum() for n in networks), float(test.estimate[0])
@@ -369,9 +364,7 @@ def _control(evidence: Evidence) -> tuple[str, tuple[TestedValue, ...]]:
         for face, pose in whole.target_from_face.items()
         if face != whole.reference_face
     }
-    rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
-    rows = [
-        TestedValue(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
-    ]
+    residual = rms(np.concatenate([m.residuals_px(camera) for m in models]))
+    rows = [TestedValue(f"face {f}, without eccentricity", value, None, "µm", None) for f, value in shifts.items()]
     largest = max(shifts.values(), default=0.0)
-    return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", tuple(rows)
+    return f"without it faces are off by up to {largest:.0f} µm at residuals of {residual:.4f} px", tuple(rows)

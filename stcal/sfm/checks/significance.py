@@ -14,7 +14,7 @@ from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import by_pose
 from stcal.geometry.robust import ratio_limit
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.labels import CircleLabel, Label
@@ -174,33 +174,32 @@ def judge(
     Check
         "not possible" without trials.
     """
-    if not (usable := [trial for trial in trials if trial.redundancy > 0]):
+    usable = [trial for trial in trials if trial.redundancy > 0]
+    if not usable:
         reason, advice = (FREE, "add images") if trials else (f"no {what} to test", "")
         return Check(key, title, "not possible", reason, (), 0, (), advice)
-    trials = usable
-    count = len(trials)
+    trials, count = usable, len(usable)
     statistic, freedom, redundancy = np.array([(t.statistic, t.freedom, t.redundancy) for t in trials], float).T
     probability = fdtrc(freedom, redundancy, statistic / freedom)
     order = np.lexsort([-statistic / freedom, probability])
     significant = [i for i in order if probability[i] * count < SUSPICIOUS]
-    verdict: Verdict = "passed"
-    if significant:
-        verdict = worst if probability[significant[0]] * count < FAILED else "suspicious"
+    verdict: Verdict = "suspicious" if significant else "passed"
+    if probability[order[0]] * count < FAILED:
+        verdict = worst
     enlarges = 1.0
     if covered and significant:
-        limits = [trials[i].limit(count) or np.inf for i in significant]
-        beyond = [abs(trials[i].value) / own for i, own in zip(significant, limits, strict=True)]
+        beyond = [abs(trials[i].value) / (trials[i].limit(count) or np.inf) for i in significant]
         ratio = max(float(np.sqrt(statistic.sum() / freedom.sum())), *beyond)
         verdict, enlarges = ("suspicious", ratio) if ratio <= MOST_ENLARGED else ("failed", 1.0)
     measured = tuple(
         TestedValue(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
         for i in order[:SHOWN]
     )
-    largest = f"{measured[0].name} at {measured[0].words()}"
-    if significant:
-        reason = f"{largest}" if count == 1 else f"{len(significant)} of {count} {what} beyond chance, first {largest}"
-    else:
-        reason = f"{largest}" if count == 1 else f"{count} {what} within chance, largest {largest}"
+    reason = f"{measured[0].name} at {measured[0].words()}"
+    if count > 1 and significant:
+        reason = f"{len(significant)} of {count} {what} beyond chance, first {reason}"
+    elif count > 1:
+        reason = f"{count} {what} within chance, largest {reason}"
     names = tuple(trials[i].name for i in significant)
     return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", enlarges)
 
@@ -228,11 +227,10 @@ class Guilt:
 
     def words(self) -> str:
         """Returns why no culprit is named, empty if one is."""
-        if self.culprits:
-            return ""
+        why = "less than half of them does not cure it"
         if self.rivals:
-            return f"{self.where}: leaving out {' or '.join(self.rivals)} cures it as well"
-        return f"{self.where}: leaving out less than half of them does not cure it"
+            why = f"{' or '.join(self.rivals)} cures it as well"
+        return "" if self.culprits else f"{self.where}: leaving out {why}"
 
 
 def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None], where: str) -> Guilt:
@@ -245,15 +243,10 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
     for i in list(out):  # one that was taken first may be innocent
         if len(out) > 1 and worst([k for k in out if k != i]) is None:
             out.remove(i)
-    rivals = {
-        k
-        for i in out
-        for j in range(len(names))
-        if j not in out and worst([j if k == i else k for k in out]) is None
-        for k in (i, j)
-    }
-    if rivals:
-        return Guilt(where, rivals=tuple(names[k] for k in sorted(rivals)))
+    others = [j for j in range(len(names)) if j not in out]
+    cures = [(i, j) for i in out for j in others if worst([j if k == i else k for k in out]) is None]
+    if cures:
+        return Guilt(where, rivals=tuple(names[k] for k in sorted({k for pair in cures for k in pair})))
     return Guilt(where, tuple(names[i] for i in out))
 
 
@@ -265,9 +258,8 @@ def on_face(model: GroupModel) -> np.ndarray:
 def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
     """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together about a ``centre`` (3,)."""
     model = network.model
-    arm = model.xyz_model[model.point_index] - centre
-    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-    return network.by_point @ (motion * on_face(model)[model.point_index][:, None, None])
+    of_faces = network.by_point * on_face(model)[model.point_index][:, None, None]
+    return by_pose(of_faces, model.xyz_model[model.point_index] - centre)
 
 
 NO_ELLIPSES = (
@@ -317,8 +309,8 @@ def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: 
     """Whether contradicting observations of a group agree if faces and board are taken by themselves: then the camera
     is right, and target and board moved relative to each other."""
     of_faces = on_face(model)[model.point_index]
+    radius = {**target.radius_of(), **board.radius_of()}
     try:
-        radius = {**target.radius_of(), **board.radius_of()}
         shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
         corrected = replace(model, shift_px=shift)
         parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (of_faces, ~of_faces)]

@@ -77,14 +77,13 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         made = make(evidence)
         checks += [made] if isinstance(made, Check) else made
         step(None)
-    failed = {check.key: check for check in checks if check.verdict == "failed"}
+    failed = {check.key: check.names for check in checks if check.verdict == "failed"}
     cause, is_doubtful = evidence.cause, any(check.verdict in ("failed", "suspicious") for check in checks)
     # That all intrinsics differ explains a board in nearly any photographs: what all circles tell goes before it.
     if is_doubtful and (cause is None or cause.cause == ANOTHER_CAMERA):
-        moved = "moved" in failed and not failed["moved"].names
+        moved, camera = failed.get("moved") == (), evidence.calibration.camera
         # A group without which all is well is the cause, unless another one explains far more of the residuals.
-        of_group = "groups" in failed and len(failed["groups"].names) == 1
-        most_left, camera = BESIDE_A_GROUP if of_group else 1.0, evidence.calibration.camera
+        most_left = BESIDE_A_GROUP if len(failed.get("groups", ())) == 1 else 1.0
         if of_set := whole_set_cause(evidence.networks, camera, moved, evidence.camera_given, most_left):
             cause = replace(of_set, verdict="failed" if failed else "suspicious")
     return (cause, *checks) if cause else tuple(checks)
@@ -190,20 +189,16 @@ def whole_set_cause(
     first = best[0]
     if first.cause.scope == "image" and _explained_by_one(networks, first.left) > EXPLAINS * most:
         return None  # its checks name that image
-    after = float(np.sqrt(first.left * redundancy / square))
+    after, freedom = float(np.sqrt(first.left * redundancy / square)), first.test.freedom
     if after > most_left:
         return None
-    share = {id(f): 100 * (square - redundancy * f.left) / most for f in fitted}
-    freedom = first.test.freedom
-    parameters = "1 parameter explains" if freedom == 1 else f"{freedom} parameters explain"
-    reason = (
-        f"{check.reason}: {parameters} {share[id(first)]:.0f} % of what any cause explains; residuals would be "
-        f"{after:.2f} times as large"
-    )
     measured = tuple(
-        TestedValue(f.cause.name, share[id(f)], None, "% explained", f.probability)
+        TestedValue(f.cause.name, 100 * (square - redundancy * f.left) / most, None, "% explained", f.probability)
         for f in sorted(fitted, key=lambda f: (f is not first, f.test.freedom))
     )
+    parameters = "1 parameter explains" if freedom == 1 else f"{freedom} parameters explain"
+    explained = f"{parameters} {measured[0].value:.0f} % of what any cause explains"
+    reason = f"{check.reason}: {explained}; residuals would be {after:.2f} times as large"
     return replace(check, reason=reason, measured=measured)
 
 
@@ -239,13 +234,10 @@ def cause_of_drawing(target_from_face: Mapping[str, Rigid], design: TargetDesign
     far = tuple(face for face, angle in turned.items() if angle > FAR_DEG)
     if not far:
         return None
-    return failed_cause(
-        f"face {', '.join(far)} is not where its rough_pose has it",
-        f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name",
-        "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose",
-        len(rough),
-        far,
-    )
+    name = f"face {', '.join(far)} is not where its rough_pose has it"
+    why = f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name"
+    remedy = "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose"
+    return failed_cause(name, why, remedy, len(rough), far)
 
 
 OTHER_SIZE = 0.02
@@ -257,22 +249,21 @@ def cause_of_size(
 ) -> Check | None:
     """Returns a failed check that names another size of the board than the drawing of the faces has; None if it fits.
     ``circles`` : (3,) places found, mm."""
-    ratios = []
-    for face in design.faces if board is not None and board.rows else ():
-        labels = [label for label in circles if label.face == face.id]
-        if len(labels) < 3:
-            continue
-        found, drawn = np.array([circles[label] for label in labels]), face.places_mm(each.circle for each in labels)
-        ratios.append(rms(found - found.mean(0)) / rms(drawn - drawn.mean(0)))
-    ratio = float(np.median(ratios)) if ratios else 1.0
-    if board is None or abs(ratio - 1) < OTHER_SIZE:
+    if board is None or not board.rows:
         return None
-    return failed_cause(
-        f"the board in board.toml is {ratio:.4g} times as large as the drawing in target.toml has the faces",
-        f"{len(ratios)} faces agree; they would fit a pitch of {board.pitch_mm / ratio:.4g} mm",
-        "measure the board over its full length with a calliper; correct pitch_mm, or the target's drawing",
-        len(ratios),
-    )
+    ratios = []
+    for face in design.faces:
+        labels = [label for label in circles if label.face == face.id]
+        if len(labels) >= 3:
+            found, drawn = np.array([circles[own] for own in labels]), face.places_mm(own.circle for own in labels)
+            ratios.append(rms(found - found.mean(0)) / rms(drawn - drawn.mean(0)))
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    if abs(ratio - 1) < OTHER_SIZE:
+        return None
+    name = f"the board in board.toml is {ratio:.4g} times as large as the drawing in target.toml has the faces"
+    why = f"{len(ratios)} faces agree; they would fit a pitch of {board.pitch_mm / ratio:.4g} mm"
+    remedy = "measure the board over its full length with a calliper; correct pitch_mm, or the target's drawing"
+    return failed_cause(name, why, remedy, len(ratios))
 
 
 MOST_SHARE = 1 / 3
@@ -293,16 +284,12 @@ def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> Fitt
         return None
     equations = [cause.equations(network, camera) for network in networks]
     if cause.scope == "all":
-        normal, right = zip(*equations, strict=True)
-        test = solve_score(np.sum(normal, axis=0), np.sum(right, axis=0))
+        test = solve_score(*image_checks.summed(equations))
     else:
         tests = [solve_score(*own) for own in equations]
-        test = ScoreTest(
-            np.concatenate([t.estimate for t in tests]),
-            np.asarray(block_diag(*(t.covariance for t in tests))),
-            sum(t.statistic for t in tests),
-            sum(t.freedom for t in tests),
-        )
+        statistic, freedom = sum(t.statistic for t in tests), sum(t.freedom for t in tests)
+        covariance = np.asarray(block_diag(*(t.covariance for t in tests)))
+        test = ScoreTest(np.concatenate([t.estimate for t in tests]), covariance, statistic, freedom)
     redundancy = _redundancy(networks)
     rest = redundancy - test.freedom
     left = (_square(networks) - test.statistic) / rest if rest > 0 else 0.0
@@ -345,12 +332,9 @@ def _explained_by_few(cause: Hypothesis, networks: Sequence[Network], camera: Ca
 
 def _explained_by_one(networks: Sequence[Network], left: float) -> float:
     """Returns how much leaving out one image explains, at most; ``left``: unexplained square per degree of freedom."""
-    most = 0.0
-    for network in networks:
-        for image in range(len(network.model.images)):
-            test = solve_score(*network.score_of_image(image))
-            most = max(most, test.statistic - test.freedom * left)
-    return most
+    each = (n.score_of_image(image) for n in networks for image in range(len(n.model.images)))
+    tests = [solve_score(*equations) for equations in each]
+    return max((test.statistic - test.freedom * left for test in tests), default=0.0)
 
 
 Size = Callable[[np.ndarray, np.ndarray], str]  # words on the size of a cause, from its parameters (q,) and their σ
@@ -360,8 +344,8 @@ def _percent(what: str) -> Size:
     return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} % against the file"
 
 
-def _spread(what: str) -> Size:
-    return lambda value, _: f"{what} up to {100 * np.ptp(value):.3g} % apart"
+def _spread(value: np.ndarray, _: np.ndarray) -> str:
+    return f"focal lengths up to {100 * np.ptp(value):.3g} % apart"
 
 
 def _listed(names: Sequence[str]) -> Size:
@@ -401,14 +385,13 @@ def _hypotheses(camera: Camera) -> list[Hypothesis]:
                    _listed(INTRINSICS[2:4]), unit[:, 2:4]),
         Hypothesis("the distortion is not that of the camera file", "another lens or focus, or its signs or order are "
                    f"wrong in the file: {ANEW}", _listed(INTRINSICS[4:]), unit[:, 4:8]),
-        Hypothesis(ANOTHER_CAMERA, "the camera file belongs to another camera: "
-                   f"{ANEW}", _listed(INTRINSICS), unit[:, :8]),
+        Hypothesis(ANOTHER_CAMERA, f"the camera file belongs to another camera: {ANEW}", _listed(INTRINSICS),
+                   unit[:, :8]),
         Hypothesis("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom "
                    "and focus, and take the photographs again; or run each group with a camera file of its own",
-                   _spread("focal lengths"), focal, "group"),
+                   _spread, focal, "group"),
         Hypothesis("zoom or focus changed from image to image", "the focal length differs from image to image: turn "
-                   "autofocus and stabiliser off, and take the photographs again", _spread("focal lengths"), focal,
-                   "image"),
+                   "autofocus and stabiliser off, and take the photographs again", _spread, focal, "image"),
         Hypothesis("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, "
                    "or stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
         Hypothesis("the centres are not those of ellipses (eccentricity)", NO_ELLIPSES, lambda value, sigma:

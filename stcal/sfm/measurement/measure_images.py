@@ -24,7 +24,7 @@ from stcal.io.images import ImageFile, Skipped, find_images, grey_8bit, grey_fin
 from stcal.labels import Label
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.adjust.faces_file import TargetCircles, read_target
-from stcal.sfm.data.group_model import ImageObservations, by_group
+from stcal.sfm.data.group_model import ImageObservations, by_group, rows_by
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect import predict
 from stcal.sfm.detect.candidates import EllipseOptions
@@ -182,16 +182,13 @@ class Tracker:
         first, labelled = labelled, self._completed(image, camera, labelled, pose)
         if labelled.observations is not first.observations:
             pose = self._pose(labelled.observations, camera)
-        if isinstance(pose, StcalError) or fit_verdict(pose) == "failed":
-            return None
-        return labelled, pose
+        return None if isinstance(pose, StcalError) or fit_verdict(pose) == "failed" else (labelled, pose)
 
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
         """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
         near = self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD)
-        wrong = predict.contradictions(near, seen.observations, camera)
-        seen = seen.without(wrong)
+        seen = seen.without(predict.contradictions(near, seen.observations, camera))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
@@ -304,9 +301,7 @@ def measure(
     DetectionError : If no image shows a face.
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
-    if design is None and isinstance(target, TargetCircles):
-        design = target.design
-    design = target_of(design)
+    design = target_of(target.design if design is None and isinstance(target, TargetCircles) else design)
     target = read_target(target, design) if isinstance(target, str | Path) else target
     camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
@@ -331,10 +326,8 @@ def measure(
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
         remedy = result.remedy("check target.toml (radii, polarity), camera file, faces.json and the exposure")
-        raise DetectionError(
-            "E-MEASURE-NONE",
-            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; {remedy}",
-        )
+        fault = f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}"
+        raise DetectionError("E-MEASURE-NONE", f"{fault}; {remedy}")
     return result
 
 
@@ -359,9 +352,9 @@ def measure_labelled(
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
     result = _result_of(outcomes, target, options, prior)
     shown = [image.observations for image in images if len(image.observations) >= MIN_CIRCLES]
-    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) < len(shown):
-        result = replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
-    return result
+    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) >= len(shown):
+        return result
+    return replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
 
 
 def _mistakes(
@@ -401,11 +394,10 @@ def _followed(
 ) -> tuple[list[MeasuredImage | Skipped], int]:
     """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched."""
     camera, size_from = sized_by(model, list(files))
-    folders: dict[str, list[ImageFile]] = {}
-    for file in sorted(files, key=lambda each: each.name):
-        folders.setdefault(file.group, []).append(file)
     setting = target, replace(model, width=camera.width, height=camera.height), board, options.pose, options.ellipses
-    jobs = [(own, setting, camera, size_from) for own in folders.values()]
+    ordered = sorted(files, key=lambda each: each.name)
+    folders = rows_by(file.group for file in ordered)
+    jobs = [([ordered[i] for i in own], setting, camera, size_from) for own in folders.values()]
     followed: dict[int, tuple[list[MeasuredImage | Skipped], int]] = {}
     for i, found in run_on_images(_follow_folder, jobs, options.workers):
         followed[i] = found

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry import least_squares
-from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, freeze, frozen, require_fields, rms
+from stcal.geometry.arrays import OF_PIXEL, Brief, first_fault, freeze, require_fields, rms
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import (
@@ -28,7 +28,7 @@ from stcal.geometry.plane import (
 )
 from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.camera_model import CameraPrior
-from stcal.labels import CircleLabel, circle_labels, parse_labels
+from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.equations import coordinates
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.data.group_model import ImageObservations, Outlier, rows_by
@@ -118,10 +118,8 @@ def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple
     by_size = sorted((face for face in faces if face in target.target_from_plane), key=lambda face: -len(faces[face]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
-        raise DegenerateError(
-            "E-MEASURE-FEW-CIRCLES",
-            f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
-        )
+        fault = f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed"
+        raise DegenerateError("E-MEASURE-FEW-CIRCLES", f"{fault}; show one face as a whole")
     reasons = []
     for face in by_size:
         rows, target_from_plane = faces[face], target.target_from_plane[face]
@@ -161,11 +159,10 @@ def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, wh
         problem = problem.without(bad, off)
         outliers = problem.outliers
         if len(outliers) > MAX_OUTLIER_SHARE * count or len(problem.labels) < MIN_CIRCLES:
-            raise DegenerateError(
-                "E-MEASURE-CONTRADICTS",
-                f"{where}: {len(outliers)} of {count} circles contradict the others, first {outliers[0].label} by "
-                f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
-            )
+            first = f"first {outliers[0].label} by {outliers[0].residual_px:.2g} px"
+            fault = f"{where}: {len(outliers)} of {count} circles contradict the others, {first}"
+            remedy = "check that camera file, faces.json and images belong together"
+            raise DegenerateError("E-MEASURE-CONTRADICTS", f"{fault}; {remedy}")
         start = best.poses
 
 
@@ -262,11 +259,9 @@ class PoseOptions:
         require_fields(self, "options")
         factor = 1.0 if self.sigma_factor is None else self.sigma_factor
         if not (0 < self.flip_odds < 1 and self.sigma_margin >= 1 and np.isfinite(factor) and factor > 0):
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"flip odds {self.flip_odds:g}, σ margin {self.sigma_margin:g}, σ factor {factor:g}: odds between "
-                "0 and 1, a margin of at least 1 and a positive factor needed",
-            )
+            stated = f"flip odds {self.flip_odds:g}, σ margin {self.sigma_margin:g}, σ factor {factor:g}"
+            needed = "odds between 0 and 1, a margin of at least 1 and a positive factor needed"
+            raise InputError("E-OPTION-RANGE", f"{stated}: {needed}")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -292,89 +287,73 @@ class TargetPose(ImageFit, Brief):
 
     def __post_init__(self):
         n = len(self.labels)
-        for name, shape in (
-            ("covariance", (6, 6)),
-            ("by_circles", (6, 3 * n)),
-            ("by_intrinsics", (6, None)),
-            ("residuals_px", (n, 2)),
-            ("weights", (n,)),
-        ):
+        shapes = {"covariance": (6, 6), "by_circles": (6, 3 * n), "by_intrinsics": (6, None), "weights": (n,)}
+        for name, shape in {**shapes, "residuals_px": (n, 2)}.items():
             freeze(self, name, shape, f"pose: {name}")
 
 
 def pose_from_circles(
-    labels: Sequence[str],  # texts ``face:circle``; dots of the board are ignored
-    centre_px: np.ndarray,  # (n, 2) in the distorted image
-    covariance_px2: np.ndarray,  # (n, 2, 2) of the single centres, without the σ factor
+    image: ImageObservations,  # whose dots of the board are ignored
     target: TargetCircles,
     camera: Camera,
     options: PoseOptions | None = None,
     prior: CameraPrior | None = None,  # covariance of the intrinsics, which are exact if None
-    where: str = "image",  # name of the image, for messages
 ) -> TargetPose:
     """Returns the pose of a calibrated target from the ellipse centres of its circles in one image. From the homography
     of the largest face, and from its reflection, Huber's loss of single centres is minimised. The minima are then
     weighed by the whole covariance of the centres: noise, target and intrinsics."""
-    options = options or PoseOptions()
-    problem = _problem(parse_labels(labels), centre_px, covariance_px2, target, camera, options, prior, where)
+    options, where = options or PoseOptions(), image.name
+    problem = _problem(image, target, camera, options, prior)
     start, plane = start_pose(problem, target, where)
     minima, problem = minima_without_outliers(problem, start, plane, where)
     residual = problem.in_px(problem.seen(minima.poses[[0]])[0][0])
     rms_px, limit_px = rms(residual), MISFIT * float(np.ptp(problem.in_px(problem.centre), axis=0).max())
     if not rms_px <= limit_px:  # no covariance describes a pose of which most circles are elsewhere
-        raise DegenerateError(
-            "E-MEASURE-MISFIT",
-            f"{where}: circles lie {rms_px:.3g} px RMS from where the best pose has them, {limit_px:.2g} allowed, "
-            f"{MISFIT:.0%} of their extent; wrong labels, a mirrored image, another target, or another camera's file",
-        )
+        allowed = f"{limit_px:.2g} allowed, {MISFIT:.0%} of their extent"
+        fault = f"{where}: circles lie {rms_px:.3g} px RMS from where the best pose has them, {allowed}"
+        causes = "wrong labels, a mirrored image, another target, or another camera's file"
+        raise DegenerateError("E-MEASURE-MISFIT", f"{fault}; {causes}")
     pose = _answer(problem, minima, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
         if pose.chi2_per_redundancy() > OUTLIER**2:  # the rotation is open because the residuals are large
-            raise DegenerateError(
-                "E-MEASURE-CONTRADICTS",
-                f"{where}: its circles contradict each other, χ²/dof {pose.chi2_per_redundancy():.2g}; check their "
-                "labels, and that camera file, faces.json and images belong together",
-            )
+            fault = f"{where}: its circles contradict each other, χ²/dof {pose.chi2_per_redundancy():.2g}"
+            remedy = "check their labels, and that camera file, faces.json and images belong together"
+            raise DegenerateError("E-MEASURE-CONTRADICTS", f"{fault}; {remedy}")
         raise DegenerateError(
             "E-MEASURE-OPEN", f"{where}: its circles do not determine the rotation; show more of a face, off one line"
         )
     return pose
 
 
-def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where) -> PoseProblem:
-    n = len(labels)
-    centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
-    used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
-    used.sort(key=lambda i: target.place.get(labels[i], -1))
-    if len({labels[i] for i in used}) < len(used):
+def _problem(image: ImageObservations, target: TargetCircles, camera: Camera, options, prior) -> PoseProblem:
+    used = [i for i, label in enumerate(image.labels) if isinstance(label, CircleLabel)]
+    used.sort(key=lambda i: target.place.get(image.labels[i], -1))
+    seen, where = image.select(used), image.name
+    if len(set(seen.labels)) < len(used):
         raise InputError("E-LABEL-REPEATED", f"{where}: a label twice; every circle is seen once")
-    unknown = [labels[i] for i in used if labels[i] not in target.place]
-    if unknown:
-        raise InputError(
-            "E-LABEL-UNKNOWN",
-            f"{where}: circle {unknown[0]} is not in the calibrated target; give the target's own labels",
-        )
-    fault = first_fault(noise, OF_PIXEL, definite=True)
+    if unknown := [label for label in seen.labels if label not in target.place]:
+        fault = f"{where}: circle {unknown[0]} is not in the calibrated target"
+        raise InputError("E-LABEL-UNKNOWN", f"{fault}; give the target's own labels")
+    fault = first_fault(seen.covariance_px2, OF_PIXEL, definite=True)
     if fault is not None:
-        raise InputError(
-            "E-COVARIANCE-VALUE",
-            f"{where}: covariance of the centre of {labels[fault.row]}: {fault.reason}; correct it",
-        )
-    place = np.array([target.place[labels[i]] for i in used], int)
+        reason = f"covariance of the centre of {seen.labels[fault.row]}: {fault.reason}; correct it"
+        raise InputError("E-COVARIANCE-VALUE", f"{where}: {reason}")
+    labels = circle_labels(seen.labels)
+    place = np.array([target.place[label] for label in labels], int)
     rows = coordinates(place)
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
-    ideal = camera.normalised_from_pixel(centre[used])
+    ideal = camera.normalised_from_pixel(seen.centre_px)
     px_by_centre = camera.pixel_jacobian(ideal)
     centre_by_px = np.linalg.inv(px_by_centre)
     basis = np.zeros((len(PARAMETER_NAMES), 0)) if prior is None else intrinsic_basis(prior.colmap_model)
     return PoseProblem(
-        labels=circle_labels(labels[i] for i in used),
+        labels=labels,
         xyz=target.xyz[place],
         normal=target.normal[place],
         radius=target.radius[place],
         centre=ideal,
         px_by_centre=px_by_centre,
-        noise=factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2),
+        noise=factor**2 * centre_by_px @ seen.covariance_px2 @ np.swapaxes(centre_by_px, 1, 2),
         by_camera=centre_by_px @ (camera.parameter_jacobian(ideal) @ basis),
         prior=np.zeros((0, 0)) if prior is None else prior.covariance,
         shape=target.covariance[np.ix_(rows, rows)],
@@ -431,10 +410,8 @@ def _solution(
     chi2, redundancy = float(last.chi2[0]), 2 * len(problem.labels) - 6
     needed = deciding_delta(options.flip_odds, options.sigma_margin, chi2 / redundancy)
     # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
-    plausible = needed / options.sigma_margin**2
-    covariance, other_side = covariance_of_likelihood(
-        problem, last.poses, full[0], chi2, gaussian, second, plane, plausible
-    )
+    given = full[0], chi2, gaussian, second, plane, needed / options.sigma_margin**2
+    covariance, other_side = covariance_of_likelihood(problem, last.poses, *given)
     parts["curvature"] = covariance - gaussian
     return TargetPose(
         camera_from_target=last.poses[0],
@@ -466,14 +443,10 @@ def measured_pose(
     calibrated = [i for i, label in enumerate(image.labels) if label in target.place]
     if not calibrated:
         faces = ", ".join(image.face_ids())
-        return DetectionError(
-            "E-MEASURE-NO-FACE", f"{image.name}: " + (f"face {faces} is not calibrated" if faces else NO_FACE)
-        )
-    circles = image.select(calibrated)
+        why = f"face {faces} is not calibrated" if faces else NO_FACE
+        return DetectionError("E-MEASURE-NO-FACE", f"{image.name}: {why}")
     try:
-        return pose_from_circles(
-            circles.labels, circles.centre_px, circles.covariance_px2, target, camera, options, prior, image.name
-        )
+        return pose_from_circles(image.select(calibrated), target, camera, options, prior)
     except StcalError as error:
         return error
 
@@ -482,10 +455,8 @@ def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
     """Returns the pose with its ambiguity decided by the image before, if one solution is clearly nearer to it."""
     if pose.status == "certain" or pose.second is None:
         return pose
-    turn, turn_of_second = (
-        Rigid(candidate.camera_from_target.rotation @ previous.rotation.T).angle_rad()
-        for candidate in (pose, pose.second)
-    )
+    both = pose.camera_from_target, pose.second.camera_from_target
+    turn, turn_of_second = (Rigid(own.rotation @ previous.rotation.T).angle_rad() for own in both)
     if turn <= NEAR_PREVIOUS * turn_of_second:
         return replace(pose, status="resolved")
     if turn_of_second > NEAR_PREVIOUS * turn:
@@ -518,10 +489,9 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
     for pose in poses:
         rows = coordinates(np.array([target.place[label] for label in pose.labels]))
         effects.append(np.hstack([pose.by_circles @ circles[rows], pose.by_intrinsics @ intrinsics]))
-    full = np.array(effects)
     pose_roots = np.linalg.cholesky(np.array([pose.covariance for pose in poses]))
-    white = np.linalg.solve(pose_roots, full)
-    _, s, vt = np.linalg.svd(white.reshape(-1, full.shape[2]), full_matrices=False)
+    white = np.linalg.solve(pose_roots, np.array(effects))
+    _, s, vt = np.linalg.svd(white.reshape(-1, white.shape[2]), full_matrices=False)
     white = white @ vt[: min(int((s**2 > FELT).sum()), MOST)].T
     u, s, vt = np.linalg.svd(white, full_matrices=False)
     return pose_roots @ (u * np.minimum(s, np.sqrt(LARGEST_SHARE))[:, None]) @ vt

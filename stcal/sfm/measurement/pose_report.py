@@ -114,10 +114,8 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         names = {image.name for image in result.images}
         unmatched += [f"{name}: in {joints.where}, but without a pose" for name in joined if name not in names]
         if not joined.keys() & names:
-            raise InputError(
-                "E-IMAGES-UNMATCHED",
-                f"{joints.where}: none of its images was measured; names are like {result.images[0].name}",
-            )
+            reason = f"{joints.where}: none of its images was measured; names are like {result.images[0].name}"
+            raise InputError("E-IMAGES-UNMATCHED", reason)
     return csv_text(table), tuple(unmatched)
 
 
@@ -131,21 +129,15 @@ def require_table_written(path: str | Path, result: MeasureResult, joints: Table
 def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str, list[str]]]:
     """Returns the names of the further columns, and their cells by image, as they stand in the file."""
     further = [name for name in joints.columns if name != IMAGE]
-    conflicts = [name for name in further if name in header]
-    if conflicts:
-        raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT",
-            f"{joints.where}: column {conflicts[0]} is an output of this command; leave it out",
-        )
-    names = joints.text(IMAGE)
+    if conflicts := [name for name in further if name in header]:
+        reason = f"{joints.where}: column {conflicts[0]} is an output of this command; leave it out"
+        raise InputError("E-TABLE-COLUMNS-CONFLICT", reason)
     cells = [joints.columns[name] for name in further]
     rows: dict[str, list[str]] = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(joints.text(IMAGE)):
         if name in rows:
-            raise InputError(
-                "E-TABLE-ROW-REPEATED",
-                f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once",
-            )
+            reason = f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once"
+            raise InputError("E-TABLE-ROW-REPEATED", reason)
         rows[name] = [c[i] if isinstance(c, list) else repr(float(c[i])) for c in cells]
     return further, rows
 
@@ -169,15 +161,8 @@ def poses_file(result: MeasureResult) -> PosesFile:
         }
         alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
         images.append(ImagePose.model_validate(named | alike))
-    return PosesFile(
-        format="stcal poses 1",
-        unit="mm",
-        sigma_factor=result.sigma_factor,
-        intrinsics_held=result.intrinsics_held,
-        notes=list(result.notes),
-        images=images,
-        left_out=[NamedReason.model_validate(each) for each in result.left_out],
-    )
+    own = {"format": "stcal poses 1", "unit": "mm", "images": images}
+    return PosesFile.model_validate({n: getattr(result, n) for n in PosesFile.model_fields.keys() - own} | own)
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -232,11 +217,8 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     statuses = {image.pose.status for image in images}
     counts, *remarks = summary(result)
     every = every or len(images) <= MOST_LISTED
-    doubtful = [
-        image
-        for image in images
-        if image.pose.status != "certain" or fit_verdict(image.pose) != "passed" or image.pose.outliers
-    ]
+    fits = ("certain", "passed", ())
+    doubtful = [i for i in images if (i.pose.status, fit_verdict(i.pose), i.pose.outliers) != fits]
     listed = images if every else doubtful[:MOST_LISTED]
     values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
     rows = [

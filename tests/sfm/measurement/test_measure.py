@@ -54,17 +54,13 @@ def measured_from(images, *more):
     return measure_labelled([LabelledImage(image, ()) for image in images], *more)
 
 
-def pose_of(image, target, camera, **more):
-    return pose_from_circles(image.labels, image.centre_px, image.covariance_px2, target, camera, **more)
-
-
 def squared_errors(scene, known, count, faces, noise_px, tilt_deg, distance_mm=(600, 1500)):
     """eᵀC⁻¹e/6 and χ²/dof of the certain poses, the share of the others, and the flipped ones among the certain."""
     rng = np.random.default_rng(len(faces) + int(1000 * noise_px))
     square, fit, flipped = [], [], 0
     for i in range(count):
         truth, towards, image = one_view(scene, rng, faces[i % len(faces)], noise_px, tilt_deg, distance_mm)
-        pose = pose_of(image, known.measured(rng), scene.camera)
+        pose = pose_from_circles(image, known.measured(rng), scene.camera)
         if pose.status == "certain":
             error = pose_error(pose.camera_from_target, truth)
             square.append(error @ np.linalg.solve(pose.covariance, error) / 6)
@@ -106,9 +102,9 @@ def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
     rng = np.random.default_rng(4)
     truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
     alone, both = (see(scene, truth, faces, 0.5, np.random.default_rng(0)) for faces in (("1",), ("1", "2", "4")))
-    pose = pose_of(alone, known.truth, scene.camera)
+    pose = pose_from_circles(alone, known.truth, scene.camera)
     assert pose.status == "ambiguous"
-    second = pose_of(both, known.truth, scene.camera)
+    second = pose_from_circles(both, known.truth, scene.camera)
     assert second.status == "certain"
     assert len(second.faces) > 1
     moved = Rigid.exp([0.02, -0.01, 0.02, 3, 2, -5])
@@ -167,11 +163,13 @@ def test_derivatives_of_the_ellipse_centres(scene, known):
 
 def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
     truth, _, image = one_view(scene, np.random.default_rng(6), ("4",), 0.0, (30, 40), (800, 900))
-    pose = pose_of(image, known.truth, scene.camera)
+    pose = pose_from_circles(image, known.truth, scene.camera)
     error = pose_error(pose.camera_from_target, truth)
     assert np.abs(error[:3]).max() < 1e-9
     assert np.abs(error[3:]).max() < 1e-6
-    turned = pose_of(image.select(np.random.default_rng(0).permutation(len(image))), known.truth, scene.camera)
+    turned = pose_from_circles(
+        image.select(np.random.default_rng(0).permutation(len(image))), known.truth, scene.camera
+    )
     assert np.abs(pose_error(turned.camera_from_target, pose.camera_from_target)).max() < 1e-9
     assert turned.labels == pose.labels
 
@@ -188,7 +186,7 @@ def test_stated_intrinsics_go_into_the_covariance(scene, known):
         camera = scene.camera.with_parameters(scene.camera.parameters() + away)
         target = known.measured(rng)
         for own, results in ((prior, square), (None, held)):
-            pose = pose_of(image, target, camera, prior=own)
+            pose = pose_from_circles(image, target, camera, prior=own)
             error = pose_error(pose.camera_from_target, truth)
             results.append(error @ np.linalg.solve(pose.covariance, error) / 6)
     assert abs(np.mean(square) - 1) < 0.15 * np.sqrt(200 / count)  # its standard error is 0.04 for 200
@@ -199,7 +197,7 @@ def test_outliers_are_named_and_left_out(scene, known):
     truth, _, image = one_view(scene, np.random.default_rng(8), ("2",), NOISE_PX, (20, 40), (900, 1000))
     centre = image.centre_px.copy()
     centre[3] += [0.8, -0.5]
-    pose = pose_of(replace(image, centre_px=centre), known.truth, scene.camera, where="a.jpg")
+    pose = pose_from_circles(replace(image, name="a.jpg", centre_px=centre), known.truth, scene.camera)
     assert [(o.image, o.label) for o in pose.outliers] == [("a.jpg", image.labels[3])]
     assert image.labels[3] not in pose.labels
     assert 0.7 < pose.outliers[0].residual_px < 1.5
@@ -213,7 +211,7 @@ def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
     twice = TargetCircles(own.labels, own.xyz, own.radius, own.covariance, 2.0)
     given = {"options": PoseOptions(sigma_factor=1.0)}
     parts = [
-        pose_of(image, target, scene.camera, **more).parts["image"]
+        pose_from_circles(image, target, scene.camera, **more).parts["image"]
         for target, more in ((own, {}), (twice, {}), (twice, given))
     ]
     assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
@@ -223,21 +221,23 @@ def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
 def test_too_few_circles_and_wrong_labels(scene, known):
     _, _, image = one_view(scene, np.random.default_rng(11), ("2",), NOISE_PX, (20, 40), (900, 1000))
     for count in (0, 1, 3):
-        refuses("E-MEASURE-FEW-CIRCLES … 4", pose_of, image.select(list(range(count))), known.truth, scene.camera)
+        refuses(
+            "E-MEASURE-FEW-CIRCLES … 4", pose_from_circles, image.select(list(range(count))), known.truth, scene.camera
+        )
     with fails_with("E-MEASURE-AMBIGUOUS … not on one line"):  # circles 1, 2, 3 and a lie in line
-        pose_of(image.select([image.labels.index(f"2:{c}") for c in "123a"]), known.truth, scene.camera)
+        pose_from_circles(image.select([image.labels.index(f"2:{c}") for c in "123a"]), known.truth, scene.camera)
     _, _, both = one_view(scene, np.random.default_rng(11), ("1", "2"), NOISE_PX, (20, 30), (900, 1000))
     in_line = [*(both.labels.index(f"2:{c}") for c in "123a"), both.labels.index("1:1")]
     with fails_with("E-MEASURE-AMBIGUOUS … face 2 … 4 circles … not on one line"):  # and not for the one of face 1
-        pose_of(both.select(in_line), known.truth, scene.camera)
-    refuses("E-LABEL-REPEATED", pose_of, image.select([0, *range(len(image))]), known.truth, scene.camera)
+        pose_from_circles(both.select(in_line), known.truth, scene.camera)
+    refuses("E-LABEL-REPEATED", pose_from_circles, image.select([0, *range(len(image))]), known.truth, scene.camera)
     with fails_with("E-LABEL-UNKNOWN … 9:1"):
-        pose_of(replace(image, labels=("9:1", *image.labels[1:])), known.truth, scene.camera)
+        pose_from_circles(replace(image, labels=("9:1", *image.labels[1:])), known.truth, scene.camera)
     mixed = replace(image, labels=image.labels[::-1])
     with pytest.raises((DegenerateError, ConvergenceError), match=r"labels|contradict"):
-        pose_of(mixed, known.truth, scene.camera)
+        pose_from_circles(mixed, known.truth, scene.camera)
     with fails_with("E-COVARIANCE-VALUE … 0"):
-        pose_of(replace(image, covariance_px2=0 * image.covariance_px2), known.truth, scene.camera)
+        pose_from_circles(replace(image, covariance_px2=0 * image.covariance_px2), known.truth, scene.camera)
 
 
 def test_faces_json_holds_the_covariance_of_all_circles_together(small_run):
@@ -420,7 +420,7 @@ def test_what_is_common_is_less_than_the_whole(scene, known):
     """Of a pose whose covariance is smaller than the target's part of it, as a curved likelihood may have it."""
     rng = np.random.default_rng(1)
     images = [see(scene, view(faces_view(scene, ("1", "2")), 0.2, 900, rng), ("1", "2"), NOISE_PX, rng) for _ in "abc"]
-    poses = [pose_of(image, known.truth, scene.camera) for image in images]
+    poses = [pose_from_circles(image, known.truth, scene.camera) for image in images]
     poses[1] = replace(poses[1], covariance=0.3 * poses[1].parts["target"] + 1e-3 * poses[1].parts["image"])
     common = common_errors(poses, known.truth, None)
     for pose, own in zip(poses, common, strict=True):
@@ -441,7 +441,7 @@ def test_poses_err_together_as_stated(scene, known, with_camera, draws):
     images = [see(scene, truth, f, 0.0, rng) for truth, f in zip(truths, faces, strict=True)]
     images = [replace(i, covariance_px2=np.tile(NOISE_PX**2 * np.eye(2), (len(i), 1, 1))) for i in images]
     prior = CameraPrior(scene.camera.colmap_model, np.diag(SIGMA**2)) if with_camera else None
-    exact = [pose_of(image, known.truth, scene.camera, prior=prior) for image in images]
+    exact = [pose_from_circles(image, known.truth, scene.camera, prior=prior) for image in images]
     common = common_errors(exact, known.truth, prior)
     assert 6 <= common.shape[2] <= MOST
     own = np.linalg.cholesky([pose.covariance for pose in exact])
@@ -452,7 +452,7 @@ def test_poses_err_together_as_stated(scene, known, with_camera, draws):
         if with_camera:
             away = intrinsic_basis(scene.camera.colmap_model) @ (SIGMA * rng.standard_normal(8))
             camera = camera.with_parameters(camera.parameters() + away)
-        poses = [pose_of(image, target, camera, prior=prior) for image in images]
+        poses = [pose_from_circles(image, target, camera, prior=prior) for image in images]
         error = [pose_error(p.camera_from_target, t) for p, t in zip(poses, truths, strict=True)]
         z.append(felt @ np.linalg.solve(own, np.array(error)[:, :, None]).ravel())
     assert np.mean(np.square(z)) == pytest.approx(1, abs=3 * np.sqrt(2 / np.size(z)))
