@@ -16,11 +16,8 @@ RIM_CLEARANCE_PX = 1.5
 
 def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns the monomials up to third degree, (10, ...)."""
-    found = np.empty((10, *x.shape), x.dtype)
-    found[0], found[1], found[2] = 1, x, y
-    found[3], found[4], found[5] = x * x, x * y, y * y
-    found[6], found[7], found[8], found[9] = found[3] * x, found[3] * y, x * found[5], found[5] * y
-    return found
+    xx, yy = x * x, y * y
+    return np.stack([np.ones_like(x), x, y, xx, x * y, yy, xx * x, xx * y, x * yy, yy * y])
 
 
 def local_ideal_maps(camera: Camera, centre_px: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -73,13 +70,7 @@ def near_rim(
     a, b = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
     square = a * a + b * b
     slope_x, slope_y = inverse[0, 0] * a + inverse[1, 0] * b, inverse[0, 1] * a + inverse[1, 1] * b
-    slope_x *= slope_x
-    slope_y *= slope_y
-    slope_x += slope_y
-    slope_x *= np.float32(width**2)
-    square -= np.sqrt(square)
-    square *= square
-    chosen = square < slope_x
+    chosen = (square - np.sqrt(square)) ** 2 < (slope_x**2 + slope_y**2) * np.float32(width**2)
     for place, shape in beside:
         x, y = dx - np.float32(place[0]), dy - np.float32(place[1])
         chosen &= (shape[0, 0] * x + shape[0, 1] * y) ** 2 + (shape[1, 0] * x + shape[1, 1] * y) ** 2 > 1
@@ -164,11 +155,8 @@ class Fits:
         self.inverse = np.pad(self.inverse, ((0, 0), more, more))
         before = self.centre
         self.unlevelled |= inside | outside
-        for waves, own in (
-            ((True, False), inside & outside),
-            ((True,), inside & ~outside),
-            ((False,), outside & ~inside),
-        ):
+        sides = ((True, False), inside & outside), ((True,), inside & ~outside), ((False,), outside & ~inside)
+        for waves, own in sides:
             active = np.flatnonzero(own)
             for _ in range(WAVE_STEPS):
                 move = self._step(active, robust=True, waves=waves)
@@ -250,8 +238,7 @@ class Fits:
         n = len(rows)
         dx, dy = self.offset[i]
         x, y = dx[columns] / np.float32(self.half[i, 0]), dy[rows, 0] / np.float32(self.half[i, 1])
-        (left, top), (right, bottom) = self.low[i], self.high[i]
-        self.grey[i, :n] = self.image[top:bottom, left:right][rows, columns]
+        self.grey[i, :n] = self.image[rows + self.low[i, 1], columns + self.low[i, 0]]
         self.ideal[i, :, :n] = self.to_ideal[i, :, 1:].astype(np.float32) @ monomials(x, y)[1:]
         self.ideal[i, :, n:] = [[self.radius[i]], [0]]
         self.real[i], self.weight[i] = np.arange(self.real.shape[1]) < n, self.real[i]
@@ -308,10 +295,7 @@ class Fits:
         weighted = jacobian * weight[:, None]
         inverse = _inverses((weighted @ np.swapaxes(jacobian, 1, 2)).astype(float))
         step = (inverse @ (weighted @ residual[..., None]))[..., 0]
-        if len(active) == len(self.blur) and count == self.scores.shape[1]:
-            self.scores, self.inverse = weighted, inverse
-        else:
-            self.scores[selection, :count], self.inverse[selection, :count, :count] = weighted, inverse
+        self.scores[selection, :count], self.inverse[selection, :count, :count] = weighted, inverse
         self.residual[selection], self.weight[selection] = residual, weight
         self.reduced[selection], self.on_unit[selection] = reduced, on_unit
         return self._apply(active, step, levels)

@@ -5,6 +5,7 @@ agree."""
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -133,7 +134,7 @@ def _lengths(xyz_camera: np.ndarray, corners: BodyCorners, camera: Camera) -> np
 
 def place_body(corners: BodyCorners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera, linked by what most images agree on."""
-    views, count = _FaceViews.of(corners, camera), len(corners.faces)
+    views, count = _FaceViews(corners, camera), len(corners.faces)
     edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
@@ -156,21 +157,10 @@ def place_body(corners: BodyCorners, camera: Camera) -> Body:
     return Body(body_from_face, camera_from_body, camera, placed_faces, placed_images)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _FaceViews:
-    """v views of a face in an image."""
+    """v views of a face in an image, in the order of images and faces."""
 
-    image: np.ndarray
-    face: np.ndarray
-    poses: Poses  # (2v,) camera_from_face, both minima of each view one after the other
-    cost: np.ndarray  # (v, 2)
-
-    def both(self, of: np.ndarray) -> Poses:
-        """Returns both poses of each of some views."""
-        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
-
-    @classmethod
-    def of(cls, corners: BodyCorners, camera: Camera) -> "_FaceViews":
+    def __init__(self, corners: BodyCorners, camera: Camera):
         normalised = camera.normalised_from_pixel(corners.xy_px)
         key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
         members = [np.flatnonzero(view_of == v) for v in range(len(key))]
@@ -186,8 +176,10 @@ class _FaceViews:
             middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
             starts += [pose, *mirrored(Poses.of([pose]), middle)]
             kept.append(v)
+        self.image, self.face = key[kept].T  # (v,)
+        self.poses, self.cost = Poses.of([]), np.zeros((0, 2))
         if not kept:
-            return cls(np.zeros(0, int), np.zeros(0, int), Poses.of([]), np.zeros((0, 2)))
+            return
         most = max(len(members[v]) for v in kept)
         index = np.array([np.pad(members[v], (0, most - len(members[v]))) for v in kept])
         real = np.array([np.arange(most) < len(members[v]) for v in kept])
@@ -205,45 +197,39 @@ class _FaceViews:
             return Normal.of(residual, root @ by_pose(by_point, rotated), np.asarray((ahead | ~real).all(1)), np.inf)
 
         minima = descend(evaluate, Poses.of(starts), 1e-6)
-        return cls(key[kept, 0], key[kept, 1], minima.poses, minima.cost.reshape(-1, 2))
+        # (2v,) camera_from_face, both minima of each view one after the other, and (v, 2) their costs
+        self.poses, self.cost = minima.poses, minima.cost.reshape(-1, 2)
+
+    def both(self, of: np.ndarray) -> Poses:
+        """Returns both poses of each of some views."""
+        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
 
 
 def _pairs(views: _FaceViews) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """Returns the two views of each image that shows two faces, by these faces, in order."""
     by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for image in np.unique(views.image):
-        own = np.flatnonzero(views.image == image).tolist()
-        for x, v in enumerate(own):
-            for w in own[x + 1 :]:
-                pair = (v, w) if views.face[v] < views.face[w] else (w, v)
-                by_pair.setdefault((int(views.face[pair[0]]), int(views.face[pair[1]])), []).append(pair)
+        for v, w in combinations(np.flatnonzero(views.image == image).tolist(), 2):
+            by_pair.setdefault((int(views.face[v]), int(views.face[w])), []).append((v, w))
     return dict(sorted(by_pair.items()))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views."""
+    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views; of at most ``MOST_VOTES``
+    pairs of views, evenly drawn."""
 
-    rotation: np.ndarray  # (4p, 3, 3)
-    a_place: np.ndarray  # (4p, 3) of the origin, from the camera, in the axes of a
-    b_place: np.ndarray  # (4p, 3)
-    of_pair: np.ndarray  # (4p,)
-    excess: np.ndarray  # (4p,) cost over that of the best pose of the image
-    turned_alike: np.ndarray  # (4p, 4p) whether two have the same rotation
-
-    @classmethod
-    def of(cls, pairs: list[tuple[int, int]], views: _FaceViews) -> "_Relative":
-        """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
+    def __init__(self, pairs: list[tuple[int, int]], views: _FaceViews):
         pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
         a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
         back, place = np.swapaxes(views.poses.rotation[a], 1, 2), views.poses.translation[..., None]
-        rotation = back @ views.poses.rotation[b]
+        self.rotation = back @ views.poses.rotation[b]  # (4p, 3, 3)
+        # (4p, 3) of the origins, from the camera, in the axes of a
+        self.a_place, self.b_place = ((back @ place[k])[..., 0] for k in (a, b))
+        self.of_pair = np.repeat(np.arange(len(pairs)), 4)
         cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
-        excess = (cost - cost.min(1, keepdims=True)).ravel()
-        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
-        a_place, b_place = ((back @ place[k])[..., 0] for k in (a, b))
-        of_pair = np.repeat(np.arange(len(pairs)), 4)
-        return cls(rotation, a_place, b_place, of_pair, excess, turned < SAME_TURN_RAD)
+        self.excess = (cost - cost.min(1, keepdims=True)).ravel()  # over that of the best pose of the image
+        cosine = (np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2
+        self.turned_alike = np.arccos(np.clip(cosine, -1, 1)) < SAME_TURN_RAD  # (4p, 4p)
 
     def best(self, agrees: np.ndarray) -> tuple[int, int]:
         """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
@@ -255,7 +241,7 @@ class _Relative:
 
 def _edge(pairs: list[tuple[int, int]], views: _FaceViews) -> tuple[Rigid, int]:
     """Returns a_from_b of two faces as the images see it, and the number of images that agree on it."""
-    poses = _Relative.of(pairs, views)
+    poses = _Relative(pairs, views)
     translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
     agrees = poses.turned_alike & (apart < SAME_PLACE)
@@ -269,12 +255,12 @@ def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float],
     """Returns true over stated size of faces whose size contradicts those of most others, by index of the face, and the
     number of the others that were compared. Too large by q, a face seems farther by q: face b is at the same place d in
     the frame of a in all images, q R_aᵀ t_b − R_aᵀ t_a = d."""
-    views = _FaceViews.of(corners, camera)
+    views = _FaceViews(corners, camera)
     ratios: list[tuple[int, int, float, float]] = []
     for (a, b), pairs in _pairs(views).items():
         if len(pairs) < LEAST_PAIRS:
             continue
-        poses = _Relative.of(pairs, views)
+        poses = _Relative(pairs, views)
         near = np.flatnonzero(poses.turned_alike[poses.best(poses.turned_alike)[0]])
         near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
         if len(near) < LEAST_PAIRS:
@@ -297,8 +283,7 @@ def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float],
 
 def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
     """Factors of faces that differ from the median of those linked to them, from log ratios (a, b, log, σ)."""
-    a, b = (np.array([ratio[k] for ratio in ratios], int) for k in range(2))
-    value, sigma = (np.array([ratio[k] for ratio in ratios], float) for k in (2, 3))
+    a, b, value, sigma = (np.array(each) for each in zip(*ratios, strict=True))
     rows = np.eye(faces)[b] - np.eye(faces)[a]
     sigma = np.hypot(sigma, LEAST_SIGMA_OFF)
     weight, logs, spread = sigma**-2, np.zeros(faces), 1.0
@@ -406,7 +391,7 @@ def settled_body(body: Body, corners: BodyCorners, basis: np.ndarray, prior: np.
     """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
     for _ in range(PASSES - 1):
-        views = _FaceViews.of(corners, body.camera)
+        views = _FaceViews(corners, body.camera)
         faces = _faces_again(views, corners, body)
         poses, placed = _images(views, corners, faces, body.placed_faces, body.camera)
         start = replace(body, body_from_face=faces, camera_from_body=poses, placed_images=placed)
