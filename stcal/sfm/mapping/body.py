@@ -430,16 +430,18 @@ def _robust(length: np.ndarray) -> float:
     return float((np.minimum(length, 1e3) ** 0.5).sum())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class PlacedBody:
     """A body with the faces and images that are placed."""
 
-    body_from_face: dict[str, Rigid]
-    camera_from_body: dict[str, Rigid]
-    faces: tuple[FaceDesign, ...]
-    camera: Camera  # with the covariance of the assumptions about an unknown one
-    unlinked: tuple[str, ...]  # faces that are seen, and never with a placed one
-    contradictions: tuple[Outlier, ...]  # corners that lie elsewhere than the body has them
+    def __init__(self, body: Body, corners: BodyCorners, camera: Camera):
+        self.camera = camera  # with the covariance of the assumptions about an unknown one
+        placed, images = (np.flatnonzero(mask).tolist() for mask in (body.placed_faces, body.placed_images))
+        self.faces = tuple(corners.faces[f] for f in placed)
+        self.body_from_face = {corners.faces[f].id: body.body_from_face[f] for f in placed}
+        self.camera_from_body = {corners.images[i]: body.camera_from_body[i] for i in images}
+        # faces that are seen, and never with a placed one
+        self.unlinked = [corners.faces[f].id for f in np.unique(corners.face) if not body.placed_faces[f]]
+        self.contradictions = contradictions(body, corners)  # corners that lie elsewhere than the body has them
 
     def unlinked_notes(self) -> list[str]:
         """Returns a note for each face of known shape that no image shows together with one that is placed."""
@@ -476,7 +478,7 @@ def place_with_camera(
     corners = BodyCorners.of(observations, faces)
     _require_sizes(corners, camera)
     body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
-    return _named(body, corners, camera)
+    return PlacedBody(body, corners, camera)
 
 
 def place_and_find_camera(
@@ -500,7 +502,7 @@ def place_and_find_camera(
     basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
     with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
         best = settled_body(best, corners, basis, prior, lens)
-    return _named(best, corners, unknown_lens(best.camera))
+    return PlacedBody(best, corners, unknown_lens(best.camera))
 
 
 def _require_sizes(corners: BodyCorners, camera: Camera) -> None:
@@ -535,18 +537,6 @@ def _with_focal_length(corners: BodyCorners, camera: Camera) -> Body | None:
         return body
     except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
         return None
-
-
-def _named(body: Body, corners: BodyCorners, camera: Camera) -> PlacedBody:
-    placed = np.flatnonzero(body.placed_faces).tolist()
-    return PlacedBody(
-        {corners.faces[f].id: body.body_from_face[f] for f in placed},
-        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
-        tuple(corners.faces[f] for f in placed),
-        camera,
-        tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
-        tuple(contradictions(body, corners)),
-    )
 
 
 def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:
