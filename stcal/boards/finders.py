@@ -392,13 +392,12 @@ def find_on_faces(
     image: np.ndarray, name: str, boards: Mapping[str, FlatBoard], camera: Camera
 ) -> tuple[dict[str, BoardView], list[str]]:
     """Return the views of boards and tags in a grey image by face, and notes on what was left out."""
-    of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
-    of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
-    tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
+    together = [tags_on(board) for board in boards.values() if isinstance(board, TagLayout | CharucoDesign)]
+    tags = find_tags(image, [dictionary for own in together for dictionary, _ in own], windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
 
     def charuco(board: CharucoDesign) -> tuple[BoardView | None, str]:
-        if not any((board.dictionary, tag) in read for tag in board.tag_ids()):
+        if read.isdisjoint(tags_on(board)):
             return None, f"no tag of {board.dictionary}"
         return find_charuco(image, name, board), ""
 

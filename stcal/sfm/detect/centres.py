@@ -115,7 +115,7 @@ class Fits:
         m = self.jacobian @ ellipses.shape_px
         value, vector = np.linalg.eigh(m @ np.swapaxes(m, 1, 2))
         self.inverse_shape = (vector / np.sqrt(value)[:, None]) @ np.swapaxes(vector, 1, 2)
-        self.start = self.centre = self.selected = to_ideal[:, :, 0]
+        self.start, self.centre, self.selected = (to_ideal[:, :, 0].copy() for _ in range(3))
         self.radius = np.prod(value, axis=1) ** 0.25
         self.blur, self.band = np.full(n, START_BLUR_PX), np.full(n, np.inf)
         self.levels = np.zeros((n, PARAMETERS - 6 + 4 * len(WAVES)), np.float32)
@@ -153,7 +153,7 @@ class Fits:
         more = (0, 4 * len(WAVES))
         self.scores = np.pad(self.scores, ((0, 0), more, (0, 0)))
         self.inverse = np.pad(self.inverse, ((0, 0), more, more))
-        before = self.centre
+        before = self.centre.copy()
         self.unlevelled |= inside | outside
         sides = ((True, False), inside & outside), ((True,), inside & ~outside), ((False,), outside & ~inside)
         for waves, own in sides:
@@ -206,11 +206,8 @@ class Fits:
         wanted = np.maximum(BAND_PX, BAND_BLURS * self.blur[active])
         moved = np.abs(self.centre[active] - self.selected[active]).max(1)
         anew = (moved > RESELECT_PX) | (np.abs(wanted / self.band[active] - 1) > RESELECT_BAND)
-        if not anew.any():
-            return active
         chosen = active[anew]
-        self.band[chosen] = wanted[anew]
-        self.selected = np.where(np.isin(np.arange(len(self.blur)), chosen)[:, None], self.centre, self.selected)
+        self.band[chosen], self.selected[chosen] = wanted[anew], self.centre[chosen]
         for i in chosen.tolist():
             centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
             on_unit, width = self.inverse_shape[i] @ self.jacobian[i], float(self.band[i])
@@ -307,11 +304,9 @@ class Fits:
         good = np.isfinite(step).all(1) & (xx * yy > xy * xy) & (xx + yy > 0)
         own, step = active[good], step[good]
         self.inverse_shape[own] = matrix[good]
-        self.centre = self.centre.copy()
         self.centre[own] += step[:, :2]
         blur = self.blur[own]
-        blur = blur + np.minimum(np.maximum(step[:, 5], -0.4 * blur), 0.6 * blur)
-        self.blur[own] = np.minimum(np.maximum(blur, BLUR_LIMITS_PX[0]), BLUR_LIMITS_PX[1])
+        self.blur[own] = np.clip(blur + np.clip(step[:, 5], -0.4 * blur, 0.6 * blur), *BLUR_LIMITS_PX)
         self.levels[own, : levels.shape[1]] = levels[good] + step[:, 6:]
         move = np.full(len(active), np.nan)
         move[good] = np.abs(step[:, :2]).max(1)

@@ -108,14 +108,14 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
     name. A face in view twice occurs twice; the mirror image of a face may look like another one."""
     readings: list[FaceSighting] = []
     if len(candidates) < MIN_NAMING or not target.faces:
-        return _decide(readings, target)
+        return [], []
     starts, tries = _hypotheses(candidates, target), np.zeros(len(candidates), int)
     is_open, explained = np.ones(len(starts.origin), bool), np.zeros(len(candidates), bool)
     grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
     for rank, first in enumerate(starts.origin.tolist()):
         if rank == FIRST_HYPOTHESES:
             for reading in readings:
-                explained[reading.rows] |= len(reading.rows) >= needed_circles(target.face(reading.face))
+                explained[reading.rows] = True
         if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
             continue
         tries[first] += rank >= FIRST_HYPOTHESES
@@ -130,8 +130,10 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
         depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
         if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
             index = _of_one_size(candidates, face, *match)
-            readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
             is_open[starts.agree(number, index)] = False
+            circles = np.flatnonzero(index >= 0)
+            if len(circles) >= min(MIN_NAMING, len(face.ids)):
+                readings.append(FaceSighting(face.id, index[circles], circles))
     return _decide(readings, target)
 
 
@@ -223,15 +225,9 @@ def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, ho
     return np.where((ratio < middle * allowed) & (ratio * allowed > middle), index, -1)
 
 
-def needed_circles(face: FaceDesign) -> int:
-    """Returns the smallest number of circles for a reading of the face."""
-    return min(MIN_NAMING, len(face.ids))
-
-
 def _decide(readings: list[FaceSighting], target: TargetDesign) -> tuple[list[FaceSighting], list[OpenFace]]:
     """Keeps the readings that explain more circles than every other reading of the same candidates."""
-    readings = [r for r in readings if len(r.rows) >= needed_circles(target.face(r.face))]
-    readings.sort(key=lambda r: -len(r.rows))
+    readings = sorted(readings, key=lambda r: -len(r.rows))
     named: list[FaceSighting] = []
     refused: list[OpenFace] = []
     settled: set[int] = set()
