@@ -188,15 +188,13 @@ def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ..
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return the saturated share (n,) of the white half a cell outside of tags; inside for negative ``cells``."""
-    if not len(corners):
-        return np.zeros(0)
     middle = corners.mean(1, keepdims=True)
     outer = middle + (corners - middle) * (1 + 1 / cells)[:, None, None]
     along = np.linspace(0, 1, SATURATION_POINTS, endpoint=False)[:, None]
     points = outer[:, :, None] + along * (np.roll(outer, -1, axis=1) - outer)[:, :, None]
     x, y = np.rint(points).astype(int).reshape(-1, 2).T
     level = grey[y.clip(0, grey.shape[0] - 1), x.clip(0, grey.shape[1] - 1)]
-    return (level.reshape(len(corners), -1) >= SATURATED).mean(1)
+    return (level.reshape(len(corners), 4 * SATURATION_POINTS) >= SATURATED).mean(1)
 
 
 def _refined(
@@ -254,7 +252,7 @@ def find_aprilgrid(
         worst = fitting.ids[4 * int(off.argmax())] // 4
         unused.append(f"tag {layout.tags[worst][1]} lies off the board's plane")
         fitting = fitting.rows(fitting.ids // 4 != worst)
-    if _off(fitting, camera).max() > MAX_OFF_SHARE:
+    if off.max() > MAX_OFF_SHARE:
         return None, _why_off(view, board, camera)
     return replace(fitting, unused=tuple(unused)), ""
 

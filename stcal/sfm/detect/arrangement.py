@@ -206,8 +206,8 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
     by_convention = view.plane == BOARD and alternatives > 1
     while True:
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
-        pose = view.camera_from_plane @ known[view.plane].inverse()
-        placed[seed] = pose, [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
+        agreed, _ = _agreeing(others, view.camera_from_plane, known, reach_mm, {view.plane})
+        placed[seed] = view.camera_from_plane, [view, *agreed]
         new = _new_planes(images, placed, known, reach_mm)
         if not new:
             break

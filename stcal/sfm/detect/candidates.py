@@ -201,12 +201,11 @@ def _ellipse(
 def distinct(image: np.ndarray, polarity: Polarity, table: np.ndarray, threshold: float) -> Ellipses:
     """Returns the ellipses of rows (x, y, full axes 1 and 2, angle of axis 1 in deg) of enough contrast. Of coincident
     rows the first, from the finest level, is kept."""
-    if len(table):
-        centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
-        pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-        smaller, larger = np.sort(radius[pairs], axis=1).T
-        near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
-        table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
+    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
+    pairs = KDTree(centre).query_pairs(0.5 * radius.max(initial=0), output_type="ndarray")
+    smaller, larger = np.sort(radius[pairs], axis=1).T
+    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+    table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
     angle = np.radians(table[:, 4])
     axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
     shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)

@@ -197,33 +197,30 @@ class _Rules:
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
         """Labels the large circles along the three directions; returns the reason if one is missing, else ""."""
         origin = circles[self.pattern.origin]
-        at = self.found.xy[origin]
-        step_x, step_y = (self.found.xy[circles[circle]] - at for circle in (self.pattern.a, self.pattern.b))
+        off = self.found.xy - self.found.xy[origin]
+        step_x, step_y = (off[circles[circle]] for circle in (self.pattern.a, self.pattern.b))
         size = self.area / self.area[origin]
         large = free & (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
         large[origin] = False
         for line, step in zip(self.pattern.lines, (step_x, step_y, step_x + step_y), strict=True):
-            direction = step / np.linalg.norm(step)
+            direction, on_line = step / np.linalg.norm(step), [origin]
             for circle, steps in line:
-                off = self.found.xy - at
-                along = off @ direction
                 across = np.abs(off @ [-direction[1], direction[0]])
-                relative_steps = along / (steps * np.linalg.norm(step))
+                relative_steps = off @ direction / (steps * np.linalg.norm(step))
                 near = (relative_steps > 1 / STEP_RATIO) & (relative_steps < STEP_RATIO)
                 rows = np.flatnonzero(large & (across < self.found.radius) & near)
                 if not len(rows):
                     return f"circle {circle} not found in its direction"
                 circles[circle] = int(rows[np.argmin(np.abs(relative_steps[rows] - 1))])
-                on_line = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
-                direction = _fitted_direction(on_line, direction)
+                on_line.append(circles[circle])
+                direction = _fitted_direction(self.found.xy[on_line], direction)
         return ""
 
     def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceSighting, str]:
         """Returns the face named by circle c, and a note; or why there is none."""
         pattern = self.pattern
         last = circles[pattern.last]
-        labelled = set(circles.values())
-        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in labelled]
+        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in circles.values()]
         if len(beside) != 1:
             return f"{len(beside)} small circles beside circle {pattern.last}, 1 needed"
         on_diagonal = self.found.xy[[circles[c] for c in (pattern.origin, *(c for c, _ in pattern.lines[2]))]]
