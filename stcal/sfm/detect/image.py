@@ -57,7 +57,7 @@ class ImageReading:
         self.misstated = ""  # what of the board's file its dots contradict
         is_free = {p: np.ones(len(e), bool) for p, e in self.found.items()}
         if board is not None:
-            dots = Candidates.of(self.found[board.polarity], camera)
+            dots = Candidates(self.found[board.polarity], camera)
             sightings = find_boards(dots, board, image_corners(camera))
             self.misstated = contradiction(dots, board, image_corners(camera), sightings)
             for grid in sightings if not self.misstated else ():
@@ -65,7 +65,7 @@ class ImageReading:
                 is_free[board.polarity][grid.rows] = False
         every, free = self.found[target.polarity], np.flatnonzero(is_free[target.polarity])
         tried = free[np.sort(np.argsort(-every.radius_px()[free], kind="stable")[:MAX_FREE])]
-        candidates = Candidates.of(every.select(tried), camera)
+        candidates = Candidates(every.select(tried), camera)
         named, unnamed = find_faces(candidates, target)
         self.mirrored = find_mirrored(candidates, target, named)  # ids of faces
         self.faces = [face.by(tried) for face in named]
@@ -131,18 +131,17 @@ def detect_image(
             image_from_board = fit_homography(view.xyz_board[:, :2], view.xy_px)
             aside = apply_homography(image_from_board, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
         detection = _detect_circles(image, camera, circles, None if corners else board, options, aside, dots)
-    parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
+    parts, sightings, board_sightings = [detection.centres], [], [*detection.boards]
     for face, view in views.items():
         assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
         extent = np.zeros((len(view), 2, 2))
         centre = camera.normalised_from_pixel(view.xy_px)
+        rows = sum(map(len, parts)) + np.arange(len(view))
         parts.append(Centres.without_rims(view.xy_px, centre, extent, view.covariance_px2))
-        rows = first + np.arange(len(view))
         if face == BOARD and corners is not None:
             board_sightings.append(BoardSighting(rows, corners.numberings(view.ids)))
         else:
             sightings.append(FaceSighting(face, rows, view.ids))
-        first += len(view)
     return replace(
         detection,
         centres=Centres.concatenate(parts),

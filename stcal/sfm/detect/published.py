@@ -125,7 +125,7 @@ def detect_published(
     first, centres, candidates, boards, free = {}, [], {}, [], {}
     for polarity in sorted(polarities):
         every = contour_ellipses(grey, polarity, options)
-        own = candidates[polarity] = Candidates.of(every, camera)
+        own = candidates[polarity] = Candidates(every, camera)
         first[polarity], free[polarity] = sum(map(len, centres)), np.ones(len(every), bool)
         equal = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2))
         centres.append(Centres.without_rims(every.centre_px, own.xy, own.shape, equal, every.contrast))
