@@ -212,11 +212,11 @@ class Fits:
             centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
             on_unit, width = self.inverse_shape[i] @ self.jacobian[i], float(self.band[i])
             self.rows[i], self.columns[i] = near_rim(self.offset[i], on_unit, centre, width, self.intruders[i])
-        self._widen(max(map(len, self.rows)))
+        self._widen(max(map(len, self.rows), default=0))
         for i in chosen.tolist():
             self._take(i)
         self.unlevelled[chosen] = True
-        few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active])
+        few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active], bool)
         self.failed[active[few]] = True
         return active[~few]
 

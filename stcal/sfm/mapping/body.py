@@ -4,6 +4,7 @@ agree."""
 
 from collections.abc import Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -56,22 +57,11 @@ FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
 """Focal lengths over the longer image side at which the search for an unknown camera starts."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class BodyCorners:
-    """n corners of known faces in the images."""
+    """n corners of known faces in the images, of views with at least four corners of a face."""
 
-    images: tuple[str, ...]
-    faces: tuple[FaceDesign, ...]
-    image: np.ndarray  # (n,) index into ``images``, as ``face`` into ``faces``
-    face: np.ndarray
-    corner: np.ndarray  # (n,) index among those of the face
-    xy_face: np.ndarray  # (n, 2) mm
-    xy_px: np.ndarray  # (n, 2)
-    root: np.ndarray  # (n, 2, 2) whitens residuals in px
-
-    @classmethod
-    def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "BodyCorners":
-        """Returns the corners of views with at least four corners of a face."""
+    def __init__(self, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]):
+        self.images, self.faces = tuple(each.name for each in observations), tuple(faces)
         place: dict[Label, tuple[int, int]] = {
             label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
         }
@@ -82,16 +72,19 @@ class BodyCorners:
             keep = np.flatnonzero((of_face >= 0) & (np.sum(of_face[:, None] == of_face, axis=1) >= MIN_CORNERS))
             rows += [(i, *place[image.labels[k]]) for k in keep]
             seen.append(image.select(keep))
-        image, face, corner = np.array(rows, int).reshape(-1, 3).T
-        xy = np.array([faces[f].xy_mm[k] for f, k in zip(face, corner, strict=True)]).reshape(-1, 2)
+        # (n,) indices into ``images``, into ``faces``, and among the corners of the face
+        self.image, self.face, self.corner = np.array(rows, int).reshape(-1, 3).T
+        self.xy_face = np.array([faces[f].xy_mm[k] for _, f, k in rows]).reshape(-1, 2)  # (n, 2) mm
+        self.xy_px = np.concatenate([each.centre_px for each in seen])  # (n, 2)
         covariance = np.concatenate([each.covariance_px2 for each in seen]) + LEAST_SIGMA_PX**2 * np.eye(2)
-        root, xy_px = np.linalg.inv(np.linalg.cholesky(covariance)), np.concatenate([each.centre_px for each in seen])
-        return cls(tuple(each.name for each in observations), tuple(faces), image, face, corner, xy, xy_px, root)
+        self.root = np.linalg.inv(np.linalg.cholesky(covariance))  # (n, 2, 2) whitens residuals in px
 
     def select(self, keep: np.ndarray) -> "BodyCorners":
         """Returns the corners of a mask."""
-        arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "corner", "xy_face", "xy_px", "root")}
-        return replace(self, **arrays)
+        part = copy(self)
+        for name in ("image", "face", "corner", "xy_face", "xy_px", "root"):
+            setattr(part, name, getattr(self, name)[keep])
+        return part
 
     def xyz_face(self) -> np.ndarray:
         """Returns the corners in the frames of their faces, (n, 3)."""
@@ -475,7 +468,7 @@ def place_with_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
-    corners = BodyCorners.of(observations, faces)
+    corners = BodyCorners(observations, faces)
     _require_sizes(corners, camera)
     body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
     return PlacedBody(body, corners, camera)
@@ -485,7 +478,7 @@ def place_and_find_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
 ) -> PlacedBody:
     """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
-    corners = BodyCorners.of(observations, faces)
+    corners = BodyCorners(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
     _require_sizes(corners, first)
