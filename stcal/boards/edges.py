@@ -95,15 +95,12 @@ def _told_by_lines(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area"
 ) -> list[tuple[Displacement, Displacement]]:
     told, n = [], len(corners)
-    dark, rise = np.moveaxis(area.levels.reshape(n, 4, 2), 2, 0)
     spread = np.where(area.settled, area.by_noise[:, 0, 0].reshape(n, 4), np.nan)
     whole = np.isfinite(corners).all((1, 2)) & np.isfinite(spread).all(1)
     for count in np.unique(cells[whole]).tolist():
         rows = np.flatnonzero(whole & (cells == count))
-        blur, noise = (np.median(value.reshape(n, 4)[rows], axis=1) for value in (area.blur, area.noise))
-        levels = np.median(dark[rows], axis=1), np.median(rise[rows], axis=1)
         sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
-        outer = OuterLines(corners[rows], blur, *levels, noise, spread[rows], sampling)
+        outer = OuterLines(corners[rows], *np.median(area.pixels[rows], axis=1).T, spread[rows], sampling)
         told.append(told_by_lines(grey, outer, count))
     return told
 
@@ -251,25 +248,26 @@ class _Area:
         harmonic = sampling - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
         scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
         noise = _noise_of(scatter, distance, weight)
-        self.noise = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)  # (m,) of pixels
+        noise = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
+        # (n, 4, 4) variance of the blur, px², dark, rise, and variance of pixels
+        self.pixels = np.column_stack([value[:, [2, 3, 5]], noise]).reshape(*shape, 4)
         self.passed = passed_by_blur(per_pixel, value[:, 2])  # (m,) share of sampling that the blur passes
         # (m, 2, 2) derivatives of offset and slope by the two harmonics of sampling, in columns
         self.by_sampling = (inverse @ products(design, weight, sampling))[:, :2]
         shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
-        factor = self.noise[:, None, None]
         # (m, 2, 2) covariance of offset and slope without sampling
-        self.by_noise = np.where(good[:, None, None], factor * inverse[:, :2, :2] + uncertain, np.nan)
+        by_noise = noise[:, None, None] * inverse[:, :2, :2] + uncertain
+        self.by_noise = np.where(good[:, None, None], by_noise, np.nan)
         smear = _smear(normal, value[:, 2], good)
         self.by_noise[:, 0, 0] += (SMEAR_SHARE * smear * (smear / frame.cell.reshape(m)) ** SMEAR_POWER) ** 2
         # way of motion, 0 where it is short
         self.smear_px = float(smear.max()) if (smear > LONG_SMEAR * frame.cell.reshape(m)).any() else 0.0
         # of the offset, by the profiles along rotated edges
-        self.told = _told_along(residual, harmonic, self.passed, weight, self.noise, good)
+        self.told = _told_along(residual, harmonic, self.passed, weight, noise, good)
         line = np.moveaxis((value[:, :2] - shift).reshape(*shape, 2), 2, 0)
         # (n, 4) False where the profiles' line is kept
         self.settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
         self.offset, self.slope = np.where(self.settled, line, [rough.offset, rough.slope])  # (n, 4) as in _Lines
-        self.blur, self.levels = value[:, 2], value[:, [3, 5]]  # (m,) variances, px²; (m, 2) dark and rise
 
     def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
         """Return the lines with their covariances, where sampling displaces them by ``variance``."""

@@ -328,7 +328,7 @@ def points_by_votes(
 
 def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tuple[WorldModel | None, int]:
     """Returns the model of one group (None without labelled points) and the number of labels with several points."""
-    observations, native = [observed for observed, _, _ in images], [image for _, _, image in images]
+    observations, corrected_px, native = zip(*images, strict=True)
     chosen, split = points_by_votes(observations, native, labelled)
     if not chosen:
         return None, 0
@@ -341,5 +341,5 @@ def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tu
     names = [[point.point3D_id for point in image.points2D] for image in native]
     at = zip(model.image_index.tolist(), model.point_index.tolist(), model.keypoint.tolist(), strict=True)
     model = model.observed(np.array([names[i][k] == chosen[model.labels[p]] for i, p, k in at]))
-    corrected = [images[i][1][k] for i, k in zip(model.image_index, model.keypoint, strict=True)]
+    corrected = [corrected_px[i][k] for i, k in zip(model.image_index, model.keypoint, strict=True)]
     return replace(model, shift_px=model.measured_px - np.array(corrected)), split
