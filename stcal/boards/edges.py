@@ -99,8 +99,9 @@ def _told_by_lines(
     whole = np.isfinite(corners).all((1, 2)) & np.isfinite(spread).all(1)
     for count in np.unique(cells[whole]).tolist():
         rows = np.flatnonzero(whole & (cells == count))
+        blur, dark, rise, noise = np.median(area.pixels[rows], axis=1).T
         sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
-        outer = OuterLines(corners[rows], *np.median(area.pixels[rows], axis=1).T, spread[rows], sampling)
+        outer = OuterLines(corners[rows], blur, dark, rise, noise, spread[rows], sampling)
         told.append(told_by_lines(grey, outer, count))
     return told
 

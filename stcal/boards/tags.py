@@ -86,7 +86,7 @@ def find_tags(
                     places = (places + grown_px * corners_by_edges(places)).astype(np.float32)
                 if larger != 1:
                     places = ((places + 0.5) / larger - 0.5).astype(np.float32)
-                seen = zip([] if ids is None else [(name, tag) for tag in ids.ravel().tolist()], places, strict=True)
+                seen = zip([] if ids is None else [(name, int(tag)) for tag in ids.ravel()], places, strict=True)
                 new = [(t, p) for t, p in seen if not any(_inside(p, other) for other in places_of.get(t, ()))]
                 for tag, place in new:
                     places_of.setdefault(tag, []).append(place)

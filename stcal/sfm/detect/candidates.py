@@ -233,7 +233,7 @@ class Candidates:
         self.radius = np.sqrt(np.abs(np.linalg.det(self.shape)))  # (n,) of equal area
         self.contrast = ellipses.contrast  # (n,) grey values
         self.px = 1 / float(np.sqrt(camera.focal.prod()))  # size of a pixel in these coordinates
-        self.tree = KDTree(self.xy)
+        self.tree: KDTree = KDTree(self.xy)
 
     def mirrored(self) -> "Candidates":
         """Returns the mirror image of the candidates, with reversed x."""

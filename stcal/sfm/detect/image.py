@@ -68,13 +68,9 @@ class ImageReading:
         candidates = Candidates(every.select(tried), camera)
         named, unnamed = find_faces(candidates, target)
         self.mirrored = find_mirrored(candidates, target, named)  # ids of faces
-        self.faces = [face.by(tried) for face in named]
+        self.faces, self.face_ids = [face.by(tried) for face in named], {face.face for face in named}
         self.unnamed: list[OpenFace] = [tuple(face.by(tried) for face in faces) for faces in unnamed]
         self.free = len(free)  # number of outlines of the target's polarity outside of boards
-
-    def face_ids(self) -> set[str]:
-        """Returns the ids of the named faces."""
-        return {each.face for each in self.faces}
 
 
 def read_image(
@@ -91,10 +87,10 @@ def read_image(
     for share in (1.0, FAINT):
         searched = replace(options, min_contrast=share * options.min_contrast)
         readings.append(reading := ImageReading(grey, camera, target, board, searched, aside))
-        enough = len(reading.face_ids()) >= min(len(target.faces), 1 if board is None else 2)
+        enough = len(reading.face_ids) >= min(len(target.faces), 1 if board is None else 2)
         if reading.free > MAX_FREE or (enough and (board is None or reading.boards)):
             break
-    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
+    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids)))
 
 
 def detect_target(
@@ -163,6 +159,7 @@ def _detect_circles(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
+    of_board = board.polarity if board else target.polarity
     # Polarity of a face or board, its rows among the outlines, names for notes, and what it may be.
     patterns: list[tuple[Polarity, np.ndarray, Sequence[Label | str], Sequence[FaceSighting | BoardSighting]]] = []
     for face in reading.faces:
@@ -170,10 +167,11 @@ def _detect_circles(
     for faces in reading.unnamed:
         rows = np.unique(np.concatenate([face.rows for face in faces]))
         patterns.append((target.polarity, rows, [NAMELESS] * len(rows), faces))
-    for grid in reading.boards if dots and board is not None else ():
-        patterns.append((board.polarity, grid.rows, [DOT] * len(grid.rows), (grid,)))
+    for grid in reading.boards if dots else ():
+        patterns.append((of_board, grid.rows, [DOT] * len(grid.rows), (grid,)))
     fine, measured = grey_fine(image), []
-    for polarity in dict.fromkeys(pattern[0] for pattern in patterns):  # all patterns of one polarity at once
+    polarities: dict[Polarity, None] = dict.fromkeys(pattern[0] for pattern in patterns)
+    for polarity in polarities:  # all patterns of one polarity at once
         own, every = [pattern[1] for pattern in patterns if pattern[0] == polarity], reading.found[polarity]
         groups = np.repeat(np.arange(len(own)), [len(rows) for rows in own])
         centres = measure_centres(fine, camera, every.select(np.concatenate(own)), every, groups)

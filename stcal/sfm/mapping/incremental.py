@@ -112,6 +112,7 @@ def map_group(
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
     names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
     seed = ids[pair.first], ids[pair.second]
+    assert pair.second_from_first is not None, "chosen pairs have a pose"
     own = partial(_own_mapping, database, names, seed, pair.second_from_first)
     ways = {
         "our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own,
