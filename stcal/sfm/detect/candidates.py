@@ -225,6 +225,8 @@ class Candidates:
     """n ellipses in normalised ideal coordinates. Lens distortion is removed from centres exactly, from shapes to first
     order."""
 
+    tree: KDTree  # over ``xy``
+
     def __init__(self, ellipses: Ellipses, camera: Camera):
         self.xy = camera.normalised_from_pixel(ellipses.centre_px)  # (n, 2) centres
         _, distorted_by_ideal = camera.distort_jacobian(self.xy)
@@ -233,7 +235,7 @@ class Candidates:
         self.radius = np.sqrt(np.abs(np.linalg.det(self.shape)))  # (n,) of equal area
         self.contrast = ellipses.contrast  # (n,) grey values
         self.px = 1 / float(np.sqrt(camera.focal.prod()))  # size of a pixel in these coordinates
-        self.tree: KDTree = KDTree(self.xy)
+        self.tree = KDTree(self.xy)
 
     def mirrored(self) -> "Candidates":
         """Returns the mirror image of the candidates, with reversed x."""
