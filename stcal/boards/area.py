@@ -170,44 +170,34 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     xy = apply_homography(image_from_grid, middle).astype(np.float32)
     level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
     bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-    return _scatter(cells, *_offsets(grey, _pieces(image_from_grid, bright, cells), outer, cells))
+    return _scatter(cells, *_offsets(grey, _Pieces(image_from_grid, bright, cells), outer, cells))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Pieces:
-    tag: np.ndarray
-    axis: np.ndarray  # 0: lines of one x
-    line: np.ndarray
-    sign: np.ndarray  # +1 where the next cell is bright
-    along: np.ndarray  # place on the line, -1 to 1
-    start: np.ndarray  # (s, 2) px
-    end: np.ndarray  # (s, 2) px
-    normal: np.ndarray  # (s, 2) towards the next cell
-    lean: np.ndarray  # how far the cell's other sides run along the line for each px across it
-    cell: np.ndarray  # distance to the next line, px
+    """The s sides between a dark and a bright cell in the grids of tags."""
 
-
-def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pieces:
-    found = []
-    for axis in (0, 1):
-        colour = np.swapaxes(bright, 1, 2) if axis == 0 else bright  # (n, line, along)
-        change = colour[:, 1:].astype(int) - colour[:, :-1]
-        tag, line, along = np.nonzero(change)
-        line = line + 1
-        corner = np.stack([line, along] if axis == 0 else [along, line], axis=-1).astype(float)
-        step, across = np.eye(2)[[1 - axis, axis]]
-        start, end, before, after = (
-            apply_homography(image_from_grid[tag], (corner + move)[:, None])[:, 0]
+    def __init__(self, image_from_grid: np.ndarray, bright: np.ndarray, cells: int):
+        found = []
+        for axis, colour in enumerate((np.swapaxes(bright, 1, 2), bright)):  # (n, line, along); 0: lines of one x
+            change = colour[:, 1:].astype(int) - colour[:, :-1]
+            tag, line, along = np.nonzero(change)
+            found.append((tag, np.full(len(tag), axis), line + 1, along, change[change != 0].astype(float)))
+        self.tag, self.axis, self.line, place, self.sign = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        self.along = (2 * place + 1) / cells - 1  # place on the line, -1 to 1
+        step, across = np.eye(2)[1 - self.axis], np.eye(2)[self.axis]
+        corner = self.line[:, None] * across + place[:, None] * step
+        self.start, self.end, before, after = (  # (s, 2) px
+            apply_homography(image_from_grid[self.tag], (corner + move)[:, None])[:, 0]
             for move in (0 * step, step, -across, across)
         )
-        direction = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+        direction = (self.end - self.start) / np.linalg.norm(self.end - self.start, axis=1, keepdims=True)
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
-        normal *= np.sign(((after - before) * normal).sum(1))[:, None]
-        widths = [np.abs(((there - start) * normal).sum(1)) for there in (before, after)]
-        lean = ((after - before) * direction).sum(1) / ((after - before) * normal).sum(1)
-        sign, place = change[change != 0].astype(float), (2 * along + 1) / cells - 1
-        found.append((tag, np.full(len(tag), axis), line, sign, place, start, end, normal, lean, np.minimum(*widths)))
-    return _Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        # (s, 2) towards the next cell, whose side is ``sign`` +1 where it is bright
+        self.normal = normal * np.sign(((after - before) * normal).sum(1))[:, None]
+        # How far the cell's other sides run along the line for each px across it.
+        self.lean = ((after - before) * direction).sum(1) / ((after - before) * self.normal).sum(1)
+        widths = [np.abs(((there - self.start) * self.normal).sum(1)) for there in (before, after)]
+        self.cell = np.minimum(*widths)  # distance to the next line, px
 
 
 def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> tuple[np.ndarray, ...]:

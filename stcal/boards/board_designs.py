@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import ClassVar
 
 import cv2
@@ -28,6 +27,11 @@ class Distinct:
         return []
 
 
+def column_row(rows: int, columns: int) -> np.ndarray:
+    """Return column and row of all places of a grid, (rows·columns, 2), row by row."""
+    return np.column_stack(np.divmod(np.arange(rows * columns), columns))[:, ::-1]
+
+
 @dataclass(frozen=True, slots=True)
 class ChessboardDesign:
     """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``. X along a row, Y down the
@@ -41,8 +45,7 @@ class ChessboardDesign:
 
     def xy_mm(self) -> np.ndarray:
         """Return the inner corners, (rows·columns, 2), row-major, mm."""
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        return self.square_mm * np.column_stack([column, row]).astype(float)
+        return self.square_mm * column_row(self.rows, self.columns).astype(float)
 
     def symmetries(self) -> list[Rigid]:
         """Return the turns after which the board looks the same, as board_from_board, without the identity."""
@@ -76,8 +79,7 @@ class CharucoDesign(Distinct):
 
     def xy_mm(self) -> np.ndarray:
         """Return the inner corners, ((rows − 1)·(columns − 1), 2), row-major, mm."""
-        row, column = np.divmod(np.arange((self.rows - 1) * (self.columns - 1)), self.columns - 1)
-        return self.square_mm * (1 + np.column_stack([column, row]).astype(float))
+        return self.square_mm * (1.0 + column_row(self.rows - 1, self.columns - 1))
 
 
 UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
@@ -212,8 +214,7 @@ class AprilGridDesign(Distinct):
 
     def layout(self) -> "TagLayout":
         """Return the board's tags one by one, with corners in the order of the detectors."""
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        first = self.tag_mm * (1 + self.spacing) * np.column_stack([column, -row])
+        first = self.tag_mm * (1 + self.spacing) * (column_row(self.rows, self.columns) * [1, -1])
         square = self.tag_mm * np.array([[0, -1], [1, -1], [1, 0], [0, 0]], float)
         square = square if self.upright else np.roll(square, -2, axis=0)
         tags = tuple((self.dictionary, tag) for tag in self.tag_ids())
@@ -272,7 +273,7 @@ class AsymmetricCirclesDesign:
         require_fields(self, "asymmetric circles")
 
     def _steps(self) -> np.ndarray:
-        row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        place, row = column_row(self.rows, self.columns).T
         return np.column_stack([2 * place + row % 2, row])
 
     def xy_mm(self) -> np.ndarray:
@@ -303,8 +304,7 @@ class AsymmetricCirclesDesign:
         cells = self._cells() - self._cells().min(0)
         rows, columns = (cells.max(0) + 1).tolist()
         sizes = rows, columns, self.nearest_mm(), self.radii_mm()[0]
-        ringed = (cells[row * self.columns + place].tolist() for row, place in self.rings)
-        rings = tuple((row, column) for row, column in ringed)
+        rings = tuple(tuple(cells[row * self.columns + place].tolist()) for row, place in self.rings)
         of = {"rings": rings, "taken": cells, "circles": self, "hexagonal": self.hexagonal}
         return LatticePart(*sizes, self.polarity, self.sigma_mm, **of)
 
@@ -330,7 +330,7 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
 
     def _cells(self) -> np.ndarray:
         """Return row and column of all circles in the hexagonal lattice, whose rows are shifted by half a pitch."""
-        row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        place, row = column_row(self.rows, self.columns).T
         return np.column_stack([row, place - row // 2])
 
 
@@ -468,7 +468,9 @@ def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
         bits = board.border_bits or UNKNOWN_BITS
         layout = board.layout()
         tags = [_tag(name, tag, at, bits) for (name, tag), at in zip(layout.tags, layout.corners_mm, strict=True)]
-        return tags + _between(board)
+        gap = board.spacing * board.tag_mm
+        between = (board.tag_mm + gap) * (column_row(board.rows + 1, board.columns + 1) * [1, -1]) - [gap, 0.0]
+        return tags + [[corner + gap * SQUARE] for corner in between]
     return [_tag(name, tag, at, 1) for (name, tag), at in zip(board.tags, board.corners_mm, strict=True)]
 
 
@@ -489,39 +491,30 @@ def outlines(black: np.ndarray) -> list[np.ndarray]:
     after: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for row, column in np.argwhere(black).tolist():
         corners = [(column + x, row + y) for x, y in SQUARE.tolist()]
-        beside = [padded[row, column + 1], padded[row + 1, column + 2], padded[row + 2, column + 1]]
-        beside.append(padded[row + 1, column])
-        for k in range(4):
-            if not beside[k]:
+        for k, (down, right) in enumerate(((0, 1), (1, 2), (2, 1), (1, 0))):  # of the neighbours in ``padded``
+            if not padded[row + down, column + right]:
                 after.setdefault(corners[k], []).append(corners[(k + 1) % 4])
     lines = []
     while after:
-        corner = start = next(iter(after))
-        step, line = (0, 0), []
-        while True:
-            ends = after[corner]
-            right = (corner[0] - step[1], corner[1] + step[0])
+        line, step = [next(iter(after))], (0, 0)
+        while len(line) == 1 or line[-1] != line[0]:
+            (x, y), ends = line[-1], after[line[-1]]
+            right = (x - step[1], y + step[0])
             end = ends.pop(ends.index(right) if right in ends else 0)
             if not ends:
-                del after[corner]
-            turned = (end[0] - corner[0], end[1] - corner[1])
-            if turned != step:
-                line.append(corner)
-            corner, step = end, turned
-            if corner == start:
-                break
-        first = (line[1][0] - line[0][0], line[1][1] - line[0][1])
-        if first[0] * step[1] == first[1] * step[0]:  # the line began in the middle of an edge
-            line = line[1:]
-        lines.append(np.array(line))
+                del after[x, y]
+            line.append(end)
+            step = (end[0] - x, end[1] - y)
+        corners = np.array(line[:-1])
+        is_turn = np.roll(corners, -1, axis=0) - corners != corners - np.roll(corners, 1, axis=0)
+        lines.append(corners[is_turn.any(1)])  # without those in the middle of an edge
     return lines
 
 
 def _squares(rows: int, columns: int, side: float, first: int, origin: float) -> list[list[np.ndarray]]:
     """Return the black squares one by one; square (0, 0) begins at ``origin``, and is black if ``first`` is 0."""
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    black = (row + column) % 2 == first
-    return [[side * (at + SQUARE) + origin] for at in np.column_stack([column, row])[black]]
+    places = column_row(rows, columns)
+    return [[side * (at + SQUARE) + origin] for at in places[places.sum(1) % 2 == first]]
 
 
 def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.ndarray]:
@@ -535,9 +528,3 @@ def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.
         top = (1 - u) * corners[0] + u * corners[1]
         lines.append((1 - v) * top + v * ((1 - u) * corners[3] + u * corners[2]))
     return lines
-
-
-def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
-    gap = board.spacing * board.tag_mm
-    step, cells = board.tag_mm + gap, product(range(board.rows + 1), range(board.columns + 1))
-    return [[np.array([column * step - gap, -row * step]) + gap * SQUARE] for row, column in cells]

@@ -55,12 +55,19 @@ Place = Annotated[int, Field(ge=0, le=999, strict=True)]
 Rings = Annotated[tuple[tuple[Place, Place], ...], Field(max_length=1000)]
 """Row and column, or place in the row, of each dot with a hole."""
 Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
+SignedPpm = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True)]
 
 
-def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K", least: float = LEAST_PPM) -> float:
-    if 0 < abs(value) < least:
-        percent = "" if per else f", and in % {1e4 * value:g}"
-        raise ValueError(f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or {least:g} needed")
+def _in_ppm(value: float) -> float:
+    if 0 < abs(value) < LEAST_PPM:
+        raise ValueError(f"in ppm/K, so that {value:g} 1/K is {1e6 * value:g}; 0 or {LEAST_PPM:g} needed")
+    return value
+
+
+def _pitch_in_ppm(value: float) -> float:
+    if 0 < value < LEAST_PITCH_PPM:
+        same = f"{value:g} as a fraction is {1e6 * value:g}, and in % {1e4 * value:g}"
+        raise ValueError(f"in ppm, so that {same}; 0 or {LEAST_PITCH_PPM:g} needed")
     return value
 
 
@@ -77,9 +84,7 @@ Celsius = Annotated[float, Field(allow_inf_nan=False, strict=True), AfterValidat
 class SizeEntry(Strict):
     """The keys of :class:`StatedSize` without the pitch, for any body."""
 
-    expansion_ppm_per_k: (
-        Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True), AfterValidator(_in_ppm)] | None
-    ) = None
+    expansion_ppm_per_k: Annotated[SignedPpm, AfterValidator(_in_ppm)] | None = None
     expansion_sigma_ppm_per_k: Annotated[Ppm, AfterValidator(_in_ppm)] | None = None
     temperature_c: Celsius | None = None
     temperature_sigma_k: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)] | None = None
@@ -93,9 +98,7 @@ class SizeEntry(Strict):
 class BoardSizeEntry(SizeEntry):
     """All keys of :class:`StatedSize`."""
 
-    pitch_sigma_ppm: (
-        Annotated[Ppm, AfterValidator(lambda value: _in_ppm(value, "", " as a fraction", LEAST_PITCH_PPM))] | None
-    ) = None
+    pitch_sigma_ppm: Annotated[Ppm, AfterValidator(_pitch_in_ppm)] | None = None
 
 
 class _CornerFile(Strict):

@@ -40,8 +40,7 @@ def known_dictionary(name: str) -> str:
         name = f"APRILTAG_{family[2]}"
     elif family is not None:
         return _of_apriltag(f"tag{(family[1] or '').capitalize()}{family[2].lower()}")
-    plain = name.strip().upper()
-    plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
+    plain = f"DICT_{name.strip().upper().removeprefix('DICT_')}"
     dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     if plain not in dictionaries:
         size = re.search(r"\d+ ?[X×] ?\d+|\d\dH\d+", plain)

@@ -1,5 +1,6 @@
 """Straight edges between dark and bright areas, their crossings and corners of tags, by the areas in each pixel."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -76,11 +77,11 @@ def corners_from_edges(
     n = len(corners)
     if not n:
         return np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool), 0.0
-    frame = _frame(np.asarray(corners, float), cells)
+    frame = _Edges(np.asarray(corners, float), cells)
     offset, good = _profiles(grey, frame)
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
         rough = _fit(frame.place, offset, good)
-        area = _by_area(grey, frame, rough)
+        area = _Area(grey, frame, rough)
         meeting = _meet(frame, area.lines(rough, SamplingVariance(0.0, 0.0)))[0]
         by_lines = _told_by_lines(grey, meeting, np.reshape(cells, -1), area)
         variance = displacement_variance([area.told, *(each for each, _ in by_lines)], [each for _, each in by_lines])
@@ -94,15 +95,13 @@ def _told_by_lines(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area"
 ) -> list[tuple[Displacement, Displacement]]:
     told, n = [], len(corners)
-    dark, rise = np.moveaxis(area.levels.reshape(n, 4, 2), 2, 0)
     spread = np.where(area.settled, area.by_noise[:, 0, 0].reshape(n, 4), np.nan)
     whole = np.isfinite(corners).all((1, 2)) & np.isfinite(spread).all(1)
     for count in np.unique(cells[whole]).tolist():
         rows = np.flatnonzero(whole & (cells == count))
-        blur, noise = (np.median(value.reshape(n, 4)[rows], axis=1) for value in (area.blur, area.noise))
-        levels = np.median(dark[rows], axis=1), np.median(rise[rows], axis=1)
+        blur, dark, rise, noise = np.median(area.pixels[rows], axis=1).T
         sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
-        outer = OuterLines(corners[rows], blur, *levels, noise, spread[rows], sampling)
+        outer = OuterLines(corners[rows], blur, dark, rise, noise, spread[rows], sampling)
         told.append(told_by_lines(grey, outer, count))
     return told
 
@@ -118,18 +117,22 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
     return np.linalg.solve(pair, np.ones((*pair.shape[:-1], 1)))[..., 0]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Edges:
-    """Geometry of the edges, px."""
+    """Geometry of the four edges of tags with ``corners`` (n, 4, 2) and ``cells`` (n,) per side, px."""
 
-    middle: np.ndarray  # (n, 4, 2) of each edge
-    along: np.ndarray  # (n, 4, 2)
-    normal: np.ndarray  # (n, 4, 2) outwards
-    length: np.ndarray  # (n, 4)
-    cell: np.ndarray  # (n, 4) width of a cell across
-    cells: np.ndarray  # (n, 4) number of cells along
-    reach: np.ndarray  # (n, 4) of the profiles
-    place: np.ndarray  # (n, 4, POINTS) of the profiles from the middle
+    def __init__(self, corners: np.ndarray, cells: np.ndarray):
+        end, number = np.roll(corners, -1, axis=1), np.reshape(cells, (-1, 1))
+        self.length = np.linalg.norm(end - corners, axis=2)  # (n, 4)
+        self.along = (end - corners) / self.length[..., None]  # (n, 4, 2)
+        self.middle = (corners + end) / 2  # (n, 4, 2)
+        normal = np.stack([self.along[..., 1], -self.along[..., 0]], axis=-1)
+        depth = 2 * ((self.middle - corners.mean(1, keepdims=True)) * normal).sum(2)
+        self.normal = normal * np.where(depth < 0, -1.0, 1.0)[..., None]  # (n, 4, 2) outwards
+        self.cell = np.minimum(np.abs(depth), self.length) / number  # (n, 4) width of a cell across
+        self.cells = np.broadcast_to(number, self.length.shape)  # (n, 4) number of cells along
+        self.reach = np.clip(CELLS_ACROSS * self.cell, *REACH_PX)  # (n, 4) of the profiles
+        # (n, 4, POINTS) of the profiles from the middle
+        self.place = (np.linspace(*ALONG, POINTS) - 0.5) * self.length[..., None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,21 +143,6 @@ class _Lines:
     slope: np.ndarray  # (n, 4)
     covariance: np.ndarray  # (n, 4, 2, 2) of the two
     keep: np.ndarray  # (n, 4, POINTS) profiles that are no outliers
-
-
-def _frame(corners: np.ndarray, cells: np.ndarray) -> _Edges:
-    end = np.roll(corners, -1, axis=1)
-    length = np.linalg.norm(end - corners, axis=2)
-    along = (end - corners) / length[..., None]
-    middle = (corners + end) / 2
-    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    depth = 2 * ((middle - corners.mean(1, keepdims=True)) * normal).sum(2)
-    normal = normal * np.where(depth < 0, -1.0, 1.0)[..., None]
-    cell = np.minimum(np.abs(depth), length) / np.reshape(cells, (-1, 1))
-    reach = np.clip(CELLS_ACROSS * cell, *REACH_PX)
-    place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
-    number = np.broadcast_to(np.reshape(cells, (-1, 1)), length.shape)
-    return _Edges(middle, along, normal, length, cell, number, reach, place)
 
 
 def _profiles(grey: np.ndarray, frame: _Edges) -> tuple[np.ndarray, np.ndarray]:
@@ -222,21 +210,65 @@ def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> tuple[np.ndarray,
     return level, t, d, used.astype(float), normal[each, 1 - major]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Area:
-    """Lines of m edges by area, with what their σ are made of."""
+    """Lines of the edges of tags by area, with what their σ are made of."""
 
-    offset: np.ndarray  # (n, 4), as in _Lines
-    slope: np.ndarray  # (n, 4)
-    settled: np.ndarray  # (n, 4) False where the profiles' line is kept
-    blur: np.ndarray  # (m,) variances, px²
-    levels: np.ndarray  # (m, 2) dark and rise
-    noise: np.ndarray  # (m,) variance of pixels
-    by_noise: np.ndarray  # (m, 2, 2) covariance of offset and slope without sampling
-    by_sampling: np.ndarray  # (m, 2, 2) their derivatives by its two harmonics, in columns
-    passed: np.ndarray  # (m,) share of it that the blur passes
-    told: Displacement  # of the offset, by the profiles along rotated edges
-    smear_px: float  # way of motion, 0 where it is short
+    def __init__(self, grey: np.ndarray, frame: _Edges, rough: _Lines):
+        level, t, d, weight, per_pixel = _pixels(grey, frame, rough)
+        m, shape = len(level), frame.length.shape
+        normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
+        length = frame.length.reshape(m, 1, 1)
+        relative = 2 * t / length
+        distance = residual = d
+        design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
+        value = np.zeros((m, 7))  # offset, slope, variance of blur, dark and rise with their changes along the edge
+        value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
+        value[:, 2] = START_VARIANCE
+        for k in range(STEPS + 1):
+            if k == STEPS - 1:  # the blur is known: the next cell's must not reach the pixels, nor the next edge's
+                blurs = BLURS * np.sqrt(value[:, 2] + PIXEL_VARIANCE)[:, None, None]
+                weight = weight * (distance >= -np.maximum(frame.cell.reshape(m, 1, 1) - blurs, LEAST_INSIDE_PX))
+                weight = weight * (np.abs(t) <= np.maximum(length / 2 - blurs, LEAST_ALONG * length))
+            distance = d - value[:, :1, None] - value[:, 1:2, None] * t
+            step, slope, widening = integrated_step(distance, normal, value[:, 2])
+            levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
+            if not k:  # the levels follow linearly
+                value[:, 3:] = solved(levels, weight, level)[0]
+            rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
+            residual = level - (levels @ value[:, None, 3:, None])[..., 0]
+            by_edge = (rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0)
+            design = np.concatenate([by_edge, levels], -1)
+            change, inverse = solved(design, weight, residual)
+            if k < STEPS:
+                value += change
+                value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
+                value = np.where(np.isfinite(value), value, 0.0)
+        good = np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
+        sampling = of_sampling(distance, per_pixel, design[..., 0])
+        explained = [solved(design, weight, column)[0] for column in np.moveaxis(sampling, -1, 0)]
+        harmonic = sampling - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
+        scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
+        noise = _noise_of(scatter, distance, weight)
+        noise = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
+        # (n, 4, 4) variance of the blur, px², dark, rise, and variance of pixels
+        self.pixels = np.column_stack([value[:, [2, 3, 5]], noise]).reshape(*shape, 4)
+        self.passed = passed_by_blur(per_pixel, value[:, 2])  # (m,) share of sampling that the blur passes
+        # (m, 2, 2) derivatives of offset and slope by the two harmonics of sampling, in columns
+        self.by_sampling = (inverse @ products(design, weight, sampling))[:, :2]
+        shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
+        # (m, 2, 2) covariance of offset and slope without sampling
+        by_noise = noise[:, None, None] * inverse[:, :2, :2] + uncertain
+        self.by_noise = np.where(good[:, None, None], by_noise, np.nan)
+        smear = _smear(normal, value[:, 2], good)
+        self.by_noise[:, 0, 0] += (SMEAR_SHARE * smear * (smear / frame.cell.reshape(m)) ** SMEAR_POWER) ** 2
+        # way of motion, 0 where it is short
+        self.smear_px = float(smear.max()) if (smear > LONG_SMEAR * frame.cell.reshape(m)).any() else 0.0
+        # of the offset, by the profiles along rotated edges
+        self.told = _told_along(residual, harmonic, self.passed, weight, noise, good)
+        line = np.moveaxis((value[:, :2] - shift).reshape(*shape, 2), 2, 0)
+        # (n, 4) False where the profiles' line is kept
+        self.settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
+        self.offset, self.slope = np.where(self.settled, line, [rough.offset, rough.slope])  # (n, 4) as in _Lines
 
     def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
         """Return the lines with their covariances, where sampling displaces them by ``variance``."""
@@ -245,58 +277,6 @@ class _Area:
         covariance = covariance.reshape(*self.offset.shape, 2, 2)
         covariance = np.where(self.settled[..., None, None], covariance, rough.covariance)
         return _Lines(self.offset, self.slope, covariance, rough.keep)
-
-
-def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
-    level, t, d, weight, per_pixel = _pixels(grey, frame, rough)
-    m = len(level)
-    normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
-    length = frame.length.reshape(m, 1, 1)
-    relative = 2 * t / length
-    distance = residual = d
-    design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
-    value = np.zeros((m, 7))  # offset, slope, variance of the blur, dark and rise with their changes along the edge
-    value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
-    value[:, 2] = START_VARIANCE
-    for k in range(STEPS + 1):
-        if k == STEPS - 1:  # the blur is known: the next cell's must not reach the pixels, nor the next edge's
-            blurs = BLURS * np.sqrt(value[:, 2] + PIXEL_VARIANCE)[:, None, None]
-            weight = weight * (distance >= -np.maximum(frame.cell.reshape(m, 1, 1) - blurs, LEAST_INSIDE_PX))
-            weight = weight * (np.abs(t) <= np.maximum(length / 2 - blurs, LEAST_ALONG * length))
-        distance = d - value[:, :1, None] - value[:, 1:2, None] * t
-        step, slope, widening = integrated_step(distance, normal, value[:, 2])
-        levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
-        if not k:  # the levels follow linearly
-            value[:, 3:] = solved(levels, weight, level)[0]
-        rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
-        residual = level - (levels @ value[:, None, 3:, None])[..., 0]
-        design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
-        change, inverse = solved(design, weight, residual)
-        if k < STEPS:
-            value += change
-            value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
-            value = np.where(np.isfinite(value), value, 0.0)
-    shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
-    sampling = of_sampling(distance, per_pixel, design[..., 0])
-    explained = [solved(design, weight, column)[0] for column in np.moveaxis(sampling, -1, 0)]
-    harmonic = sampling - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
-    scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
-    noise = _noise_of(scatter, distance, weight)
-    factor = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
-    passed = passed_by_blur(per_pixel, value[:, 2])
-    pull = products(design, weight, sampling)
-    shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
-    by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
-    smear = _smear(normal, value[:, 2], good)
-    by_noise[:, 0, 0] += (SMEAR_SHARE * smear * (smear / frame.cell.reshape(m)) ** SMEAR_POWER) ** 2
-    smeared = float(smear.max()) if (smear > LONG_SMEAR * frame.cell.reshape(m)).any() else 0.0
-    value[:, :2] -= shift
-    told = _told_along(residual, harmonic, passed, weight, factor, good)
-    line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
-    settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
-    offset, slope = np.where(settled, line, [rough.offset, rough.slope])
-    blur, levels, by_sampling = value[:, 2], value[:, [3, 5]], (inverse @ pull)[:, :2]
-    return _Area(offset, slope, settled, blur, levels, factor, by_noise, by_sampling, passed, told, smeared)
 
 
 def _smear(normal: np.ndarray, blur: np.ndarray, good: np.ndarray) -> np.ndarray:
@@ -314,21 +294,26 @@ def _smear(normal: np.ndarray, blur: np.ndarray, good: np.ndarray) -> np.ndarray
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance of the shift (m, 2) of offset and slope by random cells behind the border."""
-    m, cells = len(design), frame.cells.reshape(-1)
+    m, cells = len(design), frame.cells.ravel()
     blur = np.sqrt(variance + PIXEL_VARIANCE)[:, None, None]
     brought = rise * ndtr(-(distance + frame.cell.reshape(m, 1, 1)) / blur)
     number = np.floor((t / frame.length.reshape(m, 1, 1) + 0.5) * cells[:, None, None]).astype(int)
     inner = weight * brought * ((number >= 1) & (number <= cells[:, None, None] - 2))
     most = int(cells.max(initial=1))
-    row = (number.clip(0, most - 1) + most * np.arange(m)[:, None, None]).ravel()
-    by_parameter = np.moveaxis(inner[..., None] * design, -1, 0)
-    pull = np.stack([np.bincount(row, part.ravel(), m * most).reshape(m, most) for part in by_parameter], axis=-1)
+    pull = _by_class(number.clip(0, most - 1), most, np.moveaxis(inner[..., None] * design, -1, 0))
     moved = (pull @ inverse)[..., :2]
     return moved.sum(1) / 2, np.swapaxes(moved, 1, 2) @ moved / 4
 
 
 BIN_PX = 0.25
 """Width of a class of distances from an edge of a crossing: pixels in one class see the same part of its profile."""
+
+
+def _by_class(number: np.ndarray, classes: int, values: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the sums (n, classes, k) of k values (n, …) of pixels that have these class numbers (n, …)."""
+    n = len(number)
+    row = (number.reshape(n, -1) + classes * np.arange(n)[:, None]).ravel()
+    return np.stack([np.bincount(row, part.ravel(), n * classes).reshape(n, classes) for part in values], axis=-1)
 
 
 def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement:
@@ -342,15 +327,9 @@ def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement
 
 def _noise_of(residual, distance, weight) -> np.ndarray:
     """Return the variances (m,) of single pixels, from their scatter within classes of distances from the edge."""
-    m = len(residual)
     most = round(2 * REACH_PX[1] / BIN_PX)
     place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
-    bins = 2 * most + 1
-    row = (place + bins * np.arange(m)[:, None, None]).ravel()
-    count, total = (
-        np.bincount(row, (weight * value).ravel(), m * bins).reshape(m, bins)
-        for value in (np.ones_like(residual), residual)
-    )
+    count, total = np.moveaxis(_by_class(place, 2 * most + 1, (weight, weight * residual)), 2, 0)
     within = (weight * residual**2).sum((1, 2)) - (total**2 / np.maximum(count, 1)).sum(1)
     return np.maximum(within / np.maximum(count.sum(1) - (count > 0).sum(1), 1), ROUNDING)
 
@@ -491,11 +470,9 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
 
 def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
     """Return the sum over classes of distances of P Pᵀ, (n, 2, 2); P : the summed pulls (n, k, 2) of a class."""
-    n, most = len(pull), round(2 * half / BIN_PX)
-    bins = 2 * most + 1
-    row = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most + bins * np.arange(n)[:, None]
-    summed = np.stack([np.bincount(row.ravel(), pull[..., i].ravel(), n * bins) for i in (0, 1)], axis=-1)
-    summed = summed.reshape(n, bins, 2)
+    most = round(2 * half / BIN_PX)
+    place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
+    summed = _by_class(place, 2 * most + 1, np.moveaxis(pull, 2, 0))
     return np.swapaxes(summed, 1, 2) @ summed
 
 
@@ -508,13 +485,10 @@ def _growth(
     blur: float,  # variance, px²; neighbours at a distance k correlate by exp(−k²/4σ²)
 ) -> float:
     """Return the factor, 1 or more, of all variances by edges that are not straight: all pixels of a profile move."""
-    n = len(pull)
     number = np.rint(place).astype(int)
     number -= number.min()
-    bins = number.max() + 1
-    row = (number + bins * np.arange(n)[:, None]).ravel()
-    pulls = [np.bincount(row, (pull[..., i] * residual).ravel(), n * bins).reshape(n, bins) for i in (0, 1)]
-    squares = (np.square(pulls[0]) + np.square(pulls[1])).sum(1)
+    pulls = _by_class(number, number.max() + 1, np.moveaxis(pull * residual[..., None], 2, 0))
+    squares = np.square(pulls).sum(2).sum(1)
     expected = noise * (pull**2).sum((1, 2)) * (1 - 2 / profiles)
     told = expected > 0
     if not told.any():

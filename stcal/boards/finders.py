@@ -8,7 +8,7 @@ measured in the original image. A ChArUco board is read by its tags (through ``c
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -22,6 +22,7 @@ from stcal.boards.board_designs import (
     ChessboardDesign,
     FlatBoard,
     TagLayout,
+    column_row,
     view_of,
 )
 from stcal.boards.dictionaries import dictionary_of
@@ -136,16 +137,11 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
         if window <= MOST_WINDOW:
             break
-    measured = _by_area(grey, grid)
-    return replace(measured, xy_px=measured.xy_px + first)
-
-
-def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
-    """Return the corners by the areas of black and white: gradients place those along pixel rows 0.02 px aside."""
+    # By the areas of black and white: gradients place corners along pixel rows 0.02 px aside.
     along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
-    half = int(min(_window(grid), MOST_BY_AREA))
-    clear = np.linalg.norm(along, axis=2).min(1)
-    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half), clear)
+    halves = np.full(len(along), int(min(_window(grid), MOST_BY_AREA)))
+    measured = crossings(grey, grid.reshape(-1, 2), along, halves, np.linalg.norm(along, axis=2).min(1))
+    return replace(measured, xy_px=measured.xy_px + first)
 
 
 def _least_step(grid: np.ndarray) -> float:
@@ -159,14 +155,12 @@ def _window(grid: np.ndarray) -> float:
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:
     """Return True if the square between corners (0, 0) and (1, 1) has the darker colour."""
-    xy = board.xy_mm() / board.square_mm
-    image_from_board = fit_homography(xy, grid.reshape(-1, 2))
-    row, column = np.divmod(np.arange((board.rows - 1) * (board.columns - 1)), board.columns - 1)
-    middle = apply_homography(image_from_board, np.column_stack([column, row]) + 0.5)
-    x, y = np.rint(middle).astype(int).T
+    image_from_board = fit_homography(board.xy_mm() / board.square_mm, grid.reshape(-1, 2))
+    first = column_row(board.rows - 1, board.columns - 1)  # corners of the squares
+    x, y = np.rint(apply_homography(image_from_board, first + 0.5)).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < grey.shape[1]) & (y < grey.shape[0])
     level = grey[y[inside], x[inside]].astype(float)
-    even = ((row + column) % 2 == 0)[inside]
+    even = (first.sum(1) % 2 == 0)[inside]
     return bool(even.all() or level[even].mean() < level[~even].mean())
 
 
@@ -227,7 +221,7 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
     cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
     small, large = white / np.sqrt(2), (white + cell) / np.sqrt(2)
     for _ in range(2):
-        foretold = _foretold(squares, corners)
+        foretold = _Foretold(squares, corners)
         blurred = _saddles(smooth, foretold.xy_px, _half_px(large, foretold))
         corners = blurred.xy_px
     gradient = tuple(cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
@@ -236,7 +230,7 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
     start, clear = sharp.otherwise(blurred).xy_px, np.sqrt(2) * small * foretold.step_px
     by_area = crossings(grey, start, along, _half_px(small, foretold), clear)
     measured = by_area.otherwise(sharp).otherwise(blurred)
-    good = measured.seen & _foretold(squares, measured.xy_px).agrees(measured.xy_px)
+    good = measured.seen & _Foretold(squares, measured.xy_px).agrees(measured.xy_px)
     if good.sum() < LEAST_CORNERS:
         return None
     view = view_of(name, board, ids[good], measured.xy_px[good], measured.covariance_px2[good])
@@ -258,13 +252,27 @@ def _read(grey: np.ndarray, board: CharucoDesign) -> tuple[np.ndarray, np.ndarra
     return ids.ravel().astype(int), corners.reshape(-1, 2).astype(float)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Foretold:
-    """Corners as predicted by the corners around each of them."""
+    """Corners at ``squares`` (n, 2) of the board as predicted by the corners around each of them."""
 
-    xy_px: np.ndarray  # (n, 2)
-    scatter_px: np.ndarray  # (n,) median deviation of those corners from their own smooth field
-    step_px: np.ndarray  # (n,) shorter side of a square there
+    def __init__(self, squares: np.ndarray, corners: np.ndarray):
+        image_from_squares, n = _robust_homography(squares, corners), len(squares)
+        self.xy_px = base = apply_homography(image_from_squares, squares)  # (n, 2)
+        # (n,) shorter side of a square there
+        self.step_px = np.linalg.svd(homography_jacobian(image_from_squares, squares), compute_uv=False)[:, 1]
+        self.scatter_px = np.zeros(n)  # (n,) median deviation of those corners from their own smooth field
+        if n < TESTED_FROM:
+            return
+        near = np.asarray(KDTree(squares).query(squares, k=min(NEIGHBOURS, n - 1) + 1)[1])[:, 1:]
+        design = np.concatenate([np.ones((*near.shape, 1)), squares[near] - squares[:, None]], axis=2)
+        left = (corners - base)[near]
+        weight = np.ones(near.shape)
+        for _ in range(ROBUST_PASSES):  # least lengths instead of squares, by reweighting: a median of the plane
+            normal = np.einsum("nki,nk,nkj->nij", design, weight, design) + np.diag([0, *[SLOPE_SIGMA_PX**-2] * 2])
+            plane = np.linalg.solve(normal, np.einsum("nki,nk,nkc->nic", design, weight, left))
+            length = np.linalg.norm(left - design @ plane, axis=2)
+            weight = 1 / np.maximum(length, LEAST_SCATTER_PX)
+        self.xy_px, self.scatter_px = base + plane[:, 0], np.median(length, axis=1)
 
     def agrees(self, xy_px: np.ndarray) -> np.ndarray:
         """Return a mask (n,) of the corners that are at their predicted places."""
@@ -273,26 +281,6 @@ class _Foretold:
         off = np.linalg.norm(xy_px - self.xy_px, axis=1)
         scatter = np.maximum(self.scatter_px / median_length(2), max(robust_sigma(off, 2), LEAST_SCATTER_PX))
         return off <= GATE * scatter
-
-
-def _foretold(squares: np.ndarray, corners: np.ndarray) -> _Foretold:
-    """Return the places (n, 2), px, that the neighbours predict for corners at ``squares`` (n, 2) of the board."""
-    image_from_squares = _robust_homography(squares, corners)
-    base = apply_homography(image_from_squares, squares)
-    step = np.linalg.svd(homography_jacobian(image_from_squares, squares), compute_uv=False)[:, 1]
-    n = len(squares)
-    if n < TESTED_FROM:
-        return _Foretold(base, np.zeros(n), step)
-    near = np.asarray(KDTree(squares).query(squares, k=min(NEIGHBOURS, n - 1) + 1)[1])[:, 1:]
-    design = np.concatenate([np.ones((*near.shape, 1)), squares[near] - squares[:, None]], axis=2)
-    left = (corners - base)[near]
-    weight = np.ones(near.shape)
-    for _ in range(ROBUST_PASSES):  # least lengths instead of squares, by reweighting: a median of the plane
-        normal = np.einsum("nki,nk,nkj->nij", design, weight, design) + np.diag([0, *[SLOPE_SIGMA_PX**-2] * 2])
-        plane = np.linalg.solve(normal, np.einsum("nki,nk,nkc->nic", design, weight, left))
-        length = np.linalg.norm(left - design @ plane, axis=2)
-        weight = 1 / np.maximum(length, LEAST_SCATTER_PX)
-    return _Foretold(base + plane[:, 0], np.median(length, axis=1), step)
 
 
 def _robust_homography(squares: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -353,19 +341,13 @@ def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> Crossings
     return _found(step, start, half)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """Places about a corner: ``offsets`` (k, 2) px, with weights ``bell`` (k,); ``half`` : half a side, px."""
+    """A square window with half sides of ``half`` px: ``offsets`` (k, 2) from its middle, weights ``bell`` (k,)."""
 
-    half: int
-    offsets: np.ndarray
-    bell: np.ndarray
-
-    @classmethod
-    def of(cls, half: int) -> "_Window":
-        """Return a square window with half sides of ``half`` px."""
-        offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * 2), axis=-1).reshape(-1, 2)
-        return cls(half, offsets, np.exp(-(offsets**2).sum(1) / half**2))
+    def __init__(self, half: int):
+        self.half = half
+        self.offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * 2), axis=-1).reshape(-1, 2)
+        self.bell = np.exp(-(self.offsets**2).sum(1) / half**2)
 
     def weight(self, xy: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         """Return the weights (n, k) about corners (n, 2): zero outside of the image, and opposite to it."""
@@ -388,7 +370,7 @@ def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1
     n = len(start)
     xy, covariance, seen = start.copy(), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():
-        own, window = np.flatnonzero(half == side), _Window.of(side)
+        own, window = np.flatnonzero(half == side), _Window(side)
         for _ in range(STEPS):
             move, covariance[own] = step(xy[own], window)
             short = np.minimum(1.0, side / 2 / np.maximum(np.linalg.norm(move, axis=1, keepdims=True), SETTLED_PX))
@@ -411,13 +393,12 @@ def find_on_faces(
     image: np.ndarray, name: str, boards: Mapping[str, FlatBoard], camera: Camera
 ) -> tuple[dict[str, BoardView], list[str]]:
     """Return the views of boards and tags in a grey image by face, and notes on what was left out."""
-    of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
-    of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
-    tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
+    together = [tags_on(board) for board in boards.values() if isinstance(board, TagLayout | CharucoDesign)]
+    tags = find_tags(image, [dictionary for own in together for dictionary, _ in own], windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
 
     def charuco(board: CharucoDesign) -> tuple[BoardView | None, str]:
-        if not any((board.dictionary, tag) in read for tag in board.tag_ids()):
+        if read.isdisjoint(tags_on(board)):
             return None, f"no tag of {board.dictionary}"
         return find_charuco(image, name, board), ""
 
@@ -437,7 +418,7 @@ def find_on_faces(
         view, why, oblique = None, "", ""
         try:
             view, why = finders[type(board)](board)
-            if isinstance(board, TagLayout | AprilGridDesign):
+            if view is not None and isinstance(board, TagLayout | AprilGridDesign):
                 view, oblique = _not_oblique(view)
                 view = straightened(view, camera)
         except StcalError as error:  # corners on a line, say
@@ -452,10 +433,8 @@ def find_on_faces(
     return views, notes
 
 
-def _not_oblique(view: BoardView | None) -> tuple[BoardView | None, str]:
+def _not_oblique(view: BoardView) -> tuple[BoardView | None, str]:
     """Returns the view of tags without those that are tilted too far, None if none is left, and why."""
-    if view is None:
-        return None, ""
     corners = view.xy_px.reshape(-1, 4, 2)
     across = corners[:, 1] + corners[:, 2] - corners[:, 0] - corners[:, 3]
     down = corners[:, 2] + corners[:, 3] - corners[:, 0] - corners[:, 1]
@@ -492,14 +471,12 @@ def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
 def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], unseen: Sequence[FaceDesign]) -> list[str]:
     """Return notes on tags that images show and no face has, where tags of ``unseen`` faces are in none of them."""
     missing = sorted({tag for face in unseen for tag in tags_on(face.printed)})
-    own = {tag for face in faces for tag in tags_on(face.printed)}
-    known = sorted({dictionary for dictionary, _ in own})
     if not missing:
         return []
+    own = {tag for face in faces for tag in tags_on(face.printed)}
+    known = sorted({dictionary for dictionary, _ in own})
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, min(len(files), MOST_READ)).astype(int))]
-    seen = Counter(
-        tag for file in chosen for tag in set(find_tags(grey_of(decode(file.read(), file.name), file.name), known).tags)
-    )
+    seen = Counter(tag for file in chosen for tag in set(find_tags(_grey(file), known).tags))
     strange = [(tag, count) for tag, count in seen.most_common() if tag not in own and count > 1]
     if not strange:
         return []
@@ -508,13 +485,17 @@ def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], uns
     return [f"images show tags that no face has ({shown}), and not {names}"]
 
 
+def _grey(file: ImageFile) -> np.ndarray:
+    return grey_of(decode(file.read(), file.name), file.name)
+
+
 def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:
     """Return why none of the images shows one of the printed faces, by the tags in the first images."""
     own = {tag for face in faces for tag in tags_on(face.printed)}
     known = sorted({dictionary for dictionary, _ in own})
     reason = f"no printed face of the target is seen in {len(files)} images"
     for file in files[:LOOKED_AT] if known else ():
-        grey = grey_of(decode(file.read(), file.name), file.name)
+        grey = _grey(file)
         read = find_tags(grey, known).tags
         names = ", ".join(str(tag) for _, tag in read[:5])
         if own.intersection(read):

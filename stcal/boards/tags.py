@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import cv2
 import numpy as np
@@ -87,16 +86,15 @@ def find_tags(
                     places = (places + grown_px * corners_by_edges(places)).astype(np.float32)
                 if larger != 1:
                     places = ((places + 0.5) / larger - 0.5).astype(np.float32)
-                earlier = {tag: list(known_places) for tag, known_places in places_of.items()}
-                for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
-                    if not any(_inside(place, earlier_place) for earlier_place in earlier.get((name, int(tag)), [])):
-                        places_of.setdefault((name, int(tag)), []).append(place)
+                seen = zip([] if ids is None else [(name, int(tag)) for tag in ids.ravel()], places, strict=True)
+                new = [(t, p) for t, p in seen if not any(_inside(p, other) for other in places_of.get(t, ()))]
+                for tag, place in new:
+                    places_of.setdefault(tag, []).append(place)
     # Tags are also read inside of larger ones, from their cells or a second time from their border.
     every = [(place, cv2.contourArea(place)) for places in places_of.values() for place in places]
     for tag, places in places_of.items():
-        larger_than = [[o for o, area in every if area > cv2.contourArea(place)] for place in places]
-        outermost = [not any(_inside(p, o) for o in others) for p, others in zip(places, larger_than, strict=True)]
-        places_of[tag] = list(compress(places, outermost))
+        sized = [(place, cv2.contourArea(place)) for place in places]
+        places_of[tag] = [p for p, area in sized if not any(area < large and _inside(p, o) for o, large in every)]
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
     cells = np.array([cells_of(name, border_bits) for name, _ in once])
     white = np.array([name in FAMILIES for name, _ in once], bool)
@@ -190,15 +188,13 @@ def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ..
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return the saturated share (n,) of the white half a cell outside of tags; inside for negative ``cells``."""
-    if not len(corners):
-        return np.zeros(0)
     middle = corners.mean(1, keepdims=True)
     outer = middle + (corners - middle) * (1 + 1 / cells)[:, None, None]
     along = np.linspace(0, 1, SATURATION_POINTS, endpoint=False)[:, None]
     points = outer[:, :, None] + along * (np.roll(outer, -1, axis=1) - outer)[:, :, None]
     x, y = np.rint(points).astype(int).reshape(-1, 2).T
     level = grey[y.clip(0, grey.shape[0] - 1), x.clip(0, grey.shape[1] - 1)]
-    return (level.reshape(len(corners), -1) >= SATURATED).mean(1)
+    return (level.reshape(len(corners), 4 * SATURATION_POINTS) >= SATURATED).mean(1)
 
 
 def _refined(
@@ -256,7 +252,7 @@ def find_aprilgrid(
         worst = fitting.ids[4 * int(off.argmax())] // 4
         unused.append(f"tag {layout.tags[worst][1]} lies off the board's plane")
         fitting = fitting.rows(fitting.ids // 4 != worst)
-    if _off(fitting, camera).max() > MAX_OFF_SHARE:
+    if off.max() > MAX_OFF_SHARE:
         return None, _why_off(view, board, camera)
     return replace(fitting, unused=tuple(unused)), ""
 

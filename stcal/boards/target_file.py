@@ -103,6 +103,9 @@ def _kind_of_face(face: Any) -> str:
     return "<printed>" if isinstance(face, dict) and ("board" in face or "tags" in face) else "<circles>"
 
 
+_FaceFile = Annotated[_CirclesFile, Tag("<circles>")] | Annotated[_PrintedFile, Tag("<printed>")]
+
+
 class _ScaleFile(Strict):
     first: str = Field(alias="from")
     second: str = Field(alias="to")
@@ -114,12 +117,7 @@ class _ScaleFile(Strict):
 class _TargetFile(Sized):
     name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
     polarity: Polarity
-    face: list[
-        Annotated[
-            Annotated[_CirclesFile, Tag("<circles>")] | Annotated[_PrintedFile, Tag("<printed>")],
-            Discriminator(_kind_of_face),
-        ]
-    ] = Field(min_length=1)
+    face: list[Annotated[_FaceFile, Discriminator(_kind_of_face)]] = Field(min_length=1)
     scale: list[_ScaleFile] = Field(default=[])
 
     @model_validator(mode="before")

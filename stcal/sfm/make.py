@@ -179,7 +179,7 @@ def unnamed_cases(
     ellipses = {face.id: _seen(face, target, camera, distance_mm) for face in target.faces}
     for done, (face, hidden_rows) in enumerate(cases, 1):
         visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
-        readings, _ = find_faces(Candidates.of(ellipses[face.id].select(visible), camera), target)
+        readings, _ = find_faces(Candidates(ellipses[face.id].select(visible), camera), target)
         right = [reading for reading in readings if reading.face == face.id and len(readings) == 1]
         named = {pair for r in right for pair in zip(r.circles.tolist(), r.rows.tolist(), strict=True)}
         if named != {(circle, row) for row, circle in enumerate(visible.tolist())}:

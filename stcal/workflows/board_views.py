@@ -157,7 +157,7 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
     """Returns the circles' radius, mm, as a median, by the distance of neighbours; None without circles."""
-    candidates = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
+    candidates = Candidates(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
     if len(candidates) < len(board.xy_mm()) * MIN_SHARE:
         return None
     near = candidates.tree.query(candidates.xy, k=NEAREST + 1)[1][:, 1:]

@@ -128,7 +128,7 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(face
     rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
 
     def named(design: TargetDesign) -> dict[int, float]:
-        return wrong_sizes(BodyCorners.of(noisy, design.faces), rough)[0]
+        return wrong_sizes(BodyCorners(noisy, design.faces), rough)[0]
 
     assert named(CUBE) == {}
     drawn = list(CUBE.faces)

@@ -70,12 +70,12 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
         faces = [(each, target.face(each.face)) for each in sightings]
         views = [view(f.id, each.labels(f), f.xy_mm[each.circles], each.rows, named=named) for each, f in faces]
         readings.append([*chain.from_iterable(views)])
-    boards = () if board is None or BOARD in detection.repeated else detection.boards
-    for each, places_mm in ((each, board.places_mm) for each in boards if board is not None):
-        likely, views = len(each.numberings), []
-        for k, cells in enumerate((*each.numberings, *each.unlikely)):
+    for sighting in detection.boards if board is not None and BOARD not in detection.repeated else ():
+        likely, views = len(sighting.numberings), []
+        for k, cells in enumerate((*sighting.numberings, *sighting.unlikely)):
             labels = [DotLabel(*cell) for cell in cells.tolist()]
-            views.append(view(BOARD, labels, places_mm(labels)[:, :2], each.rows, likely=k < likely))
+            places_mm = board.places_mm(labels)[:, :2]  # type: ignore[union-attr]
+            views.append(view(BOARD, labels, places_mm, sighting.rows, likely=k < likely))
         if all(views[:likely]):
             readings.append([*chain.from_iterable(views)])
     return [views for views in readings if views]
@@ -206,8 +206,8 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
     by_convention = view.plane == BOARD and alternatives > 1
     while True:
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
-        pose = view.camera_from_plane @ known[view.plane].inverse()
-        placed[seed] = pose, [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
+        agreed, _ = _agreeing(others, view.camera_from_plane, known, reach_mm, {view.plane})
+        placed[seed] = view.camera_from_plane, [view, *agreed]
         new = _new_planes(images, placed, known, reach_mm)
         if not new:
             break
@@ -306,8 +306,8 @@ def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: floa
         accepted = []
         for view in agreed:
             xyz = pose @ (found.group_from_plane[view.plane] @ view.xyz_mm())
-            off_mm = np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)
-            accepted += [view] * bool(np.median(off_mm) < MAX_OFF_PITCHES * step_mm)
+            if np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)) < MAX_OFF_PITCHES * step_mm:
+                accepted.append(view)
         taken = {id(each) for each in (*accepted, *ambiguous)}
         elsewhere = [r for r in images[i] if taken.isdisjoint(map(id, (r, *r)))]
         views[i] = tuple(accepted)
@@ -330,9 +330,8 @@ def read_groups(
         return [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
 
     found = readings(board)
-    if board is None or (sized := _in_scale(found, board)) is board:
-        return found, board
-    return readings(sized), sized
+    sized = board and _in_scale(found, board)
+    return found if sized is board else readings(sized), sized
 
 
 def _in_scale(groups: Sequence[Sequence[Sequence[Readings]]], board: BoardDesign) -> BoardDesign:

@@ -2,6 +2,7 @@
 found in an image, before it is compared with its group."""
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, field
 
 import cv2
@@ -201,12 +202,11 @@ def _ellipse(
 def distinct(image: np.ndarray, polarity: Polarity, table: np.ndarray, threshold: float) -> Ellipses:
     """Returns the ellipses of rows (x, y, full axes 1 and 2, angle of axis 1 in deg) of enough contrast. Of coincident
     rows the first, from the finest level, is kept."""
-    if len(table):
-        centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
-        pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-        smaller, larger = np.sort(radius[pairs], axis=1).T
-        near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
-        table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
+    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
+    pairs = KDTree(centre).query_pairs(0.5 * radius.max(initial=0), output_type="ndarray")
+    smaller, larger = np.sort(radius[pairs], axis=1).T
+    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+    table = np.delete(table, pairs[near & (smaller > 0.75 * larger), 1], axis=0)
     angle = np.radians(table[:, 4])
     axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
     shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
@@ -221,31 +221,28 @@ MAX_AXIS_RATIO = 1.45  # largest ratio between the predicted and the found ellip
 MIN_HOMOGRAPHY_POINTS = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """n ellipses in normalised ideal coordinates."""
+    """n ellipses in normalised ideal coordinates. Lens distortion is removed from centres exactly, from shapes to first
+    order."""
 
-    xy: np.ndarray  # (n, 2) centres
-    shape: np.ndarray  # (n, 2, 2), rim = xy + shape @ unit circle
-    radius: np.ndarray  # (n,) of equal area
-    contrast: np.ndarray  # (n,) grey values
-    px: float  # size of a pixel in these coordinates
     tree: KDTree  # over ``xy``
 
-    @classmethod
-    def of(cls, ellipses: Ellipses, camera: Camera) -> "Candidates":
-        """Removes lens distortion from centres exactly, from shapes to first order."""
-        xy = camera.normalised_from_pixel(ellipses.centre_px)
-        _, distorted_by_ideal = camera.distort_jacobian(xy)
-        shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
-        radius = np.sqrt(np.abs(np.linalg.det(shape))) if len(xy) else np.zeros(0)
-        return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), KDTree(xy))
+    def __init__(self, ellipses: Ellipses, camera: Camera):
+        self.xy = camera.normalised_from_pixel(ellipses.centre_px)  # (n, 2) centres
+        _, distorted_by_ideal = camera.distort_jacobian(self.xy)
+        # (n, 2, 2), rim = xy + shape @ unit circle
+        self.shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
+        self.radius = np.sqrt(np.abs(np.linalg.det(self.shape)))  # (n,) of equal area
+        self.contrast = ellipses.contrast  # (n,) grey values
+        self.px = 1 / float(np.sqrt(camera.focal.prod()))  # size of a pixel in these coordinates
+        self.tree = KDTree(self.xy)
 
     def mirrored(self) -> "Candidates":
         """Returns the mirror image of the candidates, with reversed x."""
-        flip = np.array([-1.0, 1.0])
-        xy = self.xy * flip
-        return Candidates(xy, flip[:, None] * self.shape * flip, self.radius, self.contrast, self.px, KDTree(xy))
+        found, flip = copy(self), np.array([-1.0, 1.0])
+        found.xy, found.shape = self.xy * flip, flip[:, None] * self.shape * flip
+        found.tree = KDTree(found.xy)
+        return found
 
     def __len__(self) -> int:
         return len(self.xy)

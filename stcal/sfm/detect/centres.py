@@ -16,11 +16,8 @@ RIM_CLEARANCE_PX = 1.5
 
 def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns the monomials up to third degree, (10, ...)."""
-    found = np.empty((10, *x.shape), x.dtype)
-    found[0], found[1], found[2] = 1, x, y
-    found[3], found[4], found[5] = x * x, x * y, y * y
-    found[6], found[7], found[8], found[9] = found[3] * x, found[3] * y, x * found[5], found[5] * y
-    return found
+    xx, yy = x * x, y * y
+    return np.stack([np.ones_like(x), x, y, xx, x * y, yy, xx * x, xx * y, x * yy, yy * y])
 
 
 def local_ideal_maps(camera: Camera, centre_px: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -73,13 +70,7 @@ def near_rim(
     a, b = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
     square = a * a + b * b
     slope_x, slope_y = inverse[0, 0] * a + inverse[1, 0] * b, inverse[0, 1] * a + inverse[1, 1] * b
-    slope_x *= slope_x
-    slope_y *= slope_y
-    slope_x += slope_y
-    slope_x *= np.float32(width**2)
-    square -= np.sqrt(square)
-    square *= square
-    chosen = square < slope_x
+    chosen = (square - np.sqrt(square)) ** 2 < (slope_x**2 + slope_y**2) * np.float32(width**2)
     for place, shape in beside:
         x, y = dx - np.float32(place[0]), dy - np.float32(place[1])
         chosen &= (shape[0, 0] * x + shape[0, 1] * y) ** 2 + (shape[1, 0] * x + shape[1, 1] * y) ** 2 > 1
@@ -124,7 +115,7 @@ class Fits:
         m = self.jacobian @ ellipses.shape_px
         value, vector = np.linalg.eigh(m @ np.swapaxes(m, 1, 2))
         self.inverse_shape = (vector / np.sqrt(value)[:, None]) @ np.swapaxes(vector, 1, 2)
-        self.start = self.centre = self.selected = to_ideal[:, :, 0]
+        self.start, self.centre, self.selected = (to_ideal[:, :, 0].copy() for _ in range(3))
         self.radius = np.prod(value, axis=1) ** 0.25
         self.blur, self.band = np.full(n, START_BLUR_PX), np.full(n, np.inf)
         self.levels = np.zeros((n, PARAMETERS - 6 + 4 * len(WAVES)), np.float32)
@@ -162,13 +153,10 @@ class Fits:
         more = (0, 4 * len(WAVES))
         self.scores = np.pad(self.scores, ((0, 0), more, (0, 0)))
         self.inverse = np.pad(self.inverse, ((0, 0), more, more))
-        before = self.centre
+        before = self.centre.copy()
         self.unlevelled |= inside | outside
-        for waves, own in (
-            ((True, False), inside & outside),
-            ((True,), inside & ~outside),
-            ((False,), outside & ~inside),
-        ):
+        sides = ((True, False), inside & outside), ((True,), inside & ~outside), ((False,), outside & ~inside)
+        for waves, own in sides:
             active = np.flatnonzero(own)
             for _ in range(WAVE_STEPS):
                 move = self._step(active, robust=True, waves=waves)
@@ -218,20 +206,17 @@ class Fits:
         wanted = np.maximum(BAND_PX, BAND_BLURS * self.blur[active])
         moved = np.abs(self.centre[active] - self.selected[active]).max(1)
         anew = (moved > RESELECT_PX) | (np.abs(wanted / self.band[active] - 1) > RESELECT_BAND)
-        if not anew.any():
-            return active
         chosen = active[anew]
-        self.band[chosen] = wanted[anew]
-        self.selected = np.where(np.isin(np.arange(len(self.blur)), chosen)[:, None], self.centre, self.selected)
+        self.band[chosen], self.selected[chosen] = wanted[anew], self.centre[chosen]
         for i in chosen.tolist():
             centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
             on_unit, width = self.inverse_shape[i] @ self.jacobian[i], float(self.band[i])
             self.rows[i], self.columns[i] = near_rim(self.offset[i], on_unit, centre, width, self.intruders[i])
-        self._widen(max(map(len, self.rows)))
+        self._widen(max(map(len, self.rows), default=0))
         for i in chosen.tolist():
             self._take(i)
         self.unlevelled[chosen] = True
-        few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active])
+        few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active], bool)
         self.failed[active[few]] = True
         return active[~few]
 
@@ -250,8 +235,7 @@ class Fits:
         n = len(rows)
         dx, dy = self.offset[i]
         x, y = dx[columns] / np.float32(self.half[i, 0]), dy[rows, 0] / np.float32(self.half[i, 1])
-        (left, top), (right, bottom) = self.low[i], self.high[i]
-        self.grey[i, :n] = self.image[top:bottom, left:right][rows, columns]
+        self.grey[i, :n] = self.image[rows + self.low[i, 1], columns + self.low[i, 0]]
         self.ideal[i, :, :n] = self.to_ideal[i, :, 1:].astype(np.float32) @ monomials(x, y)[1:]
         self.ideal[i, :, n:] = [[self.radius[i]], [0]]
         self.real[i], self.weight[i] = np.arange(self.real.shape[1]) < n, self.real[i]
@@ -308,10 +292,7 @@ class Fits:
         weighted = jacobian * weight[:, None]
         inverse = _inverses((weighted @ np.swapaxes(jacobian, 1, 2)).astype(float))
         step = (inverse @ (weighted @ residual[..., None]))[..., 0]
-        if len(active) == len(self.blur) and count == self.scores.shape[1]:
-            self.scores, self.inverse = weighted, inverse
-        else:
-            self.scores[selection, :count], self.inverse[selection, :count, :count] = weighted, inverse
+        self.scores[selection, :count], self.inverse[selection, :count, :count] = weighted, inverse
         self.residual[selection], self.weight[selection] = residual, weight
         self.reduced[selection], self.on_unit[selection] = reduced, on_unit
         return self._apply(active, step, levels)
@@ -323,11 +304,9 @@ class Fits:
         good = np.isfinite(step).all(1) & (xx * yy > xy * xy) & (xx + yy > 0)
         own, step = active[good], step[good]
         self.inverse_shape[own] = matrix[good]
-        self.centre = self.centre.copy()
         self.centre[own] += step[:, :2]
         blur = self.blur[own]
-        blur = blur + np.minimum(np.maximum(step[:, 5], -0.4 * blur), 0.6 * blur)
-        self.blur[own] = np.minimum(np.maximum(blur, BLUR_LIMITS_PX[0]), BLUR_LIMITS_PX[1])
+        self.blur[own] = np.clip(blur + np.clip(step[:, 5], -0.4 * blur, 0.6 * blur), *BLUR_LIMITS_PX)
         self.levels[own, : levels.shape[1]] = levels[good] + step[:, 6:]
         move = np.full(len(active), np.nan)
         move[good] = np.abs(step[:, :2]).max(1)

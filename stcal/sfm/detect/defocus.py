@@ -41,20 +41,10 @@ class Focus:
     note: str = ""  # blur that defocus does not explain, in words
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Blurs:
-    """The n circles of one image whose plane has a pose."""
+    """The n circles of one image with a blur, of planes that have enough of them for a pose."""
 
-    rows: np.ndarray
-    inverse_depth: np.ndarray  # 1/mm
-    gradient: np.ndarray  # (n, 2) of the inverse depth by the ideal image coordinates, 1/(mm·px)
-    blur2: np.ndarray  # px²
-    response: np.ndarray  # of the centre, as a share, as its ``sigma``
-    sigma: np.ndarray
-
-    @classmethod
-    def of(cls, image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> "_Blurs":
-        """Returns the circles with a blur, of planes that have enough of them for a pose."""
+    def __init__(self, image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float):
         planes = np.where(image.blur_px > 0, np.array([label.plane for label in image.labels], str), "")
         rows, inverse_depth, gradient = [np.zeros(0, int)], [np.zeros(0)], [np.zeros((0, 2))]
         for plane in (plane for plane in dict.fromkeys(planes.tolist()) if plane in patterns):
@@ -66,59 +56,47 @@ class _Blurs:
                 rows.append(members)
                 inverse_depth.append(np.pad(xy, ((0, 0), (0, 1)), constant_values=1) @ normal)
                 gradient.append(np.tile(normal[:2] / focal_px, (len(xy), 1)))
-        chosen = np.concatenate(rows)
-        blur2 = image.blur_px[chosen] ** 2
-        wide2 = blur2 / (np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px) ** 2
-        return cls(
-            chosen,
-            np.concatenate(inverse_depth),
-            np.concatenate(gradient),
-            blur2,
-            RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0),
-            np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA),
-        )
+        self.rows, self.inverse_depth = np.concatenate(rows), np.concatenate(inverse_depth)  # 1/mm
+        self.gradient = np.concatenate(gradient)  # (n, 2) of it by the ideal image coordinates, 1/(mm·px)
+        self.blur2 = image.blur_px[self.rows] ** 2  # px²
+        smaller = np.linalg.svd(image.shape[self.rows], compute_uv=False)[:, 1] * focal_px
+        wide2 = self.blur2 / smaller**2
+        self.response = RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0)  # of the centre, as a share
+        self.sigma = np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA)  # of the response, likewise
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Law:
     """Law of the squared blur: c₀ + c₁ u + c₂ u², u the inverse depth about its mean, ``about``, in units of ``unit``.
-    This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil (thin lens)."""
+    This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil (thin lens). By robust least
+    squares; ``curvature`` : mean and variance of that of other images."""
 
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    about: float
-    unit: float
-    scatter: float  # robust σ of the residuals, px²
-    plain: float  # the same about a constant
-    significant: bool  # whether depth explains the blur better than a constant does
-
-    @classmethod
-    def of(cls, own: _Blurs, unit: float, curvature: tuple[float, float] | None = None) -> "_Law":
-        """Returns the law of one image by robust least squares; ``curvature`` : mean and variance of that of others."""
-        about = float(own.inverse_depth.mean())
-        rows = np.vander((own.inverse_depth - about) / unit, 3, increasing=True)
-        coefficients, inverse, scatter = _fitted(rows, own.blur2, curvature)
+    def __init__(self, own: _Blurs, unit: float, curvature: tuple[float, float] | None = None):
+        self.own, self.unit, self.about = own, unit, float(own.inverse_depth.mean())
+        rows = np.vander((own.inverse_depth - self.about) / unit, 3, increasing=True)
+        self.coefficients, self.covariance, self.scatter = _fitted(rows, own.blur2, curvature)
         from_median = np.abs(own.blur2 - np.median(own.blur2))
-        plain = float(robust_sigma(from_median))
-        residual = np.minimum(np.abs(own.blur2 - rows @ coefficients), 3 * max(scatter, 1e-12))
+        self.plain = float(
+            robust_sigma(from_median)
+        )  # as ``scatter``, the robust σ of residuals, about a constant, px²
+        residual = np.minimum(np.abs(own.blur2 - rows @ self.coefficients), 3 * max(self.scatter, 1e-12))
         freedom, square = len(rows) - 3, float((residual**2).sum())
-        gain = float((np.minimum(from_median, 3 * max(plain, 1e-12)) ** 2).sum()) - square
-        significant = gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * square / freedom
-        return cls(coefficients, inverse, about, unit, scatter, plain, bool(significant))
+        gain = float((np.minimum(from_median, 3 * max(self.plain, 1e-12)) ** 2).sum()) - square
+        # whether depth explains the blur better than a constant does
+        self.significant = bool(gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * square / freedom)
 
-    def slope(self, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slope(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the derivative of the squared blur by the inverse depth, px²·mm, and its σ."""
-        u = (inverse_depth - self.about) / self.unit
+        u = (self.own.inverse_depth - self.about) / self.unit
         by = np.stack([np.zeros_like(u), np.ones_like(u), 2 * u], axis=1) / self.unit
         return by @ self.coefficients, np.sqrt(np.einsum("ni,ij,nj->n", by, self.covariance, by))
 
-    def focus(self, image: str, own: _Blurs, shift_px: float) -> Focus:
+    def focus(self, image: str, shift_px: float) -> Focus:
         """Returns the blur of the image in depth, with the largest correction of a centre."""
         (_, slope, curvature), sigma = self.coefficients, float(np.sqrt(self.covariance[2, 2]))
-        near, far = own.inverse_depth.max(), own.inverse_depth.min()
+        near, far = self.own.inverse_depth.max(), self.own.inverse_depth.min()
         u = (np.array([near, far]) - self.about) / self.unit
         first, last = np.sqrt(np.maximum(np.vander(u, 3, increasing=True) @ self.coefficients, 0.0)).tolist()
-        spread, note = float(np.ptp(np.percentile(np.sqrt(own.blur2), [5, 95]))), ""
+        spread, note = float(np.ptp(np.percentile(np.sqrt(self.own.blur2), [5, 95]))), ""
         odd = self.significant and curvature < -3 * sigma
         if spread > TOLD_PX and (odd or self.scatter > MAX_UNEXPLAINED * self.plain):
             why = "motion, a curved plane of focus or dirt on the lens; centres may be off by more than their σ"
@@ -131,27 +109,29 @@ class _Law:
 
 def correct_defocus(
     images: Sequence[ImageObservations], camera: Camera, patterns: Mapping[str, Pattern]
-) -> tuple[list[ImageObservations], tuple[Focus, ...]]:
-    """Returns the images with centres at which a lens with the same blur everywhere would show them, and their blur.
-    Out of focus, blur varies across a tilted circle, and its fit with one blur moves towards the blurrier side.
-    ``patterns``: of the faces and the board, by the plane of a label."""
+) -> tuple[list[ImageObservations], list[Focus | None]]:
+    """Returns the images with centres at which a lens with the same blur everywhere would show them, and their blur,
+    None where too few circles tell it. Out of focus, blur varies across a tilted circle, and its fit with one
+    blur moves towards the blurrier side. ``patterns``: of the faces and the board, by the plane of a label."""
     focal_px = float(np.sqrt(camera.focal.prod()))
-    views = [_Blurs.of(image, patterns, focal_px) for image in images]
-    corrected, focus = list(images), []
-    for i, (image, own, law) in enumerate(zip(images, views, _laws(views), strict=True)):
-        if law is not None:
-            corrected[i], shift_px = _moved(image, own, law, camera, focal_px) if law.significant else (image, 0.0)
-            focus.append(law.focus(image.name, own, shift_px))
-    return corrected, tuple(focus)
+    corrected: list[ImageObservations] = list(images)
+    focus: list[Focus | None] = [None] * len(images)
+    for i, law in _laws([_Blurs(image, patterns, focal_px) for image in images]).items():
+        shift_px = 0.0
+        if law.significant:
+            corrected[i], shift_px = _moved(images[i], law, camera, focal_px)
+        focus[i] = law.focus(images[i].name, shift_px)
+    return corrected, focus
 
 
-def _laws(views: Sequence[_Blurs]) -> list[_Law | None]:
-    """Returns the law of each image, None of those with too few circles. Each a² is drawn towards the mean of all by as
-    much as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7)."""
+def _laws(views: Sequence[_Blurs]) -> dict[int, _Law]:
+    """Returns the laws of the images with enough circles. Each a² is drawn towards the mean of all by as much as their
+    scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7)."""
     enough = {i: circles for i, circles in enumerate(views) if len(circles.rows) >= MIN_CIRCLES}
-    unit = float(np.median([np.ptp(circles.inverse_depth) for circles in enough.values()])) if enough else 1.0
-    unit = unit if unit > 0 else 1.0
-    laws = {i: _Law.of(circles, unit) for i, circles in enough.items()}
+    if not enough:
+        return {}
+    unit = float(np.median([np.ptp(circles.inverse_depth) for circles in enough.values()])) or 1.0
+    laws = {i: _Law(circles, unit) for i, circles in enough.items()}
     curvature = np.array([law.coefficients[2] for law in laws.values()])
     variance = np.array([law.covariance[2, 2] for law in laws.values()])
     if len(enough) >= 3 and (variance > 0).all():
@@ -161,8 +141,8 @@ def _laws(views: Sequence[_Blurs]) -> list[_Law | None]:
         between = max(0.0, excess / (weight.sum() - (weight**2).sum() / weight.sum()))
         weight = 1 / (variance + between)
         prior = float((weight * curvature).sum() / weight.sum()), between + 1 / float(weight.sum())
-        laws = {i: _Law.of(circles, unit, prior) for i, circles in enough.items()}
-    return [laws.get(i) for i in range(len(views))]
+        laws = {i: _Law(circles, unit, prior) for i, circles in enough.items()}
+    return laws
 
 
 def _fitted(
@@ -185,11 +165,9 @@ def _fitted(
     return coefficients, inverse, scatter
 
 
-def _moved(
-    image: ImageObservations, own: _Blurs, law: _Law, camera: Camera, focal_px: float
-) -> tuple[ImageObservations, float]:
+def _moved(image: ImageObservations, law: _Law, camera: Camera, focal_px: float) -> tuple[ImageObservations, float]:
     """Returns the image with corrected centres, and the largest correction, px."""
-    slope, slope_sigma = law.slope(own.inverse_depth)
+    own, (slope, slope_sigma) = law.own, law.slope()
     by_slope = own.response[:, None] * own.gradient
     shift = slope[:, None] * by_slope
     variance = slope_sigma**2 + (own.sigma * slope) ** 2

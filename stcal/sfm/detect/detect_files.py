@@ -8,7 +8,6 @@ share the folder, as ``detect`` and ``run`` do, detect nothing twice, whatever t
 import hashlib
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -336,15 +335,10 @@ def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, 
     if len(set(kinds)) < 2:
         return
     places = [np.floor(each.detection.centres.centre_px / SAME_PLACE_PX).astype(int) for each in images]
-    cells = [set(map(tuple, each.tolist())) for each in places]
-    images_of: dict[tuple, list[int]] = {}
-    for i, own in enumerate(cells):
-        for cell in own:
-            images_of.setdefault(cell, []).append(i)
-    common = Counter(pair for seen in images_of.values() for pair in combinations(seen, 2))
-    for (i, j), count in sorted(common.items()):
-        if kinds[i] != kinds[j] and count >= SAME_SHARE * min(len(cells[i]), len(cells[j])):
-            yield images[i], images[j]
+    squares = [set(map(tuple, each.tolist())) for each in places]
+    for (first, kind, own), (second, other_kind, other) in combinations(zip(images, kinds, squares, strict=True), 2):
+        if kind != other_kind and len(own & other) >= max(1, SAME_SHARE * min(len(own), len(other))):
+            yield first, second
 
 
 def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None = None) -> None:

@@ -3,7 +3,6 @@ which is extended to all circles of a face. A face is named only if one reading 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 
@@ -30,42 +29,19 @@ MAX_SIZE_RATIO = 1.25
 """Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pairs:
-    """p distinct pairs of neighbouring circles of a design, each with the s circles nearest to the first."""
-
-    offset: np.ndarray  # (p, s, 2) places relative to the first
-    radius: np.ndarray  # (p, s)
-    there: np.ndarray  # (p, s) mask, as small faces have fewer circles
-    second: np.ndarray  # (p,) index of the pair's second circle
-    uses: np.ndarray  # (p + 1,) start of each pair's rows in the next two
-    face: np.ndarray  # (u,) number of the face
-    circles: np.ndarray  # (u, s) numbers of the circles in it, −1 if there is none
-    face_xy: np.ndarray  # (f, m, 2) all circles of the f faces, mm
-    face_radius: np.ndarray  # (f, m), 0 behind the last circle of a face
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Starts:
-    """n hypotheses, the best supported first."""
+    """n hypotheses, the best supported first: first outline (n,), number of the face (n,), ``circles`` (n, s) of this
+    face, and ``candidates`` (n, s) that match them, −1 if there is none."""
 
-    origin: np.ndarray  # (n,) first outline
-    face: np.ndarray  # (n,) number of the face
-    circles: np.ndarray  # (n, s) of this face
-    candidates: np.ndarray  # (n, s) that match these circles, −1 if there is none
-    rows: dict[tuple[int, int, int], np.ndarray]  # by face, circle and candidate
-
-    @classmethod
-    def of(cls, origin: np.ndarray, face: np.ndarray, circles: np.ndarray, candidates: np.ndarray) -> "_Starts":
-        """Returns the hypotheses, listed by each match of a circle with a candidate."""
+    def __init__(self, origin: np.ndarray, face: np.ndarray, circles: np.ndarray, candidates: np.ndarray):
+        self.origin, self.face, self.circles, self.candidates = origin, face, circles, candidates
         row, column = np.nonzero(candidates >= 0)
         keys = np.stack([face[row], circles[row, column], candidates[row, column]])
         order = np.lexsort(keys[::-1])
         keys, row = keys[:, order], row[order]
         begin = np.flatnonzero(np.diff(keys, prepend=-1).any(0))
-        matches = zip(*keys[:, begin].tolist(), strict=True)
-        rows = dict(zip(matches, np.split(row, begin)[1:], strict=True))
-        return cls(origin, face, circles, candidates, rows)
+        matches = zip(*keys[:, begin].tolist(), strict=True)  # of face, circle and candidate
+        self.rows = dict(zip(matches, np.split(row, begin)[1:], strict=True))
 
     def agree(self, face: int, index: np.ndarray) -> np.ndarray:
         """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
@@ -94,33 +70,37 @@ class _Starts:
         return chosen
 
 
-@lru_cache(maxsize=8)
-def _pairs(target: TargetDesign) -> _Pairs:
-    faces, most = target.faces, max(len(face.ids) for face in target.faces)
-    width = min(SUPPORT + 2, most)
-    uses_of: dict[tuple, list[tuple[int, np.ndarray]]] = {}
-    for number, face in enumerate(faces):
-        distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
-        for nearest in np.argsort(distance, axis=1, kind="stable")[:, :width]:
-            offset = np.round(face.xy_mm[nearest] - face.xy_mm[nearest[0]], 6)
-            same = (*offset.ravel(), *np.round(face.radius_mm[nearest], 6))
-            for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
-                uses_of.setdefault((second, *same), []).append((number, nearest))
-    firsts = [(faces[number], nearest, width - len(nearest)) for (number, nearest), *_ in uses_of.values()]
-    every = [
-        (number, np.pad(c, (0, width - len(c)), constant_values=-1)) for use in uses_of.values() for number, c in use
-    ]
-    return _Pairs(
-        np.array([np.pad(f.xy_mm[c] - f.xy_mm[c[0]], ((0, more), (0, 0))) for f, c, more in firsts]),
-        np.array([np.pad(f.radius_mm[c], (0, more), constant_values=1.0) for f, c, more in firsts]),
-        np.array([np.arange(width) < len(c) for _, c, _ in firsts]),
-        np.array([second for second, *_ in uses_of], int),
-        np.cumsum([0, *map(len, uses_of.values())]),
-        np.array([number for number, _ in every], int),
-        np.array([circles for _, circles in every]),
-        np.array([np.pad(f.xy_mm, ((0, most - len(f.ids)), (0, 0)), "wrap") for f in faces]),
-        np.array([np.pad(f.radius_mm, (0, most - len(f.ids))) for f in faces]),
-    )
+class _Pairs:
+    """p distinct pairs of neighbouring circles of a design, each with the s circles nearest to the first."""
+
+    def __init__(self, target: TargetDesign):
+        faces, most = target.faces, max(len(face.ids) for face in target.faces)
+        width = min(SUPPORT + 2, most)
+        uses_of: dict[tuple, list[tuple[int, np.ndarray]]] = {}
+        for number, face in enumerate(faces):
+            distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+            for nearest in np.argsort(distance, axis=1, kind="stable")[:, :width]:
+                offset = np.round(face.xy_mm[nearest] - face.xy_mm[nearest[0]], 6)
+                same = (*offset.ravel(), *np.round(face.radius_mm[nearest], 6))
+                for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
+                    uses_of.setdefault((second, *same), []).append((number, nearest))
+        firsts = [(faces[number], nearest, width - len(nearest)) for (number, nearest), *_ in uses_of.values()]
+        # (p, s, 2) places relative to the first, (p, s) radii, and a mask, as small faces have fewer circles
+        self.offset = np.array([np.pad(f.xy_mm[c] - f.xy_mm[c[0]], ((0, more), (0, 0))) for f, c, more in firsts])
+        self.radius = np.array([np.pad(f.radius_mm[c], (0, more), constant_values=1.0) for f, c, more in firsts])
+        self.there = np.array([np.arange(width) < len(c) for _, c, _ in firsts])
+        self.second = np.array([second for second, *_ in uses_of], int)  # (p,) index of the pair's second circle
+        self.uses = np.cumsum([0, *map(len, uses_of.values())])  # (p + 1,) start of each pair's rows in the next two
+        every = [use for uses in uses_of.values() for use in uses]
+        self.face = np.array([number for number, _ in every], int)  # (u,) number of the face
+        # (u, s) numbers of the circles in it, −1 if there is none
+        self.circles = np.array([np.pad(c, (0, width - len(c)), constant_values=-1) for _, c in every])
+        # (f, m, 2) and (f, m): all circles of the f faces, mm; a radius of 0 is behind the last circle of a face
+        self.face_xy = np.array([np.pad(f.xy_mm, ((0, most - len(f.ids)), (0, 0)), "wrap") for f in faces])
+        self.face_radius = np.array([np.pad(f.radius_mm, (0, most - len(f.ids))) for f in faces])
+
+
+_pairs = lru_cache(maxsize=8)(_Pairs)
 
 
 def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceSighting], list[OpenFace]]:
@@ -128,14 +108,14 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
     name. A face in view twice occurs twice; the mirror image of a face may look like another one."""
     readings: list[FaceSighting] = []
     if len(candidates) < MIN_NAMING or not target.faces:
-        return _decide(readings, target)
+        return [], []
     starts, tries = _hypotheses(candidates, target), np.zeros(len(candidates), int)
     is_open, explained = np.ones(len(starts.origin), bool), np.zeros(len(candidates), bool)
     grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
     for rank, first in enumerate(starts.origin.tolist()):
         if rank == FIRST_HYPOTHESES:
             for reading in readings:
-                explained[reading.rows] |= len(reading.rows) >= needed_circles(target.face(reading.face))
+                explained[reading.rows] = True
         if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
             continue
         tries[first] += rank >= FIRST_HYPOTHESES
@@ -150,8 +130,10 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
         depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
         if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
             index = _of_one_size(candidates, face, *match)
-            readings.append(FaceSighting(face.id, index[index >= 0], np.flatnonzero(index >= 0)))
             is_open[starts.agree(number, index)] = False
+            circles = np.flatnonzero(index >= 0)
+            if len(circles) >= min(MIN_NAMING, len(face.ids)):
+                readings.append(FaceSighting(face.id, index[circles], circles))
     return _decide(readings, target)
 
 
@@ -192,7 +174,7 @@ def _hypotheses(candidates: Candidates, target: TargetDesign) -> _Starts:
     supported, origin = supported[best], origin[best]
     begin, count = pairs.uses[pair[supported]], np.diff(pairs.uses)[pair[supported]]
     use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
-    return _Starts.of(
+    return _Starts(
         np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[supported], count, axis=0)
     )
 
@@ -243,15 +225,9 @@ def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, ho
     return np.where((ratio < middle * allowed) & (ratio * allowed > middle), index, -1)
 
 
-def needed_circles(face: FaceDesign) -> int:
-    """Returns the smallest number of circles for a reading of the face."""
-    return min(MIN_NAMING, len(face.ids))
-
-
 def _decide(readings: list[FaceSighting], target: TargetDesign) -> tuple[list[FaceSighting], list[OpenFace]]:
     """Keeps the readings that explain more circles than every other reading of the same candidates."""
-    readings = [r for r in readings if len(r.rows) >= needed_circles(target.face(r.face))]
-    readings.sort(key=lambda r: -len(r.rows))
+    readings = sorted(readings, key=lambda r: -len(r.rows))
     named: list[FaceSighting] = []
     refused: list[OpenFace] = []
     settled: set[int] = set()

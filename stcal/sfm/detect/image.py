@@ -1,7 +1,7 @@
 """Detection in one image: candidates → board → faces → centres. Decisions that need the group stay open."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -34,22 +34,43 @@ FAINT = 0.25  # share of the required contrast that is used if an image shows to
 MAX_FREE = 400  # number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class ImageReading:
-    """Interpretation of the outlines in one image, before their centres are measured."""
+    """Interpretation of the outlines in one 8-bit image, before their centres are measured; as :func:`read_image`."""
 
-    found: dict[Polarity, Ellipses]
-    boards: tuple[BoardSighting, ...]  # the one with the most dots first
-    free: Ellipses  # the largest ``MAX_FREE`` outlines of the target's polarity outside of boards
-    faces: list[FaceSighting]
-    unnamed: list[OpenFace]
-    mirrored: tuple[str, ...]  # ids of faces
-    untried: int = 0  # number of outlines beyond ``MAX_FREE``
-    misstated: str = ""  # what of the board's file its dots contradict
-
-    def face_ids(self) -> set[str]:
-        """Returns the ids of the named faces."""
-        return {each.face for each in self.faces}
+    def __init__(
+        self,
+        grey: np.ndarray,
+        camera: Camera,
+        target: TargetDesign,
+        board: BoardDesign | None,
+        options: EllipseOptions,
+        aside: np.ndarray | None,
+    ):
+        polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
+        self.found: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
+        if aside is not None:
+            area = aside.astype(np.float32)
+            for polarity, every in self.found.items():
+                inside = [cv2.pointPolygonTest(area, at, False) > 0 for at in every.centre_px.tolist()]
+                self.found[polarity] = every.select(~np.array(inside, bool))
+        self.boards: list[BoardSighting] = []  # the one with the most dots first
+        self.misstated = ""  # what of the board's file its dots contradict
+        is_free = {p: np.ones(len(e), bool) for p, e in self.found.items()}
+        if board is not None:
+            dots = Candidates(self.found[board.polarity], camera)
+            sightings = find_boards(dots, board, image_corners(camera))
+            self.misstated = contradiction(dots, board, image_corners(camera), sightings)
+            for grid in sightings if not self.misstated else ():
+                self.boards.append(by_rings(grid, board, grey, camera, dots.xy) if board.rings else grid)
+                is_free[board.polarity][grid.rows] = False
+        every, free = self.found[target.polarity], np.flatnonzero(is_free[target.polarity])
+        tried = free[np.sort(np.argsort(-every.radius_px()[free], kind="stable")[:MAX_FREE])]
+        candidates = Candidates(every.select(tried), camera)
+        named, unnamed = find_faces(candidates, target)
+        self.mirrored = find_mirrored(candidates, target, named)  # ids of faces
+        self.faces, self.face_ids = [face.by(tried) for face in named], {face.face for face in named}
+        self.unnamed: list[OpenFace] = [tuple(face.by(tried) for face in faces) for faces in unnamed]
+        self.free = len(free)  # number of outlines of the target's polarity outside of boards
 
 
 def read_image(
@@ -65,38 +86,11 @@ def read_image(
     readings: list[ImageReading] = []
     for share in (1.0, FAINT):
         searched = replace(options, min_contrast=share * options.min_contrast)
-        readings.append(reading := _read_once(grey, camera, target, board, searched, aside))
-        enough = len(reading.face_ids()) >= min(len(target.faces), 1 if board is None else 2)
-        if reading.untried or (enough and (board is None or reading.boards)):
+        readings.append(reading := ImageReading(grey, camera, target, board, searched, aside))
+        enough = len(reading.face_ids) >= min(len(target.faces), 1 if board is None else 2)
+        if reading.free > MAX_FREE or (enough and (board is None or reading.boards)):
             break
-    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
-
-
-def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
-    polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    outlines: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
-    if aside is not None:
-        for polarity, found in outlines.items():
-            inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
-            outlines[polarity] = found.select(~np.array(inside, bool))
-    boards: list[BoardSighting] = []
-    misstated = ""
-    free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
-    if board is not None:
-        dots = Candidates.of(outlines[board.polarity], camera)
-        sightings = find_boards(dots, board, image_corners(camera))
-        misstated = contradiction(dots, board, image_corners(camera), sightings)
-        for found in sightings if not misstated else ():
-            boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
-            free[board.polarity][found.rows] = False
-    all_free = outlines[target.polarity].select(free[target.polarity])
-    ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
-    candidates = Candidates.of(ellipses, camera)
-    faces, unnamed = find_faces(candidates, target)
-    mirrored = find_mirrored(candidates, target, faces)
-    return ImageReading(
-        outlines, tuple(boards), ellipses, faces, unnamed, mirrored, len(all_free) - len(ellipses), misstated
-    )
+    return max(readings, key=lambda each: (len(each.boards) > 0, len(each.face_ids)))
 
 
 def detect_target(
@@ -133,18 +127,17 @@ def detect_image(
             image_from_board = fit_homography(view.xyz_board[:, :2], view.xy_px)
             aside = apply_homography(image_from_board, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
         detection = _detect_circles(image, camera, circles, None if corners else board, options, aside, dots)
-    parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
+    parts, sightings, board_sightings = [detection.centres], [], [*detection.boards]
     for face, view in views.items():
         assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
         extent = np.zeros((len(view), 2, 2))
         centre = camera.normalised_from_pixel(view.xy_px)
+        rows = sum(map(len, parts)) + np.arange(len(view))
         parts.append(Centres.without_rims(view.xy_px, centre, extent, view.covariance_px2))
-        rows = first + np.arange(len(view))
         if face == BOARD and corners is not None:
             board_sightings.append(BoardSighting(rows, corners.numberings(view.ids)))
         else:
             sightings.append(FaceSighting(face, rows, view.ids))
-        first += len(view)
     return replace(
         detection,
         centres=Centres.concatenate(parts),
@@ -166,35 +159,41 @@ def _detect_circles(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
-    free, named, refused = reading.free, reading.faces, reading.unnamed
     of_board = board.polarity if board else target.polarity
-    patterns: list[_Pattern] = []
-    for face in named:
-        patterns.append((target.polarity, free, face.rows, face.labels(target.face(face.face)), (face,)))
-    for faces in refused:
+    # Polarity of a face or board, its rows among the outlines, names for notes, and what it may be.
+    patterns: list[tuple[Polarity, np.ndarray, Sequence[Label | str], Sequence[FaceSighting | BoardSighting]]] = []
+    for face in reading.faces:
+        patterns.append((target.polarity, face.rows, face.labels(target.face(face.face)), (face,)))
+    for faces in reading.unnamed:
         rows = np.unique(np.concatenate([face.rows for face in faces]))
-        patterns.append((target.polarity, free, rows, [NAMELESS] * len(rows), faces))
+        patterns.append((target.polarity, rows, [NAMELESS] * len(rows), faces))
     for grid in reading.boards if dots else ():
-        patterns.append((of_board, reading.found[of_board], grid.rows, [DOT] * len(grid.rows), (grid,)))
-    measured = _measured(grey_fine(image), camera, patterns, reading.found)
+        patterns.append((of_board, grid.rows, [DOT] * len(grid.rows), (grid,)))
+    fine, measured = grey_fine(image), []
+    polarities: dict[Polarity, None] = dict.fromkeys(pattern[0] for pattern in patterns)
+    for polarity in polarities:  # all patterns of one polarity at once
+        own, every = [pattern[1] for pattern in patterns if pattern[0] == polarity], reading.found[polarity]
+        groups = np.repeat(np.arange(len(own)), [len(rows) for rows in own])
+        centres = measure_centres(fine, camera, every.select(np.concatenate(own)), every, groups)
+        measured += [centres.select(groups == k) for k in range(len(own))]
     notes = [reading.misstated] if reading.misstated else []
-    if reading.untried:
-        every, tried = len(free) + reading.untried, f"the {len(free)} largest were tried for faces"
+    if reading.free > MAX_FREE:
+        tried = f"the {MAX_FREE} largest were tried for faces"
         remedy = "keep fine patterns out of view, or raise --min-diameter"
-        notes.append(f"{every} outlines like circles beside the board, {tried}; {remedy}")
+        notes.append(f"{reading.free} outlines like circles beside the board, {tried}; {remedy}")
     parts, sightings = [NO_CENTRES], []
-    for (_, ellipses, rows, names, own), centres in zip(patterns, measured, strict=True):
+    for (polarity, rows, names, own), centres in zip(patterns, measured, strict=True):
         for i in np.flatnonzero(~centres.ok).tolist():
             share = f"{100 * centres.rim[i]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
             why = f"{share}; partly hidden or disturbed, left out"
             if centres.rim[i] >= MIN_RIM:
                 why = "σ of its centre is not determined, left out; check the distortion in the camera file"
             notes.append(f"{names[i]}: {why}")
-        row = np.full(len(ellipses), -1)
+        row = np.full(len(reading.found[polarity]), -1)
         row[rows[centres.ok]] = sum(map(len, parts)) + np.arange(centres.ok.sum())
         parts.append(centres.select(centres.ok))
         sightings.append(tuple(each.by(row) for each in own))
-    first, second = len(named), len(named) + len(refused)
+    first, second = len(reading.faces), len(reading.faces) + len(reading.unnamed)
     return ImageDetection(
         Centres.concatenate(parts),
         tuple(face for (face,) in sightings[:first]),
@@ -204,25 +203,6 @@ def _detect_circles(
         sum(len(e) for e in reading.found.values()),
         tuple(sightings[first:second]),
     )
-
-
-_Pattern = tuple[Polarity, Ellipses, np.ndarray, Sequence[Label | str], tuple[FaceSighting | BoardSighting, ...]]
-"""Polarity of one face or board, candidates, its rows among them, names for notes, and what it may be."""
-
-
-def _measured(
-    image: np.ndarray, camera: Camera, patterns: list[_Pattern], found: dict[Polarity, Ellipses]
-) -> list[Centres]:
-    """Returns the centres of each pattern. All patterns of one polarity are measured at once."""
-    measured: dict[int, Centres] = {}
-    for polarity, every in found.items():
-        members = [i for i, pattern in enumerate(patterns) if pattern[0] == polarity]
-        if members:
-            own = [patterns[i][1].select(patterns[i][2]) for i in members]
-            groups = np.repeat(np.arange(len(members)), [len(each) for each in own])
-            centres = measure_centres(image, camera, Ellipses.concatenate(own), every, groups)
-            measured |= {i: centres.select(groups == k) for k, i in enumerate(members)}
-    return [measured[i] for i in range(len(patterns))]
 
 
 def image_corners(camera: Camera) -> np.ndarray:

@@ -34,7 +34,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ELSEWHERE, FAR_DEG, Centres, ImageObservations, Note
+from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ELSEWHERE, FAR_DEG, Centres, ImageObservations, Note, rows_by
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.arrangement import (
     FOREIGN,
@@ -237,10 +237,8 @@ def _focal_px(camera: Camera) -> float:
 
 
 def _groups(detection: DetectionResult) -> list[list[Named]]:
-    groups: dict[str, list[Named]] = {}
-    for image in detection.images:
-        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
-    return list(groups.values())
+    images = [(image.file.name, image.file.group, image.detection) for image in detection.images]
+    return [[images[i] for i in rows] for rows in rows_by(group for _, group, _ in images).values()]
 
 
 def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
@@ -280,11 +278,9 @@ def without_defocus(
 ) -> list[LabelledImage]:
     """Returns the images with centres corrected for blur that varies across a circle, and what their blur shows."""
     corrected, focus = correct_defocus([image.observations for image in images], camera, patterns)
-    by_name = {own.image: own for own in focus}
-    blurs = [by_name.get(observations.name) for observations in corrected]
     return [
         LabelledImage(observations, (*image.notes, *([blur.note] if blur and blur.note else [])), blur)
-        for image, observations, blur in zip(images, corrected, blurs, strict=True)
+        for image, observations, blur in zip(images, corrected, focus, strict=True)
     ]
 
 

@@ -325,9 +325,8 @@ LEVEL_PX = 9  # side of the square in the small picture whose mean is subtracted
 def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles) -> tuple[tuple[Label, ...], Centres]:
     """Returns the labels and centres of the circles that are found at predicted places in a grey image of any depth."""
     expected = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
-    planes = [label.plane for label in predicted.labels]
-    number = {plane: i for i, plane in enumerate(dict.fromkeys(planes))}
-    found = measure_centres(image, camera, expected, expected, np.array([number[plane] for plane in planes], int))
+    _, plane = np.unique([label.plane for label in predicted.labels], return_inverse=True)
+    found = measure_centres(image, camera, expected, expected, plane)
     contrast, needed = _contrast(found, predicted.polarity)
     seen = np.flatnonzero(found.ok & (contrast >= needed))
     return tuple(predicted.labels[i] for i in seen.tolist()), found.select(seen)

@@ -9,7 +9,7 @@ half of the 45° to the next name. Distances are measured in radii of the circle
 §1.2 does not mention, is found as everywhere in this package.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -45,27 +45,12 @@ ZERO_COSINE = float(np.sin(np.radians(22.5)))
 MAX_MISFIT = 0.25  # largest distance of a circle from its place in the face's plane, in radii
 
 
-@dataclass(frozen=True, slots=True)
 class PublishedPattern:
-    """Pattern of the published rules, by circle ids."""
+    """Pattern of the published rules, by circle ids; an error if the design has another form."""
 
-    origin: str  # of the directions, with the small circles ``a`` and ``b`` beside it
-    a: str
-    b: str
-    c: str  # small circle that names the face, beside ``last``, at ``c_radii`` radii of it
-    last: str
-    # circles along X, Y and the diagonal from the ``origin`` on: (id, distance in steps)
-    lines: tuple[tuple[tuple[str, float], ...], ...]
-    names: dict[tuple[int, int], str]  # face id by (sign of the scalar, of the vector product) with the diagonal
-    step_radii: float  # distance from the origin to ``a`` in radii of the origin
-    c_radii: float
-    small: float  # ratio of the areas of small and large circles
-
-    @classmethod
-    def of(cls, target: TargetDesign) -> "PublishedPattern":
-        """Returns the pattern of a design; an error if it has another form."""
+    def __init__(self, target: TargetDesign):
         try:
-            return cls._of(target)
+            self._read(target)
         except (LookupError, ValueError) as error:
             raise InputError(
                 "E-TARGET-NOT-PUBLISHED",
@@ -75,8 +60,7 @@ class PublishedPattern:
                 "joint or chain",
             ) from error
 
-    @classmethod
-    def _of(cls, target: TargetDesign) -> "PublishedPattern":
+    def _read(self, target: TargetDesign) -> None:
         first, places = target.faces[0], [dict(zip(face.ids, face.xy_mm, strict=True)) for face in target.faces]
         place, radius = places[0], dict(zip(first.ids, first.radius_mm.tolist(), strict=True))
         common = [i for i in first.ids if all(i in other and np.allclose(other[i], place[i]) for other in places)]
@@ -87,19 +71,23 @@ class PublishedPattern:
         large = {i: place[i] for i in common if radius[i] > 0.75 * largest and i != first.origin}
         small = {i: place[i] for i in common if i not in large and i != first.origin}
         lines = [_along(direction, large) for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
-        (a, step_x), (b, step_y) = (_along(direction, small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
+        # ``origin`` of the directions, with the small circles ``a`` and ``b`` beside it
+        (self.a, step_x), (self.b, step_y) = (_along(direction, small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
+        self.origin = first.origin
         if not np.isclose(step_x, step_y) or len(large) != sum(map(len, lines)) or len(small) != 2:
             raise ValueError("its circles lie elsewhere")
-        (c,), last = names_face, lines[2][-1][0]
-        directions = [other[c] - place[last] for other in places]
-        names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
+        (self.c,), self.last = names_face, lines[2][-1][0]  # small circle that names the face, and the one beside it
+        directions = [other[self.c] - place[self.last] for other in places]
+        # face id by (sign of the scalar, of the vector product) with the diagonal
+        self.names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
         distances = np.linalg.norm(directions, axis=1)
-        if len(names) < len(target.faces) or not np.allclose(distances, distances[0], rtol=0.05):
+        if len(self.names) < len(target.faces) or not np.allclose(distances, distances[0], rtol=0.05):
             raise ValueError("the circles beside the last do not tell its faces apart")
-        in_steps = tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines)
-        step_radii, c_radii = step_x / radius[first.origin], float(distances[0]) / radius[last]
-        small_share = (radius[a] / radius[first.origin]) ** 2
-        return cls(first.origin, a, b, c, last, in_steps, names, step_radii, c_radii, small_share)
+        # circles along X, Y and the diagonal from the origin on: (id, distance in steps)
+        self.lines = tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines)
+        self.step_radii = step_x / radius[first.origin]  # distance from the origin to ``a`` in radii of the origin
+        self.c_radii = float(distances[0]) / radius[self.last]
+        self.small = (radius[self.a] / radius[first.origin]) ** 2  # ratio of the areas of small and large circles
 
 
 def _along(direction: tuple[float, float], place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
@@ -131,13 +119,13 @@ def detect_published(
 ) -> ImageDetection:
     """Finds all circles of the target and the board in one grey image by the published rules, all with the same σ.
     Diameters and axis ratio in ``options`` are the rules' two tests."""
-    pattern = PublishedPattern.of(target)
+    pattern = PublishedPattern(target)
     grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
     first, centres, candidates, boards, free = {}, [], {}, [], {}
     for polarity in sorted(polarities):
         every = contour_ellipses(grey, polarity, options)
-        own = candidates[polarity] = Candidates.of(every, camera)
+        own = candidates[polarity] = Candidates(every, camera)
         first[polarity], free[polarity] = sum(map(len, centres)), np.ones(len(every), bool)
         equal = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2))
         centres.append(Centres.without_rims(every.centre_px, own.xy, own.shape, equal, every.contrast))
@@ -209,33 +197,30 @@ class _Rules:
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
         """Labels the large circles along the three directions; returns the reason if one is missing, else ""."""
         origin = circles[self.pattern.origin]
-        at = self.found.xy[origin]
-        step_x, step_y = (self.found.xy[circles[circle]] - at for circle in (self.pattern.a, self.pattern.b))
+        off = self.found.xy - self.found.xy[origin]
+        step_x, step_y = (off[circles[circle]] for circle in (self.pattern.a, self.pattern.b))
         size = self.area / self.area[origin]
         large = free & (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
         large[origin] = False
         for line, step in zip(self.pattern.lines, (step_x, step_y, step_x + step_y), strict=True):
-            direction = step / np.linalg.norm(step)
+            direction, on_line = step / np.linalg.norm(step), [origin]
             for circle, steps in line:
-                off = self.found.xy - at
-                along = off @ direction
                 across = np.abs(off @ [-direction[1], direction[0]])
-                relative_steps = along / (steps * np.linalg.norm(step))
+                relative_steps = off @ direction / (steps * np.linalg.norm(step))
                 near = (relative_steps > 1 / STEP_RATIO) & (relative_steps < STEP_RATIO)
                 rows = np.flatnonzero(large & (across < self.found.radius) & near)
                 if not len(rows):
                     return f"circle {circle} not found in its direction"
                 circles[circle] = int(rows[np.argmin(np.abs(relative_steps[rows] - 1))])
-                on_line = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
-                direction = _fitted_direction(on_line, direction)
+                on_line.append(circles[circle])
+                direction = _fitted_direction(self.found.xy[on_line], direction)
         return ""
 
     def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceSighting, str]:
         """Returns the face named by circle c, and a note; or why there is none."""
         pattern = self.pattern
         last = circles[pattern.last]
-        labelled = set(circles.values())
-        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in labelled]
+        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in circles.values()]
         if len(beside) != 1:
             return f"{len(beside)} small circles beside circle {pattern.last}, 1 needed"
         on_diagonal = self.found.xy[[circles[c] for c in (pattern.origin, *(c for c, _ in pattern.lines[2]))]]

@@ -4,7 +4,9 @@ agree."""
 
 from collections.abc import Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -55,22 +57,11 @@ FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
 """Focal lengths over the longer image side at which the search for an unknown camera starts."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class BodyCorners:
-    """n corners of known faces in the images."""
+    """n corners of known faces in the images, of views with at least four corners of a face."""
 
-    images: tuple[str, ...]
-    faces: tuple[FaceDesign, ...]
-    image: np.ndarray  # (n,) index into ``images``, as ``face`` into ``faces``
-    face: np.ndarray
-    corner: np.ndarray  # (n,) index among those of the face
-    xy_face: np.ndarray  # (n, 2) mm
-    xy_px: np.ndarray  # (n, 2)
-    root: np.ndarray  # (n, 2, 2) whitens residuals in px
-
-    @classmethod
-    def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "BodyCorners":
-        """Returns the corners of views with at least four corners of a face."""
+    def __init__(self, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]):
+        self.images, self.faces = tuple(each.name for each in observations), tuple(faces)
         place: dict[Label, tuple[int, int]] = {
             label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
         }
@@ -81,16 +72,19 @@ class BodyCorners:
             keep = np.flatnonzero((of_face >= 0) & (np.sum(of_face[:, None] == of_face, axis=1) >= MIN_CORNERS))
             rows += [(i, *place[image.labels[k]]) for k in keep]
             seen.append(image.select(keep))
-        image, face, corner = np.array(rows, int).reshape(-1, 3).T
-        xy = np.array([faces[f].xy_mm[k] for f, k in zip(face, corner, strict=True)]).reshape(-1, 2)
+        # (n,) indices into ``images``, into ``faces``, and among the corners of the face
+        self.image, self.face, self.corner = np.array(rows, int).reshape(-1, 3).T
+        self.xy_face = np.array([faces[f].xy_mm[k] for _, f, k in rows]).reshape(-1, 2)  # (n, 2) mm
+        self.xy_px = np.concatenate([each.centre_px for each in seen])  # (n, 2)
         covariance = np.concatenate([each.covariance_px2 for each in seen]) + LEAST_SIGMA_PX**2 * np.eye(2)
-        root, xy_px = np.linalg.inv(np.linalg.cholesky(covariance)), np.concatenate([each.centre_px for each in seen])
-        return cls(tuple(each.name for each in observations), tuple(faces), image, face, corner, xy, xy_px, root)
+        self.root = np.linalg.inv(np.linalg.cholesky(covariance))  # (n, 2, 2) whitens residuals in px
 
     def select(self, keep: np.ndarray) -> "BodyCorners":
         """Returns the corners of a mask."""
-        arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "corner", "xy_face", "xy_px", "root")}
-        return replace(self, **arrays)
+        part = copy(self)
+        for name in ("image", "face", "corner", "xy_face", "xy_px", "root"):
+            setattr(part, name, getattr(self, name)[keep])
+        return part
 
     def xyz_face(self) -> np.ndarray:
         """Returns the corners in the frames of their faces, (n, 3)."""
@@ -133,7 +127,7 @@ def _lengths(xyz_camera: np.ndarray, corners: BodyCorners, camera: Camera) -> np
 
 def place_body(corners: BodyCorners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera, linked by what most images agree on."""
-    views, count = _FaceViews.of(corners, camera), len(corners.faces)
+    views, count = _FaceViews(corners, camera), len(corners.faces)
     edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
@@ -156,21 +150,10 @@ def place_body(corners: BodyCorners, camera: Camera) -> Body:
     return Body(body_from_face, camera_from_body, camera, placed_faces, placed_images)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _FaceViews:
-    """v views of a face in an image."""
+    """v views of a face in an image, in the order of images and faces."""
 
-    image: np.ndarray
-    face: np.ndarray
-    poses: Poses  # (2v,) camera_from_face, both minima of each view one after the other
-    cost: np.ndarray  # (v, 2)
-
-    def both(self, of: np.ndarray) -> Poses:
-        """Returns both poses of each of some views."""
-        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
-
-    @classmethod
-    def of(cls, corners: BodyCorners, camera: Camera) -> "_FaceViews":
+    def __init__(self, corners: BodyCorners, camera: Camera):
         normalised = camera.normalised_from_pixel(corners.xy_px)
         key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
         members = [np.flatnonzero(view_of == v) for v in range(len(key))]
@@ -186,8 +169,10 @@ class _FaceViews:
             middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
             starts += [pose, *mirrored(Poses.of([pose]), middle)]
             kept.append(v)
+        self.image, self.face = key[kept].T  # (v,)
+        self.poses, self.cost = Poses.of([]), np.zeros((0, 2))
         if not kept:
-            return cls(np.zeros(0, int), np.zeros(0, int), Poses.of([]), np.zeros((0, 2)))
+            return
         most = max(len(members[v]) for v in kept)
         index = np.array([np.pad(members[v], (0, most - len(members[v]))) for v in kept])
         real = np.array([np.arange(most) < len(members[v]) for v in kept])
@@ -205,45 +190,39 @@ class _FaceViews:
             return Normal.of(residual, root @ by_pose(by_point, rotated), np.asarray((ahead | ~real).all(1)), np.inf)
 
         minima = descend(evaluate, Poses.of(starts), 1e-6)
-        return cls(key[kept, 0], key[kept, 1], minima.poses, minima.cost.reshape(-1, 2))
+        # (2v,) camera_from_face, both minima of each view one after the other, and (v, 2) their costs
+        self.poses, self.cost = minima.poses, minima.cost.reshape(-1, 2)
+
+    def both(self, of: np.ndarray) -> Poses:
+        """Returns both poses of each of some views."""
+        return self.poses[np.stack([2 * of, 2 * of + 1], 1).ravel()]
 
 
 def _pairs(views: _FaceViews) -> dict[tuple[int, int], list[tuple[int, int]]]:
     """Returns the two views of each image that shows two faces, by these faces, in order."""
     by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for image in np.unique(views.image):
-        own = np.flatnonzero(views.image == image).tolist()
-        for x, v in enumerate(own):
-            for w in own[x + 1 :]:
-                pair = (v, w) if views.face[v] < views.face[w] else (w, v)
-                by_pair.setdefault((int(views.face[pair[0]]), int(views.face[pair[1]])), []).append(pair)
+        for v, w in combinations(np.flatnonzero(views.image == image).tolist(), 2):
+            by_pair.setdefault((int(views.face[v]), int(views.face[w])), []).append((v, w))
     return dict(sorted(by_pair.items()))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views."""
+    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views; of at most ``MOST_VOTES``
+    pairs of views, evenly drawn."""
 
-    rotation: np.ndarray  # (4p, 3, 3)
-    a_place: np.ndarray  # (4p, 3) of the origin, from the camera, in the axes of a
-    b_place: np.ndarray  # (4p, 3)
-    of_pair: np.ndarray  # (4p,)
-    excess: np.ndarray  # (4p,) cost over that of the best pose of the image
-    turned_alike: np.ndarray  # (4p, 4p) whether two have the same rotation
-
-    @classmethod
-    def of(cls, pairs: list[tuple[int, int]], views: _FaceViews) -> "_Relative":
-        """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
+    def __init__(self, pairs: list[tuple[int, int]], views: _FaceViews):
         pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
         a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
         back, place = np.swapaxes(views.poses.rotation[a], 1, 2), views.poses.translation[..., None]
-        rotation = back @ views.poses.rotation[b]
+        self.rotation = back @ views.poses.rotation[b]  # (4p, 3, 3)
+        # (4p, 3) of the origins, from the camera, in the axes of a
+        self.a_place, self.b_place = ((back @ place[k])[..., 0] for k in (a, b))
+        self.of_pair = np.repeat(np.arange(len(pairs)), 4)
         cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
-        excess = (cost - cost.min(1, keepdims=True)).ravel()
-        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
-        a_place, b_place = ((back @ place[k])[..., 0] for k in (a, b))
-        of_pair = np.repeat(np.arange(len(pairs)), 4)
-        return cls(rotation, a_place, b_place, of_pair, excess, turned < SAME_TURN_RAD)
+        self.excess = (cost - cost.min(1, keepdims=True)).ravel()  # over that of the best pose of the image
+        cosine = (np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2
+        self.turned_alike = np.arccos(np.clip(cosine, -1, 1)) < SAME_TURN_RAD  # (4p, 4p)
 
     def best(self, agrees: np.ndarray) -> tuple[int, int]:
         """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
@@ -255,7 +234,7 @@ class _Relative:
 
 def _edge(pairs: list[tuple[int, int]], views: _FaceViews) -> tuple[Rigid, int]:
     """Returns a_from_b of two faces as the images see it, and the number of images that agree on it."""
-    poses = _Relative.of(pairs, views)
+    poses = _Relative(pairs, views)
     translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
     agrees = poses.turned_alike & (apart < SAME_PLACE)
@@ -269,12 +248,12 @@ def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float],
     """Returns true over stated size of faces whose size contradicts those of most others, by index of the face, and the
     number of the others that were compared. Too large by q, a face seems farther by q: face b is at the same place d in
     the frame of a in all images, q R_aᵀ t_b − R_aᵀ t_a = d."""
-    views = _FaceViews.of(corners, camera)
+    views = _FaceViews(corners, camera)
     ratios: list[tuple[int, int, float, float]] = []
     for (a, b), pairs in _pairs(views).items():
         if len(pairs) < LEAST_PAIRS:
             continue
-        poses = _Relative.of(pairs, views)
+        poses = _Relative(pairs, views)
         near = np.flatnonzero(poses.turned_alike[poses.best(poses.turned_alike)[0]])
         near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
         if len(near) < LEAST_PAIRS:
@@ -297,8 +276,7 @@ def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float],
 
 def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
     """Factors of faces that differ from the median of those linked to them, from log ratios (a, b, log, σ)."""
-    a, b = (np.array([ratio[k] for ratio in ratios], int) for k in range(2))
-    value, sigma = (np.array([ratio[k] for ratio in ratios], float) for k in (2, 3))
+    a, b, value, sigma = (np.array(each) for each in zip(*ratios, strict=True))
     rows = np.eye(faces)[b] - np.eye(faces)[a]
     sigma = np.hypot(sigma, LEAST_SIGMA_OFF)
     weight, logs, spread = sigma**-2, np.zeros(faces), 1.0
@@ -406,7 +384,7 @@ def settled_body(body: Body, corners: BodyCorners, basis: np.ndarray, prior: np.
     """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
     for _ in range(PASSES - 1):
-        views = _FaceViews.of(corners, body.camera)
+        views = _FaceViews(corners, body.camera)
         faces = _faces_again(views, corners, body)
         poses, placed = _images(views, corners, faces, body.placed_faces, body.camera)
         start = replace(body, body_from_face=faces, camera_from_body=poses, placed_images=placed)
@@ -445,16 +423,18 @@ def _robust(length: np.ndarray) -> float:
     return float((np.minimum(length, 1e3) ** 0.5).sum())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class PlacedBody:
     """A body with the faces and images that are placed."""
 
-    body_from_face: dict[str, Rigid]
-    camera_from_body: dict[str, Rigid]
-    faces: tuple[FaceDesign, ...]
-    camera: Camera  # with the covariance of the assumptions about an unknown one
-    unlinked: tuple[str, ...]  # faces that are seen, and never with a placed one
-    contradictions: tuple[Outlier, ...]  # corners that lie elsewhere than the body has them
+    def __init__(self, body: Body, corners: BodyCorners, camera: Camera):
+        self.camera = camera  # with the covariance of the assumptions about an unknown one
+        placed, images = (np.flatnonzero(mask).tolist() for mask in (body.placed_faces, body.placed_images))
+        self.faces = tuple(corners.faces[f] for f in placed)
+        self.body_from_face = {corners.faces[f].id: body.body_from_face[f] for f in placed}
+        self.camera_from_body = {corners.images[i]: body.camera_from_body[i] for i in images}
+        # faces that are seen, and never with a placed one
+        self.unlinked = [corners.faces[f].id for f in np.unique(corners.face) if not body.placed_faces[f]]
+        self.contradictions = contradictions(body, corners)  # corners that lie elsewhere than the body has them
 
     def unlinked_notes(self) -> list[str]:
         """Returns a note for each face of known shape that no image shows together with one that is placed."""
@@ -488,17 +468,17 @@ def place_with_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
-    corners = BodyCorners.of(observations, faces)
+    corners = BodyCorners(observations, faces)
     _require_sizes(corners, camera)
     body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
-    return _named(body, corners, camera)
+    return PlacedBody(body, corners, camera)
 
 
 def place_and_find_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
 ) -> PlacedBody:
     """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
-    corners = BodyCorners.of(observations, faces)
+    corners = BodyCorners(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
     _require_sizes(corners, first)
@@ -515,7 +495,7 @@ def place_and_find_camera(
     basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
     with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
         best = settled_body(best, corners, basis, prior, lens)
-    return _named(best, corners, unknown_lens(best.camera))
+    return PlacedBody(best, corners, unknown_lens(best.camera))
 
 
 def _require_sizes(corners: BodyCorners, camera: Camera) -> None:
@@ -550,18 +530,6 @@ def _with_focal_length(corners: BodyCorners, camera: Camera) -> Body | None:
         return body
     except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
         return None
-
-
-def _named(body: Body, corners: BodyCorners, camera: Camera) -> PlacedBody:
-    placed = np.flatnonzero(body.placed_faces).tolist()
-    return PlacedBody(
-        {corners.faces[f].id: body.body_from_face[f] for f in placed},
-        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
-        tuple(corners.faces[f] for f in placed),
-        camera,
-        tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
-        tuple(contradictions(body, corners)),
-    )
 
 
 def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:

@@ -111,18 +111,17 @@ def map_group(
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
     names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
-    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
-    own = partial(_own_mapping, database, names, ids, pair)
+    seed = ids[pair.first], ids[pair.second]
+    assert pair.second_from_first is not None, "chosen pairs have a pose"
+    own = partial(_own_mapping, database, names, seed, pair.second_from_first)
     ways = {
         "our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own,
-        "COLMAP's estimate of the chosen pair": lambda: seeded_mapping(
-            database, scratch, names, (ids[first.name], ids[second.name])
-        ),
+        "COLMAP's estimate of the chosen pair": partial(seeded_mapping, database, scratch, names, seed),
         "our relative pose of the chosen pair (COLMAP's gates refused its own)": own,
     }
+    by_board = share_board_alone(*(i for i in group if i.name in (pair.first, pair.second)))
     try:
-        tried = [*ways.items()][not share_board_alone(first, second) :]
-        found = ((seeded, model) for seeded, way in tried if (model := way()) is not None)
+        found = ((seeded, model) for seeded, way in [*ways.items()][not by_board :] if (model := way()) is not None)
         seeded, reconstruction = next(found, ("", None))
     except RuntimeError as error:
         if "SQLite" not in str(error):
@@ -201,10 +200,12 @@ def seeded_mapping(
     return best if best is not None and best.num_reg_images() >= 2 else None
 
 
-def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
-    """Runs COLMAP's incremental mapper step by step, starting from the relative pose of ``pair``."""
+def _own_mapping(
+    database: Path, names: list[str], pair: tuple[int, int], second_from_first: Rigid
+) -> pycolmap.Reconstruction | None:
+    """Runs COLMAP's incremental mapper step by step, starting from the relative pose of the pair (ids)."""
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
-    options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
+    options = pipeline_options(names, pair)
     with pycolmap.Database.open(str(database)) as opened:
         cache = pycolmap.DatabaseCache.create(
             opened, pycolmap.DatabaseCacheOptions(min_num_matches=MIN_POINTS, image_names=set(names))
@@ -213,11 +214,9 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     mapper_options, triangulation = options.get_mapper(), options.get_triangulation()
-    start = pair.pose()
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(start.rotation), start.translation)
-    first, second = ids[pair.first], ids[pair.second]
-    mapper.register_initial_image_pair(mapper_options, first, second, pose)
-    registered = [first, second]
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(second_from_first.rotation), second_from_first.translation)
+    mapper.register_initial_image_pair(mapper_options, *pair, pose)
+    registered = list(pair)
     while registered:
         for image_id in registered:
             mapper.triangulate_image(triangulation, image_id)
@@ -247,9 +246,13 @@ def labelled_model(
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     is_outlier = residual > MAX_REPROJECTION_PX
-    rows = np.column_stack([model.image_index, model.point_index])[is_outlier]
     outliers = tuple(
-        Outlier(model.images[i], model.labels[p], float(off), MAX_REPROJECTION_PX)
-        for (i, p), off in zip(rows, residual[is_outlier], strict=True)
+        Outlier(
+            model.images[model.image_index[k]],
+            model.labels[model.point_index[k]],
+            float(residual[k]),
+            MAX_REPROJECTION_PX,
+        )
+        for k in np.flatnonzero(is_outlier)
     )
     return model.without(is_outlier), outliers

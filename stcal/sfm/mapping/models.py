@@ -54,8 +54,7 @@ def write_model(
     tracks: dict[tuple[Label, tuple[float, ...]], pycolmap.Track] = {}
     for model in models:
         places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_model.tolist(), strict=True)]
-        for place in places:
-            tracks.setdefault(place, pycolmap.Track())
+        tracks |= {place: pycolmap.Track() for place in places if place not in tracks}
         for name, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
             keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
@@ -148,20 +147,19 @@ def read_model(
         )
     native = cameras[0]
     camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
-    index_of_name = {image.name: i for i, image in enumerate(observations)}
+    of_run = {image.name: (image, xy) for image, xy in zip(observations, corrected_px, strict=True)}
+    tolerance_px = CORRECTION_TOLERANCE_PX if corrected_again else KEYPOINT_TOLERANCE_PX
     members: dict[str, list] = {}
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        if image.name not in index_of_name:
+        if image.name not in of_run:
             listed = f"{observations[0].name} … {observations[-1].name}"
-            cut = "; names with spaces need a binary model" if any(" " in name for name in index_of_name) else ""
+            cut = "; names with spaces need a binary model" if any(" " in name for name in of_run) else ""
             raise _of_another_run(path, f"image {image.name} is not of this run ({listed}{cut})")
-        i = index_of_name[image.name]
-        tolerance_px = CORRECTION_TOLERANCE_PX if corrected_again else KEYPOINT_TOLERANCE_PX
-        xy = require_keypoints(path, image, observations[i].labels, corrected_px[i], tolerance_px)
-        corrected = xy if corrected_again else corrected_px[i]
-        members.setdefault(observations[i].group, []).append((observations[i], corrected, image))
+        observed, corrected = of_run[image.name]
+        xy = require_keypoints(path, image, observed.labels, corrected, tolerance_px)
+        members.setdefault(observed.group, []).append((observed, xy if corrected_again else corrected, image))
     labelled = _labelled_points(reconstruction, {image.name: image for image in observations})
     groups, split = [], 0
     for name, images in sorted(members.items()):
@@ -183,8 +181,7 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
     """Opens a model's files; InputError if one is damaged or missing."""
     pycolmap.logging.minloglevel = LOG_NOTHING
     try:
-        for name in ("cameras", "rigs", "frames", "images", "points3D"):
-            file = Path(path) / f"{name}.bin"
+        for file in (Path(path) / f"{name}.bin" for name in ("cameras", "rigs", "frames", "images", "points3D")):
             if file.exists():
                 _require_whole(file)
         for file in Path(path).glob("*.txt"):
@@ -331,20 +328,18 @@ def points_by_votes(
 
 def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tuple[WorldModel | None, int]:
     """Returns the model of one group (None without labelled points) and the number of labels with several points."""
-    observations, native = [observed for observed, _, _ in images], [image for _, _, image in images]
+    observations, corrected_px, native = zip(*images, strict=True)
     chosen, split = points_by_votes(observations, native, labelled)
     if not chosen:
         return None, 0
     xyz = {label: reconstruction.point3D(point).xyz for label, point in chosen.items()}
-    lost = [label for label in sorted(xyz) if not np.isfinite(xyz[label]).all()]
-    if lost:
-        raise InputError(
-            "E-MODEL-POSE",
-            f"model {path}: point {chosen[lost[0]]} ({lost[0]}) is not finite; write or copy it again",
-        )
+    for label in sorted(xyz):
+        if not np.isfinite(xyz[label]).all():
+            fault = f"model {path}: point {chosen[label]} ({label}) is not finite"
+            raise InputError("E-MODEL-POSE", f"{fault}; write or copy it again")
     model = assemble(WorldModel, group, observations, [pose_of_image(path, image) for image in native], xyz)
     names = [[point.point3D_id for point in image.points2D] for image in native]
     at = zip(model.image_index.tolist(), model.point_index.tolist(), model.keypoint.tolist(), strict=True)
     model = model.observed(np.array([names[i][k] == chosen[model.labels[p]] for i, p, k in at]))
-    corrected = [images[i][1][k] for i, k in zip(model.image_index, model.keypoint, strict=True)]
+    corrected = [corrected_px[i][k] for i, k in zip(model.image_index, model.keypoint, strict=True)]
     return replace(model, shift_px=model.measured_px - np.array(corrected)), split

@@ -61,16 +61,8 @@ class PairScore:
     median_angle_rad: float  # of the rays of triangulated points
     in_front: float  # share of the points in front of both cameras
     forward: float  # |t_z|/‖t‖
-    second_from_first: Rigid | None  # with unit translation
+    second_from_first: Rigid | None  # with unit translation; of chosen and usable pairs
     verdict: str  # ``chosen``, ``usable`` or why not usable
-
-    def pose(self) -> Rigid:
-        """Returns ``second_from_first``; an error if the pair has none."""
-        if self.second_from_first is None:
-            raise MappingError(
-                "E-MAPPING-NO-PAIR", f"pair {self.first}, {self.second}: no relative pose; take another pair"
-            )
-        return self.second_from_first
 
 
 def rank_pairs(
@@ -295,12 +287,11 @@ def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
         near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
         order = skeleton[np.argsort(-near, kind="stable")]
         order = order[shared[i, order] >= MIN_SHARED]
-        picked, candidates = list(order[:NEIGHBOURS]), list(order[NEIGHBOURS:])
+        picked = list(order[:NEIGHBOURS])
         open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
         while open_labels.any():
-            best = max(candidates, key=lambda j: int((seen[j] & open_labels).sum()))
+            best = max(order, key=lambda j: int((seen[j] & open_labels).sum()))
             picked.append(best)
-            candidates.remove(best)
             open_labels &= ~seen[best]
         pairs |= {(int(min(i, j)), int(max(i, j))) for j in picked}
     return pairs

@@ -136,7 +136,7 @@ def detect_with(task: Task, camera: CameraModel) -> DetectedImages:
     dots, detector = task.board if task.board.rows else None, None
     if options.solve == "paper":
         require_dots(dots, "--solve paper")
-        PublishedPattern.of(target)
+        PublishedPattern(target)
         detector = detect_published
     how = options.ellipses, task.folder.cache, options.workers
     detection = detect_files(chosen, camera, target, dots, *how, step, detector)

@@ -16,7 +16,7 @@ from stcal.sfm.detect.image import image_corners
 def dots(sample):
     grey = decode((sample / "images/12/IMG_1000.jpg").read_bytes(), "sample")
     camera = read_camera(sample / "cameras.txt").calibrated(grey.shape[1], grey.shape[0])
-    return Candidates.of(find_ellipses(grey, "bright", EllipseOptions()), camera), image_corners(camera)
+    return Candidates(find_ellipses(grey, "bright", EllipseOptions()), camera), image_corners(camera)
 
 
 @pytest.mark.parametrize("factor", [0.52, 1.5, 3.0])

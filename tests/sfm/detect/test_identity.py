@@ -69,7 +69,7 @@ def face_ellipses(face_id, camera_from_face, hidden=(), **kwargs):
 
 def found_in(ellipses, target=TARGET):
     """Faces with a name, and patterns without one."""
-    return find_faces(Candidates.of(ellipses, CAMERA), target)
+    return find_faces(Candidates(ellipses, CAMERA), target)
 
 
 @pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
@@ -154,7 +154,7 @@ def test_which_faces_a_mirror_makes_of_faces():
 @pytest.mark.parametrize("face_id", ["1", "2"])
 def test_a_mirrored_image_is_told_by_a_face_without_a_mirror_image(face_id):
     faces = face_ellipses("1", pose(30, 0, 0, x=200)), face_ellipses(face_id, pose(40, 10, 0, x=-250))
-    candidates = Candidates.of(joined(*faces), CAMERA)
+    candidates = Candidates(joined(*faces), CAMERA)
     for each, mirrored in ((candidates, set()), (candidates.mirrored(), {"1"})):
         assert set(find_mirrored(each, TARGET, find_faces(each, TARGET)[0])) == mirrored
 
@@ -188,7 +188,7 @@ def board_ellipses(board, camera_from_board, hidden=()):
 
 
 def find(ellipses, board):
-    return find_boards(Candidates.of(ellipses, CAMERA), board, CORNERS)
+    return find_boards(Candidates(ellipses, CAMERA), board, CORNERS)
 
 
 def cells_of(reading, keep, board, numbering=0):
@@ -267,7 +267,7 @@ def test_rings_at_other_places_than_stated_are_refused():
         if (row, column) in stated.rings:
             cv2.circle(large, centre, round(2 * scale * stated.radius_mm), 0, -1)
     grey = cv2.GaussianBlur(cv2.resize(large, (camera.width, camera.height), interpolation=cv2.INTER_AREA), None, 0.7)
-    dots = Candidates.of(find_ellipses(grey, "bright", EllipseOptions()), camera)
+    dots = Candidates(find_ellipses(grey, "bright", EllipseOptions()), camera)
     (reading,) = find_boards(dots, stated, image_corners(camera))
     assert len(reading.numberings) == 2
     assert len(by_rings(reading, stated, grey, camera, dots.xy).numberings) == 1

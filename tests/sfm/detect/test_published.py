@@ -79,7 +79,7 @@ def test_an_even_image_has_nothing():
 
 def test_the_names_of_the_reference_design():
     """Dot product zero: 1; positive: 2 and 4, negative: 3 and 5, each two told apart by the vector product."""
-    names = PublishedPattern.of(reference_target()).names
+    names = PublishedPattern(reference_target()).names
     assert names == {(0, 0): "1", (1, -1): "2", (1, 1): "4", (-1, 1): "3", (-1, -1): "5"}
 
 
@@ -88,4 +88,4 @@ def test_a_design_of_another_form_is_refused():
     xy = face.xy_mm.copy()
     xy[face.ids.index("6")] = (50.0, 30.0)
     other = TargetDesign("other", "bright", (replace(face, xy_mm=xy), TARGET.face("2")))
-    refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern.of, other)
+    refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern, other)
