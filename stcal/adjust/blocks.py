@@ -49,7 +49,8 @@ class Equations:
         """Return equations of the same unknowns with the numbers of :meth:`flat`."""
         shapes = [np.shape(getattr(self, each.name)) for each in fields(self)]
         parts = np.split(flat, np.cumsum([np.prod(shape, dtype=int) for shape in shapes])[:-1])
-        return Equations(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+        numbers: list[Any] = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        return Equations(*numbers)
 
     def alone(self, held: float = 0.0) -> "tuple[np.ndarray, np.ndarray, Reduction]":
         """Return normal matrix and right side of the kept unknowns alone, and the elimination of the others.

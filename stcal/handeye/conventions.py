@@ -149,7 +149,12 @@ def _with_angles(read: str, meant: str, poses: Poses) -> Poses:
 def _changed(loop: Loop, change: Callable[[Poses], Poses], *sides: str) -> Callable[[], Loop]:
     """Returns a function that gives the loop with changed poses of sides, as a file would state them."""
     names = {"robot": "base_from_flange", "board": "camera_from_board"}
-    return lambda: replace(loop, **{names[side]: change(getattr(loop, names[side])) for side in sides})
+
+    def changed() -> Loop:
+        poses: dict[str, Any] = {names[side]: change(getattr(loop, names[side])) for side in sides}
+        return replace(loop, **poses)
+
+    return changed
 
 
 def _inverted(loop: Loop, by_images: bool) -> Candidate:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -217,7 +217,7 @@ class HandEyePlanFile(ResultFile):
     @classmethod
     def of(cls, result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> "HandEyePlanFile":
         taken = [name for name, out in zip(result.names, result.outliers, strict=True) if not out]
-        known = {"setup": result.setup, "method": result.method, "taken": taken, "joints": joints}
+        known: dict[str, Any] = {"setup": result.setup, "method": result.method, "taken": taken, "joints": joints}
         known |= {name: getattr(planned, name) for name in ("sigma_mm", "turn_rad")}
         known |= {name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")}
         return cls(format="stcal handeye plan 1", **known)

@@ -16,6 +16,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.corner_views import View, Views, resect
 from stcal.handeye.data.pose_pairs import OTHER, HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.handeye_problem import IN_COMMON, METHODS, HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS
 from stcal.handeye.remarks import Aside, Grave
 from stcal.parallel import one_thread, run_in_order
@@ -273,6 +274,8 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     opposite = OTHER[setup]
     plain = replace(problem, views=None, options=replace(problem.options, intrinsics=None, symmetries=()))
     try:
+        if not problem.options.four_dof and SETUP_BETTER * _robust_miss(plain, setup) < _robust_miss(plain, opposite):
+            return ()
         in_either = (replace(plain, setup=each) for each in (setup, opposite))
         first, other = (refitted(each, "pose", rows[:SETUP_SPLITS]).means() for each in in_either)
     except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
@@ -283,6 +286,13 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     as_stated = f"{np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}"
     as_other = f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}"
     return (Grave(f"poses held out are missed by {as_stated}, by {as_other}: give --setup {opposite} if it is that"),)
+
+
+def _robust_miss(problem: HandEyeProblem, setup: Setup) -> float:
+    """Returns the product of median rotation and translation (rad mm) by which a quick solution misses the poses."""
+    loop = Loop.of(problem.pairs, setup)
+    misses = loop.residuals(*robust(loop, problem.options.with_scale)).reshape(-1, 2, 3)
+    return float(np.median(np.linalg.norm(misses, axis=2), axis=0).prod())
 
 
 @require_arguments

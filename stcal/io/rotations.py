@@ -151,7 +151,8 @@ def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.nd
 
 def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
     """Refuse values (m, …) that are not finite; the message names the row."""
-    bad, said = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1), "a value that is not finite, numbers needed"
+    finite, said = np.isfinite(values.reshape(len(values), -1)), "a value that is not finite, numbers needed"
+    bad = np.any(~finite, axis=1)
     refuse(bad, "E-TABLE-NUMBER", lambda i: f"{where}: {places[i]}", lambda _: said, "; take it out")
 
 

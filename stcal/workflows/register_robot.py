@@ -123,8 +123,8 @@ def register_with_robot(
     if not len(found) == len(data) == len(pairs):
         given = f"{len(pairs)} point pairs, a registration of {len(found)}, {len(data)} joint vectors"
         raise InputError("E-ARRAY-SHAPE", f"{pairs.where}: {given}; as many of each needed")
-    options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
-    options["liu2017_options"] = liu2017_options
+    options: dict[str, Any] = {"model": found.model, "method": found.method, "seed": found.seed}
+    options |= {"threshold_mm": threshold_mm, "liu2017_options": liu2017_options}
     settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
     good = found.inliers.copy()
     if registration.field is not None:

@@ -42,6 +42,7 @@ from stcal.io.rotations import (
     places_of,
     read_rotations,
     require_finite,
+    rotations,
     said_convention,
 )
 from stcal.io.table import FARTHEST, LENGTHS, Table, is_comment, read_table, separator_stated
@@ -170,7 +171,8 @@ def _content(path: Path, data: bytes, said: Said, key: str, quaternions: Order) 
     if _UNIVERSAL.fullmatch(first):
         inside = [(number, _UNIVERSAL.fullmatch(line.strip())) for number, line in lines]
         values, places = _rows_of([(number, match[1] if match else "") for number, match in inside], 6, where)
-        rotation, words = turned_values(values[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
+        convention = said_convention(said.rotation, "the numbers after x, y, z", where)
+        rotation, words = rotations(values[:, 3:], convention, places, where)
         return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
     name, *others = re.split(r"[\s,;]+", first, maxsplit=1)
     named = _numbers(others[0]) if others and ":" not in name and name != "-" else None

@@ -144,7 +144,7 @@ def taken_at(stream: Stream, seconds: np.ndarray, names: Sequence[str], toleranc
     between = covered & (spacing <= LONGEST_S) & ~same
     nearby = ~between & ~same & (gap_s <= tolerance_s)
     kept, left_out = between | same | nearby, []
-    for k in np.flatnonzero(~kept):
+    for k in np.flatnonzero(~kept).tolist():
         reason = f"{gap_s[k]:.4g} s {'before' if seconds[k] < samples[0] else 'after'} the samples of {stream.where}"
         if covered[k]:
             reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed"

@@ -266,7 +266,7 @@ def _undetermined(solution: ArmSolution, names: list[str], partial: bool) -> tup
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Returns how many parameters each kind of measurement at these joint values would determine."""
-    tip, none = state.tips_of(data), dict.fromkeys(("covariance", "common", "distances", "from_row"))
+    tip, none = state.tips_of(data), {"covariance": None, "common": None, "distances": None, "from_row": None}
     exact = replace(data, positions=tip.translation, rotations=tip.rotation, **none)
     seen = {kind: observed(exact, kind) for kind in get_args(Kind)}
     return {kind: ArmProblem(own, TYPICAL, robust=False).at(state).rank() - _place(own) for kind, own in seen.items()}

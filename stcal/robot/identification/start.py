@@ -298,7 +298,7 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
         for held, said, right, times in (there, ("mm", words, "mm", 1 / LENGTHS[unit])):
-            scaled = {name: times * values for name, values in lengths.items() if values is not None}
+            scaled: dict[str, Any] = {name: times * values for name, values in lengths.items() if values is not None}
             remedy = f"call the columns x_{right} … or distance_{right}"
             yield f"lengths are {held} in columns of {said}; {remedy}", robot, replace(data, **scaled)
     for i in range(n):
@@ -307,7 +307,7 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
         yield f"joint {i + 1} had the opposite sign; {remedy}", robot, reversed_
     if (robot.coupling != np.eye(n)).any():
         what = "the joints were not coupled; take coupling out of the robot file"
-        yield what, replace(robot, coupling=None), data
+        yield what, replace(robot, coupling=np.eye(n)), data
         what = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
         yield what, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
     elif n >= 3:

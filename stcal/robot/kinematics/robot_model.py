@@ -340,7 +340,7 @@ class Robot(Brief):
         if ends.shape != (n, 2) or len(kinds) != n:
             fault = f"{where}: limits of shape {ends.shape}, types of {len(kinds)} joints"
             raise InputError("E-ARRAY-SHAPE", f"{fault}; ({n}, 2) and {n} needed")
-        joints = tuple(Joint(kind, *pair) for kind, pair in zip(kinds, ends.tolist(), strict=True))
+        joints = tuple(map(Joint, kinds, *zip(*ends.tolist(), strict=True)))
         finite = np.where(np.isfinite(ends), ends, 0.0)
         warn_of_degrees(finite.T, np.array(kinds) == "revolute", f"{where}: limits")
         return cls(name, convention, tuple(DHRow(*row) for row in rows.tolist()), joints)

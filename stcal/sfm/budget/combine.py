@@ -451,7 +451,7 @@ def budget(
         for kinds in ("AB", "A")
     )
     traces = (np.trace(covariances, axis1=1, axis2=2).tolist() for covariances in (circles, estimated))
-    freedoms = np.array([effective_freedom(*variances, freedom) for variances in zip(*traces, strict=True)])
+    freedoms = np.array([effective_freedom(whole, part, freedom) for whole, part in zip(*traces, strict=True)])
     conditions = conditions_of(statement, board)
     return Budget(joint, reference_face, sources, rows, circles, freedoms, freedom, views, statement, conditions)
 

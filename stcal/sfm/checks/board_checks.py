@@ -316,4 +316,5 @@ def _sources(
             name, log_scale = f"distance {known.first} to {known.second}", np.log(np.linalg.norm(apart) / known.mm)
             sources.append((name, log_scale, gradient.ravel(), (known.sigma_mm / known.mm) ** 2))
     names, *numbers = zip(*sources, strict=True) if sources else [()] * 4
-    return names, *(np.array(each) for each in numbers)
+    log_scales, gradients, variances = (np.array(each) for each in numbers)
+    return names, log_scales, gradients, variances

@@ -404,9 +404,10 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
-    um = {label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()}
+    um: dict[str, float] = {label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()}
     known = {label: v for label, v in off.items() if label in covariances}
-    sigmas = {label: _sigmas(v, covariances[label], FACE_FLOOR[3:]) for label, v in known.items()}
+    floor = FACE_FLOOR[3:]
+    sigmas: dict[str, float] = {label: _sigmas(v, covariances[label], floor) for label, v in known.items()}
     return ResultsCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
 
 
@@ -505,7 +506,7 @@ def _differences(
                 measured = f"{um:.1f} µm, {mdeg:.2f} mdeg{in_sigma}"
                 clauses.append(f"face {face} ({source}) {measured}; {', '.join(allowed)} allowed")
         of_circles = (compared.circles_um, "µm", limits.circle_um), (compared.circles_sigmas, "σ", sigma)
-        largest += [(f"circle {{}} ({source})", *each) for each in of_circles]
+        largest += [(f"circle {{}} ({source})", off, unit, most) for off, unit, most in of_circles]
     largest += [
         ("camera {}: position", {c.image: c.position_um for c in mapping.cameras}, "µm", limits.camera_um),
         ("camera {}: attitude", {c.image: c.rotation_mdeg for c in mapping.cameras}, "mdeg", limits.camera_mdeg),

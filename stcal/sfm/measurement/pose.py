@@ -327,7 +327,7 @@ def pose_from_circles(
 
 def _problem(image: ImageObservations, target: TargetCircles, camera: Camera, options, prior) -> PoseProblem:
     used = [i for i, label in enumerate(image.labels) if isinstance(label, CircleLabel)]
-    used.sort(key=lambda i: target.place.get(image.labels[i], -1))
+    used.sort(key=lambda i: target.place.get(image.labels[i], -1))  # type: ignore[arg-type]
     seen, where = image.select(used), image.name
     if len(set(seen.labels)) < len(used):
         raise InputError("E-LABEL-REPEATED", f"{where}: a label twice; every circle is seen once")

@@ -145,8 +145,8 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     origins = [{face: pose[:3, 3] for face, pose in side.target_from_face.items()} for side in (known, answer)]
     for kind, (true, found) in {"circles": (known.circles, answer.circles), "faces": origins}.items():
         common = [np.array([side[name] for name in true if name in found]).reshape(-1, 3) for side in (true, found)]
-        lengths = (float(np.linalg.norm(points - points.mean(axis=0))) if len(points) else 0.0 for points in common)
-        _require_same_unit(f"run {run}, truth {truth}", kind, *lengths, "run")
+        true_mm, found_mm = (float(np.linalg.norm(xyz - xyz.mean(axis=0))) if len(xyz) else 0.0 for xyz in common)
+        _require_same_unit(f"run {run}, truth {truth}", kind, true_mm, found_mm, "run")
     faces = {face: _face(face, answer, known) for face in known.target_from_face if face in answer.target_from_face}
     labels = None
     if run.is_dir() and known.groups:

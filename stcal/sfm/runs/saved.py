@@ -3,7 +3,6 @@ from it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
@@ -305,8 +304,11 @@ class RunResult(SavedRun):
 
     def unadjusted(self) -> dict[str, frozenset[Label]]:
         """Returns the labels of the keypoints that are not in the result, by image."""
-        without = {name: np.isnan(residual).any(axis=1) for name, residual in self.residuals_px().items()}
-        return {image.name: frozenset(compress(image.labels, without[image.name])) for image in self.observations}
+        residuals, left = self.residuals_px(), {}
+        for image in self.observations:
+            without = np.isnan(residuals[image.name]).any(axis=1)
+            left[image.name] = frozenset(image.labels[i] for i in np.flatnonzero(without).tolist())
+        return left
 
     def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
         """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
