@@ -247,11 +247,12 @@ class Camera(ByValue):
             moved_x, moved_y = moved_x + r2 * (s1 + r2 * s2), moved_y + r2 * (s3 + r2 * s4)
         return moved_x, moved_y, r2, top, bottom
 
-    def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the image is folded over."""
+    def undistort(self, xy_distorted: ArrayLike, or_nan: bool = False) -> np.ndarray:
+        """Invert :meth:`distort` by Newton's method to 1e-12; where the image is folded over, raise ConvergenceError,
+        or with ``or_nan`` return NaN."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
-            return self._perspective(target.copy(), target)
+            return self._perspective(target.copy(), target, or_nan)
         if not np.isfinite(target).all():
             raise ConvergenceError("E-CAMERA-PIXEL", "camera: a pixel to undistort is not finite; finite ones needed")
         x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
@@ -269,33 +270,36 @@ class Camera(ByValue):
                 x, y = x - (y_by_y * off_x - x_by_y * off_y) / safe, y - (x_by_x * off_y - y_by_x * off_x) / safe
         # Beyond the fold Newton can end on a mirrored branch: an inverse has a positive definite derivative.
         good = done & (det >= 0) & (x_by_x + y_by_y > 0)
-        if good.all():
-            return self._perspective(np.stack([x, y], axis=-1), target)
+        if or_nan or good.all():
+            return self._perspective(np.where(good, [x, y], np.nan).transpose(*range(1, x.ndim + 1), 0), target, or_nan)
         worst = np.unravel_index(np.argmin(good), good.shape)
         at = self.focal * target[worst] + self.centre
         fault = f"camera: no undistorted point for pixel ({at[0]:.0f}, {at[1]:.0f})"
         remedy = "the distortion coefficients fold the image over there, check them"
         raise ConvergenceError("E-CAMERA-FOLDED", f"{fault}; {remedy}")
 
-    def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def _perspective(self, xy: np.ndarray, target: np.ndarray, or_nan: bool) -> np.ndarray:
         """Return ideal coordinates (..., 2) of undistorted ``xy``; ``target`` : distorted points, for messages."""
         if not self.fisheye:
             return xy
         theta = np.hypot(xy[..., 0], xy[..., 1])
-        if (theta >= WIDEST_RAD).any():
+        if or_nan:
+            theta = np.where(theta < WIDEST_RAD, theta, np.nan)
+        elif (theta >= WIDEST_RAD).any():
             at = self.focal * target[np.unravel_index(theta.argmax(), theta.shape)] + self.centre
             fault = f"camera: pixel ({at[0]:.0f}, {at[1]:.0f}) is {np.degrees(theta.max()):.1f}° from the axis"
             needed = f"less than {np.degrees(WIDEST_RAD):.0f}° needed; use the middle of the image"
             raise ConvergenceError("E-CAMERA-FIELD", f"{fault}, {needed}")
-        return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
+        return xy * np.where(theta == 0, 1.0, np.tan(theta) / np.where(theta == 0, 1.0, theta))[..., None]
 
     def pixel_from_normalised(self, xy: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of ideal normalised coordinates (..., 2), lens distortion applied."""
         return self.distort(xy) * self.focal + self.centre
 
-    def normalised_from_pixel(self, xy_px: ArrayLike) -> np.ndarray:
-        """Return ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed."""
-        return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal)
+    def normalised_from_pixel(self, xy_px: ArrayLike, or_nan: bool = False) -> np.ndarray:
+        """Return ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed; see
+        :meth:`undistort`."""
+        return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal, or_nan)
 
     def project(self, xyz_camera: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame; NaN of points that are not before it."""

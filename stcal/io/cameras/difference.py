@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError, named
+from stcal.errors import DegenerateError, InputError, named
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -119,13 +119,8 @@ def image_grid(camera: Camera | SizedLens) -> np.ndarray:
 
 def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return the rays (n, 3) with z = 1 of pixels (n, 2); nan where the lens has none."""
-    try:
-        return np.column_stack([camera.normalised_from_pixel(pixels), np.ones(len(pixels))])
-    except ConvergenceError:
-        if len(pixels) == 1:
-            return np.full((1, 3), np.nan)
-        half = len(pixels) // 2
-        return np.concatenate([rays(camera, pixels[:half]), rays(camera, pixels[half:])])
+    xy = camera.normalised_from_pixel(pixels, or_nan=True)
+    return np.where(np.isfinite(xy[:, :1]), np.column_stack([xy, np.ones(len(xy))]), np.nan)
 
 
 CANDIDATES = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")

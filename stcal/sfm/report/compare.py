@@ -16,7 +16,7 @@ from stcal.io.files import MODEL_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import FARTHEST, LENGTHS, csv_rows, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
-from stcal.report.text import NONE, cells, number, text_table
+from stcal.report.text import number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
@@ -331,18 +331,3 @@ def comparison_table(comparison: CompareFile) -> str:
     if comparison.missing:
         lines.append(f"not in the run: face {', '.join(comparison.missing)}")
     return "\n".join(lines)
-
-
-def comparison_cells(comparison: dict) -> tuple[list[str], list[list[str]]]:
-    """Returns heads and rows of the table; ``comparison`` : its content in ``report.json``."""
-    faces = list(comparison["sigma"])
-    heads = ["<Method", *(f"Face {face} (µm)" for face in faces), "Rotation, largest (mdeg)", "Board, mean (µm)",
-             "± (µm)", "Residual (px)"]  # fmt: skip
-    rows = []
-    for row in comparison["rows"]:
-        is_last = row is comparison["rows"][-1]
-        values, sign = (comparison["sigma"], "σ ") if is_last else (row["faces"], "")
-        shown = [f"{sign}{number(values[face]['translation_um'], 2)}" if face in values else NONE for face in faces]
-        turned = sign + number(max((each["rotation_mdeg"] for each in values.values()), default=None), 2)
-        rows.append([row["method"], *shown, turned, *cells(row, "board_mean_um:1 board_spread_um:1 residual_rms_px:4")])
-    return heads, rows

@@ -33,7 +33,6 @@ from stcal.report.document import (
 from stcal.report.svg import AXIS_COLOURS, COLOURS, INK, round_below
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
-from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
 from stcal.sfm.report.run_figures import board_residuals, by_photograph, halves, normalised_residuals, residual_field
 
@@ -525,3 +524,18 @@ def shown_overlays(report: dict) -> list[str]:
     ranked = sorted(names, key=lambda name: (name in worst, name not in noted, -worst.get(name, 0.0)))
     chosen = set(ranked[:FIRST_IMAGES])
     return [name for name in names if name in chosen]
+
+
+def comparison_cells(comparison: dict) -> tuple[list[str], list[list[str]]]:
+    """Returns heads and rows of the table; ``comparison`` : its content in ``report.json``."""
+    faces = list(comparison["sigma"])
+    heads = ["<Method", *(f"Face {face} (µm)" for face in faces), "Rotation, largest (mdeg)", "Board, mean (µm)",
+             "± (µm)", "Residual (px)"]  # fmt: skip
+    rows = []
+    for row in comparison["rows"]:
+        is_last = row is comparison["rows"][-1]
+        values, sign = (comparison["sigma"], "σ ") if is_last else (row["faces"], "")
+        shown = [f"{sign}{number(values[face]['translation_um'], 2)}" if face in values else NONE for face in faces]
+        turned = sign + number(max((each["rotation_mdeg"] for each in values.values()), default=None), 2)
+        rows.append([row["method"], *shown, turned, *cells(row, "board_mean_um:1 board_spread_um:1 residual_rms_px:4")])
+    return heads, rows

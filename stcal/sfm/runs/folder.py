@@ -49,9 +49,16 @@ from stcal.sfm.detect.predict import CUT, REMEDIES
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
-from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
-from stcal.sfm.report.run_page import CONTROL, FIRST_IMAGES, PUBLISHED, faces_table, report_html, shown_overlays
+from stcal.sfm.report.run_page import (
+    CONTROL,
+    FIRST_IMAGES,
+    PUBLISHED,
+    comparison_cells,
+    faces_table,
+    report_html,
+    shown_overlays,
+)
 from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
 from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun
 from stcal.sfm.runs.stages import DetectedImages, Task
