@@ -65,8 +65,7 @@ def _print_version() -> None:
 def _program() -> ModuleType:
     """Loads and returns the module of the commands, which use one thread of OpenBLAS: where memory is too little for
     its threads, it sends its own process SIGINT, or tries for ever."""
-    for number in LOADING:
-        signal.signal(number, _end)
+    _answer()
     _require_address_space()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -89,6 +88,11 @@ def _require_address_space() -> None:
         message = f"error: {NO_MEMORY}: {limit >> 20} MB of address space allowed, {ADDRESS_SPACE >> 20} MB needed; "
         os.write(sys.stderr.fileno(), f"{message}raise the limit (`ulimit -v`)\n".encode())
         sys.exit(3)
+
+
+def _answer() -> None:
+    for number in LOADING:
+        signal.signal(number, _end)
 
 
 def _end(number: int, _) -> None:

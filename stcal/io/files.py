@@ -119,6 +119,17 @@ def require_written(
     """Read a written file with the reader of later commands, and require that it gives the values that were
     reported. ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest
     difference, rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError."""
+    difference = _difference(path, read, reported)
+    if not difference <= most:
+        differs = f"the file gives values that differ from those reported by up to {difference:.2g} {unit}"
+        raise ConvergenceError("E-WRITTEN-DIFFERS", f"{path}: {differs}, {most:g} allowed; {DO_NOT_USE}")
+
+
+DO_NOT_USE = "do not use the file, and report this with its data"
+
+
+def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
+    """Return the largest difference between a file and the reported values; infinite for another shape."""
     import numpy as np
 
     try:
@@ -126,15 +137,9 @@ def require_written(
     except (StcalError, OSError, LookupError, ValueError, SyntaxError) as error:
         unread = f"{path}: written, and cannot be read again: {error}; {DO_NOT_USE}"
         raise ConvergenceError("E-WRITTEN-DIFFERS", unread) from error
-    difference = np.inf
-    if again.shape == values.shape and (np.isnan(again) == np.isnan(values)).all():
-        difference = np.nanmax(np.abs(again - values), initial=0.0)
-    if not difference <= most:
-        differs = f"the file gives values that differ from those reported by up to {difference:.2g} {unit}"
-        raise ConvergenceError("E-WRITTEN-DIFFERS", f"{path}: {differs}, {most:g} allowed; {DO_NOT_USE}")
-
-
-DO_NOT_USE = "do not use the file, and report this with its data"
+    if again.shape != values.shape or (np.isnan(again) != np.isnan(values)).any():
+        return float("inf")
+    return float(np.nanmax(np.abs(again - values), initial=0.0))
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:

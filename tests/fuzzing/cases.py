@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.io.files import RUN_MARKER
-from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.transaction import verify
 from tests.commands import CALLS, PLACES, Call, options_of
 from tests.fuzzing.judged import OUT, Failures, Outcome, Program, called, failures, hashes, lay_out, started
 from tests.fuzzing.mistakes import MISTAKES, told

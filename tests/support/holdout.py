@@ -1,7 +1,7 @@
 """How far poses are off in photographs that also show a board: the target calibrated on some, found in others."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import combinations
 
 import numpy as np
@@ -75,7 +75,8 @@ def subset_trials(
         if most is not None and len(subsets) > most:
             subsets = [subsets[k] for k in sorted(rng.choice(len(subsets), most, replace=False))]
         for subset in subsets:
-            yield _trial(images, i, seen.select(list(subset)), calibrated.layout, truth, options)
+            part = SeenTags(*(getattr(seen, each.name)[list(subset)] for each in fields(SeenTags)))
+            yield _trial(images, i, part, calibrated.layout, truth, options)
 
 
 def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayout, truth: Rigid, options) -> PoseTrial:

@@ -37,9 +37,11 @@ from stcal.sfm.runs.comparisons import (
     CameraRow,
     Crosscheck,
     FaceDifference,
+    FacesCompared,
     ImagesRegistered,
+    MappingCompared,
     ResidualRms,
-    ResultsCompared,
+    ResultCompared,
     Tolerances,
     allowed_text,
 )
@@ -343,7 +345,7 @@ def _compared(
         residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
         mapping=mapping,
         result=result,
-        plain=ResultsCompared(faces=face_differences(of_native.target, run)),
+        plain=FacesCompared(faces=face_differences(of_native.target, run)),
         notes=list(of_native.notes),
         differences=_differences(images, mapping, result, tolerances),
     )
@@ -400,7 +402,7 @@ def _off(difference: np.ndarray) -> tuple[float, float]:
     return MICRO * shift, MICRO * turn
 
 
-def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultsCompared:
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> MappingCompared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
@@ -408,7 +410,7 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     known = {label: v for label, v in off.items() if label in covariances}
     floor = FACE_FLOOR[3:]
     sigmas: dict[str, float] = {label: _sigmas(v, covariances[label], floor) for label, v in known.items()}
-    return ResultsCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
+    return MappingCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
 
 
 def face_differences(
@@ -483,7 +485,7 @@ def comparison_text(check: Crosscheck) -> str:
 
 
 def _differences(
-    images: ImagesRegistered, mapping: ResultsCompared, result: ResultsCompared, limits: Tolerances
+    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
 ) -> list[str]:
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):

@@ -214,12 +214,18 @@ class CameraRow(Part):
     sigmas: float
 
 
-class ResultsCompared(Part):
-    """Differences of two results; the keys that were not given are not in the file."""
-
+class FacesCompared(Part):
     faces: dict[ByFace, FaceDifference | None]
+
+
+class ResultCompared(FacesCompared):
     circles_um: dict[ByLabel, float] = Field(default={})
     circles_sigmas: dict[ByLabel, float] = Field(default={})
+
+
+class MappingCompared(ResultCompared):
+    """Differences of two results; the keys that were not given are not in the file."""
+
     cameras: list[CameraRow] = Field(default=[])
 
 
@@ -240,18 +246,18 @@ class Crosscheck(Part):
     residual_rms_px: ResidualRms = Field(
         description="per coordinate, of the `native` model, of `pycolmap`'s, and of the `run`'s final one"
     )
-    mapping: ResultsCompared = Field(
+    mapping: MappingCompared = Field(
         description="native against pycolmap, both as COLMAP adjusts them, through our scale and face stages, target "
         "frame: `faces` face → `translation_um`, `rotation_mdeg`, `sigmas` (null where only one has it), `circles_um` "
         "label → distance, `circles_sigmas`, `cameras`: `image`, `position_um`, `rotation_mdeg`, `sigmas`. `sigmas`: "
         "√(dᵀC⁻¹d/k) of the k components of the difference, with the run's own covariance of the face or circle, and "
         "with that of the camera in its group, circles held together"
     )
-    result: ResultsCompared = Field(
+    result: ResultCompared = Field(
         description="native models after our whole adjustment against `faces.json`: `faces` with `translation_um`, "
         "`rotation_mdeg`, `sigmas`; `circles_um`, `circles_sigmas`"
     )
-    plain: ResultsCompared = Field(
+    plain: FacesCompared = Field(
         description="native models as they are against `faces.json`: `faces` with `translation_um`, `rotation_mdeg`, "
         "`sigmas`; no tolerance applies"
     )
