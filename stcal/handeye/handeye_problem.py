@@ -343,7 +343,7 @@ class HandEyeProblem:
         if options.four_dof:
             x, z, covariance, notes = self._without_slide(x, z, solution.normal)
         inverse = covariance
-        notes += self._remarks(x, solution.outliers, solution.residuals)
+        notes += self._remarks(x, solution.outliers, solution.residuals, solution.scale_hint(loop))
         if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
             notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
         if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -434,9 +434,7 @@ class HandEyeProblem:
         note = f"the robot's poses err by {own} an axis, where {said} are stated: its σ are estimated instead"
         return free, unknown, (f"{note}; check the robot's poses",)
 
-    def _remarks(
-        self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float] | None = None
-    ) -> Remarks:
+    def _remarks(self, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> Remarks:
         """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
         if self.part:
             return ()
@@ -446,7 +444,7 @@ class HandEyeProblem:
         moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
         notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
         if not (options.with_scale or options.four_dof):
-            notes += remarks.of_size(loop[good], options.noise, hint)
+            notes += remarks.of_size(loop[good], hint, options.noise)
         return notes + remarks.of_distance(loop)
 
     def _without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, Remarks]:

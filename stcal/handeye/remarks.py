@@ -347,16 +347,15 @@ def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray
     return (f"{before}: solve the poses before it, and those from it on, separately",)
 
 
-def of_size(loop: Loop, noise: Noise, hint: tuple[float, float] | None) -> Remarks:
-    """Returns a note if the board is of another size than stated by the poses, and by the corners, if there are any,
-    whose ``hint`` is the scale after one step, with its σ."""
+def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> Remarks:
+    """Returns a note if the board is of another size than stated. ``hint`` is the scale after one step, with its σ."""
 
     def other(scale: float, sigma: float, sigmas: float) -> bool:
         return abs(scale - 1) > max(sigmas * sigma, SIZE_SHARE)
 
-    if hint is not None and not other(*hint, HINTED):
+    if not other(*hint, HINTED):
         return ()
-    try:
+    try:  # the hint comes from one large step, so the scale is solved for
         solution = adjust_poses(loop, robust(loop, with_scale=True), noise, with_scale=True)
     except StcalError:
         return ()

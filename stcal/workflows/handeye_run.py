@@ -9,6 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.conventions import flipped, tilted
@@ -128,7 +129,8 @@ NO_COVARIANCE = Aside(
     "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the board's "
     "size, is not in σ; `measure` writes it (columns cov_… and common…)"
 )
-SURE_SIGMAS = 4.0  # number of its σ from which an offset is reported (1 in 16,000)
+HINT_T, SURE_SIGMAS = 3.0, 4.0
+"""Student's t from which an offset is solved for, and number of its σ from which it is reported (1 in 16,000)."""
 FALLS = 0.98
 """Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
 HARMFUL = 1.0  # change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always
@@ -172,6 +174,8 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
     if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _is_moving(timed):
         return result, ()
     try:
+        if abs(_lag_t(problem, timed, result)) < HINT_T:
+            return result, ()
         plain = replace(options, intrinsics=None, camera=None, symmetries=())
         lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
         shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
@@ -205,6 +209,23 @@ def _is_moving(timed: Timed) -> bool:
     steps = rms_of(poses[1:].difference(poses[:-1]))
     smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
     return smooth and len(timed.seconds) >= LEAST_ROWS
+
+
+def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:
+    """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
+    good = np.flatnonzero(~result.outliers)
+    loop, x = problem.loop[good], result.mount_from_camera
+    residuals = loop.residuals(x, result.stand_from_board, result.scale)
+    by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
+    columns = 12 + (result.sigma_scale is not None)
+    jacobian = np.concatenate([loop.jacobian(x, result.scale, columns), by_time], axis=2)
+    size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
+    weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
+    flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()
+    covariance = generalised_inverse(flat.T @ flat)
+    step = -covariance @ (flat.T @ left)
+    variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
+    return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
 
 
 LEAST_REACHED = 0.5  # share of the poses taken that the arm of a robot file must reach to be accepted as this robot

@@ -160,6 +160,15 @@ class PoseSolution:
         used = ~self.outliers & ~np.isin(np.arange(len(loop)), out)
         return _solved(loop[used], self.state, self.covariance[used], len(self.normal))[0]
 
+    def scale_hint(self, loop: Loop) -> tuple[float, float]:
+        """Returns the scale, one step from the solution, if it were solved for, and its σ."""
+        used = ~self.outliers
+        jacobian = loop[used].jacobian(self.state.mount_from_camera, self.state.scale, 13)
+        weighted = np.linalg.solve(self.covariance[used], jacobian)
+        inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
+        step = -inverse[12] @ np.einsum("mai,ma->i", weighted, self.residuals[used])
+        return self.state.scale + float(step), float(np.sqrt(inverse[12, 12]))
+
 
 def adjust_poses(
     loop: Loop, start: LoopState, noise: Noise, with_scale: bool = False, robust: bool = True

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.design import BoardDesign, known_distances
+from stcal.design import BoardDesign, ScaleReference, known_distances
 from stcal.errors import DegenerateError
 from stcal.geometry.normal_equations import free_motions
 from stcal.geometry.rigid import align_similarity
@@ -229,9 +229,12 @@ MOST_PRINT_FACTOR = 10.0
 """Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
 
 
-def scales_check(evidence: Evidence) -> Check:
-    """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
+def scales_check(evidence: Evidence) -> Check | tuple[()]:
+    """Tests each source of the scale against the mean of all in the free network of a group, which has one scale, if
+    the target tells its size too."""
     networks, board, joint = evidence.networks, evidence.board, evidence.joint
+    if not isinstance(board, ScaleReference):
+        return ()
     print_factor, title = 1.0 if joint is None else joint.print_factor, CHECKS["scales"][0]
     remedy = "another size than stated: measure a side of each print, and correct target.toml or state size_sigma_mm"
     name, times = _alone(networks, board) or ("", 1.0)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtri, fdtrc
 
-from stcal.design import BoardDesign, ScaleReference, TargetDesign
+from stcal.design import BoardDesign, TargetDesign
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera, intrinsic_basis
@@ -65,15 +65,14 @@ MAKERS: tuple[Maker, ...] = (
     image_checks.control_check,
     board_checks.scales_check,
 )
-"""Makers of the checks in the order of the report; the last one where the target tells its size itself."""
+"""Makers of the checks in the order of the report."""
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
     """Returns all checks in the order of the report, the cause of the whole set before them if one failed."""
-    makers = MAKERS if isinstance(evidence.board, ScaleReference) else MAKERS[:-1]
-    step = counted(progress or (lambda *_: None), "check", len(makers))
+    step = counted(progress or (lambda *_: None), "check", len(MAKERS))
     checks: list[Check] = []
-    for make in makers:
+    for make in MAKERS:
         made = make(evidence)
         checks += [made] if isinstance(made, Check) else made
         step(None)

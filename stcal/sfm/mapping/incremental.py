@@ -115,13 +115,13 @@ def map_group(
     assert pair.second_from_first is not None, "chosen pairs have a pose"
     own = partial(_own_mapping, database, names, seed, pair.second_from_first)
     ways = {
-        "our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own,
         "COLMAP's estimate of the chosen pair": partial(seeded_mapping, database, scratch, names, seed),
         "our relative pose of the chosen pair (COLMAP's gates refused its own)": own,
     }
-    by_board = share_board_alone(*(i for i in group if i.name in (pair.first, pair.second)))
+    if share_board_alone(*(i for i in group if i.name in (pair.first, pair.second))):
+        ways = {"our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own} | ways
     try:
-        found = ((seeded, model) for seeded, way in [*ways.items()][not by_board :] if (model := way()) is not None)
+        found = ((seeded, model) for seeded, way in ways.items() if (model := way()) is not None)
         seeded, reconstruction = next(found, ("", None))
     except RuntimeError as error:
         if "SQLite" not in str(error):
