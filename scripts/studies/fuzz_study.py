@@ -5,7 +5,7 @@
 All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Six parts:
 inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for it
 (`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), programs ended by signals, and with a
-full disk (`ulimit -f`) or little memory, from the beginning or from random moments on (`k0`, `k1`, …), what runs keep
+full disk (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …), what runs keep
 swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). The seed and the case's name repeat a
 case: `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
@@ -24,10 +24,11 @@ from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
-from scripts.runner import head, row, script
+from scripts.runner import script
 from tests.commands import CALLS, COMMANDS
-from tests.fuzzing.cases import Judged, options, run_all
+from tests.fuzzing.cases import Judged, option_cases
 from tests.fuzzing.mistakes import MISTAKES
+from tests.fuzzing.pool import run_all
 from tests.fuzzing.stock import make_stock
 
 ALLOWED = ("no program could tell",)
@@ -40,28 +41,33 @@ def names_of(arguments) -> list[str]:
     if arguments.only:
         return [arguments.only]
     valid = [f"v{i}" for i in range(len(CALLS))]
-    odd = [f"o{i}" for i in range(len(options()))]
+    options = [f"o{i}" for i in range(len(option_cases()))]
     counts = {"k": arguments.kills, "s": arguments.kept, "d": arguments.closed, "c": arguments.count}
     drawn = [f"{letter}{i}" for letter, count in counts.items() for i in range(count)]
-    return [*valid, *MISTAKES, *odd, *drawn]
+    return [*valid, *MISTAKES, *options, *drawn]
 
 
-def summary(found: list[Judged]) -> None:
-    """Counts by kind with the cases, and by command."""
+def show(found: Judged, seed: int) -> None:
+    """Each failure of a case."""
+    for kind, what in found.failures:
+        print(f"{kind} | {found.said} | --seed {seed} --only {found.name!r}\n    {what[-SHOWN:]}", flush=True)
+
+
+def summary(found: list[Judged], seed: int) -> str:
+    """Counts by kind with the cases, and by command, as Markdown."""
     kinds: dict[str, list[str]] = {}
     for each in found:
-        for kind in dict(each.failures):
+        for kind in sorted({kind for kind, _ in each.failures}):
             kinds.setdefault(kind, []).append(each.name)
-    head("failure", "cases", "names")
-    for kind, names in sorted(kinds.items()):
-        row(kind, len(names), ", ".join(names[:12]))
-    print()
-    head("command", "exit 0", "2", "3", "other")
+    lines = [f"seed {seed}: {len(found)} cases", "", "| failure | cases | names |", "|---|---|---|"]
+    lines += [f"| {kind} | {len(names)} | {', '.join(names[:12])} |" for kind, names in sorted(kinds.items())]
     codes = Counter((each.command, each.code) for each in found)
+    lines += ["", "| command | exit 0 | 2 | 3 | other |", "|---|---|---|---|---|"]
     for command in COMMANDS:
         own = {code: n for (name, code), n in codes.items() if name == command}
         known = [own.pop(code, 0) for code in (0, 2, 3)]
-        row(command, *known, sum(own.values()))
+        lines.append(f"| {command} | {' | '.join(map(str, known))} | {sum(own.values())} |")
+    return "\n".join(lines)
 
 
 COUNTS = {"count": 1000, "kills": 20, "kept": 60, "closed": 20}
@@ -79,9 +85,6 @@ def main(arguments) -> None:
         stock = make_stock(Path(folder) / "stock")
         for each in run_all(stock, arguments.seed, names_of(arguments), arguments.workers):
             found.append(each)
-            for kind, what in each.failures:
-                place = f"--seed {arguments.seed} --only {each.name!r}"
-                print(f"{kind} | {each.said} | {place}\n    {what[-SHOWN:]}", flush=True)
-    print(f"\nseed {arguments.seed}: {len(found)} cases, {time.monotonic() - start:.0f} s\n")
-    summary(found)
+            show(each, arguments.seed)
+    print(f"\n{summary(found, arguments.seed)}\n\n{time.monotonic() - start:.0f} s")
     sys.exit(any(kind not in ALLOWED for each in found for kind, _ in each.failures))

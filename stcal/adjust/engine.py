@@ -7,7 +7,7 @@ of a single member. A block of many members that no row ties to one another is e
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -122,12 +122,8 @@ class Adjustment:
 
     def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
         """Add knowledge of a kept :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
-        mean, weight = np.asarray(mean), np.asarray(weight)
-
-        def away(members: Vector) -> np.ndarray:
-            return (members.array - mean).ravel()
-
-        self.know(Known(block, lambda v: float(away(v) @ weight @ away(v)), lambda v: (weight, -weight @ away(v))))
+        of_prior = np.asarray(mean), np.asarray(weight)
+        self.know(Known(block, partial(_prior_cost, *of_prior), partial(_prior_equations, *of_prior)))
 
     def know(self, known: Known) -> None:
         """Add knowledge of a kept block that has equations of its own."""
@@ -177,6 +173,15 @@ class Adjustment:
     def at(self, values: Mapping[str, Any]) -> "Solution":
         """Return the problem linearised about a state."""
         return Solution(self, dict(values))
+
+
+def _prior_cost(mean: np.ndarray, weight: np.ndarray, members: Vector) -> float:
+    away = (members.array - mean).ravel()
+    return float(away @ weight @ away)
+
+
+def _prior_equations(mean: np.ndarray, weight: np.ndarray, members: Vector) -> tuple[np.ndarray, np.ndarray]:
+    return weight, -weight @ (members.array - mean).ravel()
 
 
 @dataclass(frozen=True, eq=False)

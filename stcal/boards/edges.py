@@ -312,7 +312,7 @@ BIN_PX = 0.25
 def _by_class(number: np.ndarray, classes: int, values: Iterable[np.ndarray]) -> np.ndarray:
     """Return the sums (n, classes, k) of k values (n, …) of pixels that have these class numbers (n, …)."""
     n = len(number)
-    row = (number.reshape(n, -1) + classes * np.arange(n)[:, None]).ravel()
+    row = (number + classes * np.arange(n).reshape(-1, *[1] * (number.ndim - 1))).ravel()
     return np.stack([np.bincount(row, part.ravel(), n * classes).reshape(n, classes) for part in values], axis=-1)
 
 

@@ -122,14 +122,15 @@ def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
 
 
 def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + a_from_b[..., None, :, 2]
+    constant = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
+    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + constant
 
 
 def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
     """Return the Jacobians (..., 2, 2) of :func:`apply_homography` at points (..., 2); also for k homographies."""
     mapped = _mapped(a_from_b, xy_b)
     w = mapped[..., 2, None, None]
-    homography = a_from_b[..., None, :, :]
+    homography = a_from_b if a_from_b.ndim == 2 else a_from_b[:, None]
     return (homography[..., :2, :2] - mapped[..., :2, None] / w * homography[..., 2:, :2]) / w
 
 

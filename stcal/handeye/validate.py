@@ -351,7 +351,8 @@ def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
 
 def _differences(others: list[HandEye], result: HandEye) -> list[np.ndarray]:
     """Returns the differences (n, 6) of X and of Z of other results against ``result``."""
-    return [np.array([getattr(each, name).difference(getattr(result, name)) for each in others]) for name in TRANSFORMS]
+    pairs = ([(getattr(each, name), getattr(result, name)) for each in others] for name in TRANSFORMS)
+    return [np.array([one.difference(other) for one, other in each]).reshape(-1, 6) for each in pairs]
 
 
 def with_common_errors(result: HandEye, problem: HandEyeProblem) -> HandEye:

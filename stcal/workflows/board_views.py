@@ -1,6 +1,7 @@
 """Boards of any kind in images: their points, and the camera that took photographs of a board of corners or circles."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from stcal.boards.board_designs import (
 from stcal.boards.finders import find_charuco, find_chessboard, shift_by_curves, straightened, why_no_chessboard
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import InputError, StcalError
+from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
@@ -145,7 +146,9 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     turned, few = replace(board, rows=board.columns, columns=board.rows), f"{few}, but {len(ids)} of its tags"
 
     def corners(other: CharucoDesign) -> int:
-        view = find_charuco(image, "", other)
+        view = None
+        with suppress(DegenerateError):
+            view = find_charuco(image, "", other)
         return 0 if view is None else len(view)
 
     best = max((replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)), key=corners)

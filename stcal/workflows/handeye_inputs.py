@@ -80,7 +80,7 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         rows = [known.index(time) for time in images.values()]
         lines = f"{robot.understood}; {len(rows)} of them at the times of images"
         dense = len(images) < len(known) == len(set(known))
-        robot = replace(robot[rows], names=tuple(images), understood=lines, own=False)
+        robot = replace(robot[rows], names=tuple(images), understood=lines, own=False, timed=False)
         return robot, (), clock() if dense else None
     stream, seconds = clock()
     seen = tuple(images)
@@ -94,6 +94,7 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         "places": tuple(f"time of {name}" for name in kept),
         "covariance": None,
         "own": False,
+        "timed": False,
     }
     read |= {"poses": taken.base_from_flange, "understood": f"{robot.understood}{note}; {taken.said}"}
     untimed_images = tuple((name, f"no time in {timing.image_times}") for name in names if name not in images)

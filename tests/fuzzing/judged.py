@@ -1,40 +1,31 @@
-"""One call of a program in a process of its own, and what must hold of it whatever the inputs are."""
+"""One call of a program on spoiled inputs, in this process, and what must hold of it whatever the inputs are."""
 
 import contextlib
 import csv
-import faulthandler
 import hashlib
-import importlib
 import json
-import multiprocessing
 import os
-import pkgutil
-import resource
 import shutil
 import signal
 import sys
 import time
+import traceback
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from io import TextIOWrapper
 from pathlib import Path
 
-import stcal
 from stcal.cli.main import MESSAGE_CHARACTERS
-from stcal.errors import NO_MEMORY
 from stcal.io.files import RUN_ENTRIES
 from tests.commands import PROGRAMS, Call
 from tests.outcome import PROGRESS
 from tests.shared import own_copy, without_rights
 
-LONGEST_S = 60
+LONGEST_S = 60.0
 """Of processor time; three times as much by the clock, as others may have the processor."""
 MOST_BYTES = 2 << 30
-"""Of memory, beside what this process has; a program then says that there is not enough."""
 LONGEST_PRINTED = 4 << 20
 CODES = (0, 2, 3, 4)  # that a command ends with by itself
 FAILED_CHECKS = 4  # of a run whose results are written, and not to be used
@@ -42,29 +33,30 @@ EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
 _NO_POSE = "no pose accepted"
 """Said on standard output with exit code 3 by a command that has done its work."""
-ENDS = {".html": b"</html>", ".pdf": b"%%EOF"}
-FORK = multiprocessing.get_context("fork")
-Failures = list[tuple[str, str]]
-"""(kind, what) of what must not be."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a call ended: ``code`` is negative where a signal ended it; ``seconds`` by the clock."""
+    """How a call ended: ``code`` None where it raised; ``trace`` of what it raised."""
 
-    code: int
+    code: int | None
     out: str
     err: str
-    seconds: float = 0.0
-
-    @property
-    def lines(self) -> list[str]:
-        """Of standard error, but for progress."""
-        return [line for line in self.err.split("\n") if line and not PROGRESS.fullmatch(line)]
+    seconds: float
+    peak_bytes: int = 0
+    trace: str = ""
 
     @property
     def said(self) -> str:
-        return "\n".join([self.out, *self.lines])
+        return "\n".join([self.out, *lines_of(self.err)])
+
+
+class TooLong(BaseException):
+    """The call has had its time."""
+
+
+def lines_of(err: str) -> list[str]:
+    return [line for line in err.split("\n") if line and not PROGRESS.fullmatch(line)]
 
 
 def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path, Path]:
@@ -72,8 +64,7 @@ def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path,
     read, written = folder / IN, folder / OUT
     shutil.rmtree(folder, ignore_errors=True)
     for place, below in [*((p, read) for p in call.inputs), *((p, written) for p in call.folders)]:
-        (below / place).parent.mkdir(parents=True, exist_ok=True)
-        own_copy(stock / place, below / place, ignore=shutil.ignore_patterns("lock"))
+        _copy(stock / place, below / place)
     for below in (read, written):
         below.mkdir(parents=True, exist_ok=True)
     for name in call.outputs if earlier else ():
@@ -81,163 +72,167 @@ def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path,
     return read, written
 
 
+def _copy(source: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir():
+        own_copy(source, to, ignore=shutil.ignore_patterns("lock"))
+    else:
+        shutil.copyfile(source, to)
+
+
 def hashes(folder: Path) -> dict[str, str]:
     """Of every file and link below a folder, by its place."""
     found = {}
-    for path in map(str, folder.rglob("*")):
-        if os.path.islink(path):
-            found[path] = f"link to {os.readlink(path)}"
-        elif os.path.isfile(path):
-            size = os.path.getsize(path)
-            # With the effective rights: a plain user may not read what the superuser's process may.
-            large = size > 1 << 26 or not os.access(path, os.R_OK, effective_ids=True)  # or a file with a large hole
-            found[path] = str(size) if large else hashlib.blake2b(Path(path).read_bytes()).hexdigest()
+    for root, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = os.path.join(root, name)
+            if os.path.islink(path):
+                found[path] = f"link to {os.readlink(path)}"
+            elif os.path.isfile(path):
+                found[path] = _hash(path)
     return found
 
 
-class Program:
-    """``perform`` in a process and session of its own, with limits of time and memory, its streams caught."""
-
-    def __init__(self, perform: Callable[[], object], folder: Path):
-        load()
-        self.start = time.monotonic()
-        pipes = [os.pipe() for _ in range(2)]
-        self.process = FORK.Process(target=_perform, args=(perform, folder, [end for _, end in pipes]))
-        self.process.start()
-        for _, end in pipes:
-            os.close(end)
-        self._streams = [open(end, "rb") for end, _ in pipes]  # noqa: SIM115
-
-    def ends_within(self, seconds: float) -> bool:
-        """Waits for its end; ``Process.join`` takes the start of another program for it."""
-        last = time.monotonic() + seconds
-        while self.process.exitcode is None and time.monotonic() < last:
-            time.sleep(0.01)
-        return self.process.exitcode is not None
-
-    def session(self) -> list[int]:
-        """Processes that go on in its session."""
-        found = []
-        for place in Path("/proc").glob("[0-9]*/stat"):
-            with contextlib.suppress(OSError):
-                state, _, _, session = place.read_text().rpartition(")")[2].split()[:4]
-                if int(session) == self.process.pid and state != "Z":
-                    found.append(int(place.parent.name))
-        return found
-
-    def outcome(self) -> Outcome:
-        with ThreadPoolExecutor(2) as threads:
-            texts = [threads.submit(stream.read) for stream in self._streams]
-            if not self.ends_within(3 * LONGEST_S):
-                os.kill(self.process.pid, signal.SIGXCPU)
-            seconds = time.monotonic() - self.start
-            # What it started may go on with its streams.
-            if wait(texts, 10).not_done or not self.ends_within(0):
-                os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.join()
-        for stream in self._streams:
-            stream.close()
-        return Outcome(self.process.exitcode, *(t.result().decode(errors="replace") for t in texts), seconds)
+def _hash(path: str) -> str:
+    size = os.path.getsize(path)
+    # With the effective rights: a plain user may not read what the superuser's process may.
+    if size > 1 << 26 or not os.access(path, os.R_OK, effective_ids=True):  # or a file with a large hole
+        return str(size)
+    with open(path, "rb") as stream:
+        return hashlib.blake2b(stream.read()).hexdigest()
 
 
-def _perform(perform: Callable[[], object], folder: Path, streams: list[int]) -> None:
-    """Runs in the new process."""
-    os.setsid()
-    os.chdir(folder)
-    for number, stream in enumerate(streams, 1):
-        os.dup2(stream, number)
-    sys.stdout, sys.stderr = (open(n, "w", 1, "utf-8", closefd=False) for n in (1, 2))  # noqa: SIM115
-    held = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_DATA, (held + MOST_BYTES, resource.RLIM_INFINITY))
-    resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S + 5))
-    faulthandler.enable()
-    faulthandler.register(signal.SIGXCPU, chain=True)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    warnings.resetwarnings()
-    warnings.simplefilter("always")
-    for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
-        warnings.simplefilter("ignore", kind)
-    perform()
-
-
-@cache
-def load() -> None:
-    """Imports all of the package, so that the process of a call need not."""
-    for module in pkgutil.walk_packages(stcal.__path__, "stcal."):
-        if not module.name.endswith("__main__"):
-            with contextlib.suppress(ImportError):
-                importlib.import_module(module.name)
-
-
-def called(
-    call: Call,
-    folder: Path,
-    program: str = "stcal",
-    more: tuple[str, ...] = (),
-    plain: bool = False,
-    around: Callable[[], AbstractContextManager] = nullcontext,
-) -> Outcome:
-    """Call a program whose libraries are loaded; ``plain`` : without the superuser's rights."""
+def in_process(call: Call, program: str, folder: Path, more: tuple[str, ...] = (), plain: bool = False) -> Outcome:
+    """Call a program here, its working directory ``folder``; standard streams are caught as files."""
     words = [*call.arguments(folder / IN, folder / OUT), *more]
-
-    def perform() -> None:
-        sys.argv = [program, *(words[1:] if program == "stcal-sfm" else words)]
-        with without_rights(plain), around():
+    words = words[1:] if program == "stcal-sfm" else words
+    before = os.getcwd()
+    trace, code = "", None
+    with _caught_streams() as streams, _own_settings(), without_rights(plain):
+        sys.argv = [program, *words]
+        os.chdir(folder)
+        held = _forget_peak()
+        start = time.monotonic()
+        try:
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+            signal.setitimer(signal.ITIMER_REAL, 3 * LONGEST_S)
             PROGRAMS[program][1]()
-
-    return Program(perform, folder).outcome()
-
-
-def started(call: Call, folder: Path, limits: Sequence[tuple[int, int]] = (), closed: Sequence[int] = ()) -> Program:
-    """Start a program from its beginning. ``limits`` : resources and how much of each; ``closed`` : streams."""
-    words = ["-P", "-c", "from stcal.cli.entry import main; main()", *call.arguments(folder / IN, folder / OUT)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2]), "PYTHONWARNINGS": ""}
-
-    def perform() -> None:
-        for what, most in limits:
-            resource.setrlimit(what, (most, most))
-        for number in closed:
-            os.close(number)
-        os.execve(sys.executable, [sys.executable, *words], environment)
-
-    return Program(perform, folder)
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+        except TooLong:
+            trace = "too long\n" + traceback.format_exc()
+        except BaseException:
+            trace = traceback.format_exc()
+        finally:
+            for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+                signal.setitimer(timer, 0)
+            seconds = time.monotonic() - start
+            os.chdir(before)
+    return Outcome(code, *streams, seconds, max(_bytes("VmHWM:") - held, 0), trace)
 
 
-def failures(call: Call, folder: Path, outcome: Outcome, before: dict[str, str], refused: bool = False) -> Failures:
-    """Everything that must not be; ``before`` : hashes of the folder before the call; ``refused`` : the inputs are such
-    that the command must not end with 0."""
+@contextlib.contextmanager
+def _caught_streams() -> Iterator[list[str]]:
+    """What is written to standard output and error meanwhile, by libraries in C too; filled in at the end."""
+    texts: list[str] = []
+    kept, own = [os.dup(1), os.dup(2)], (sys.stdout, sys.stderr)
+    files = [open(os.memfd_create(name), "r+b") for name in ("out", "err")]  # noqa: SIM115
+    for number, file in enumerate(files, 1):
+        os.dup2(file.fileno(), number)
+    sys.stdout, sys.stderr = (
+        TextIOWrapper(os.fdopen(os.dup(n), "wb", 0), encoding="utf-8", write_through=True) for n in (1, 2)
+    )
+    try:
+        yield texts
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.close()
+        sys.stdout, sys.stderr = own
+        for number, (file, old) in enumerate(zip(files, kept, strict=True), 1):
+            os.dup2(old, number)
+            os.close(old)
+            file.seek(0)
+            texts.append(file.read(LONGEST_PRINTED + 1).decode(errors="replace"))
+            file.close()
+
+
+@contextlib.contextmanager
+def _own_settings() -> Iterator[None]:
+    """Signals, arguments and warnings as a new process has them, and afterwards as they were."""
+    argv, numbers = sys.argv, (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGPROF)
+    handlers = [signal.getsignal(number) for number in numbers]
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, _end)
+    try:
+        with warnings.catch_warnings():
+            warnings.resetwarnings()
+            warnings.simplefilter("always")
+            for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+                warnings.simplefilter("ignore", kind)
+            yield
+    finally:
+        sys.argv = argv
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+
+
+def _end(*_) -> None:
+    raise TooLong
+
+
+def _forget_peak() -> int:
+    """Let the peak of memory begin at what is used now, which earlier tests may hold; returns that, bytes."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _bytes("VmRSS:")
+
+
+def _bytes(what: str) -> int:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith(what):
+                return int(line.split()[1]) * 1024
+    return 0
+
+
+def failures(
+    call: Call, folder: Path, outcome: Outcome, before: dict[str, str], refused: bool
+) -> list[tuple[str, str]]:
+    """(kind, what) of everything that must not be; ``before`` : hashes of the folder before the call; ``refused`` : the
+    inputs are such that the command must not end with 0."""
+    found = list(_ending(outcome, refused))
+    if outcome.peak_bytes > MOST_BYTES or "not enough memory" in outcome.err:
+        found.append(("memory", f"{outcome.peak_bytes / 2**20:.0f} MB; {outcome.err[-100:]}"))
     after = hashes(folder)
-    changed = {path for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
-    # A run keeps its cache, and who holds its lock, where it is read.
-    inputs = sorted(p for p in changed & before.keys() if f"/{IN}/" in p and "/cache/" not in p and "holder" not in p)
-    found = [("input changed", ", ".join(inputs[:3]))] if inputs else []
-    if outcome.code == -signal.SIGXCPU:
-        return [*found, ("hang", f"over {LONGEST_S:g} s\n{outcome.err[:500]}")]
-    if "Traceback (most recent call last)" in outcome.said:
-        return [*found, ("traceback", outcome.err)]
-    if NO_MEMORY in outcome.err:
-        found.append(("memory", outcome.err[-100:]))
-    if outcome.code not in CODES or (refused and outcome.code == 0):
-        found.append(("exit code", f"{outcome.code}, {'an error' if refused else f'one of {CODES}'} needed"))
-    written = folder / OUT
-    for name in call.outputs:
-        path = str(written / name)
-        if path in before and path not in after:
-            found.append(("earlier result lost", f"{name} is gone, exit code {outcome.code}"))
-        elif outcome.code == 0 and path not in changed:
-            found.append(("broken result", f"{name} was not written, exit code 0"))
-    for path in map(Path, sorted(changed & after.keys())):
-        if f"/{OUT}/" in str(path) and ".stcal" not in path.parts and (reason := broken(path)):
-            found.append(("left behind" if path.suffix == ".partial" else "broken result", f"{path}: {reason}"))
-    if outcome.code not in (0, FAILED_CHECKS):
-        runs = [written / place / entry for place in call.folders for entry in RUN_ENTRIES]
-        lost = sorted(p for p in changed & before.keys() if any(Path(p).is_relative_to(run) for run in runs))
-        found += [("earlier run lost", f"{path}, exit code {outcome.code}") for path in lost]
-    return [*found, *_printed(outcome)]
+    read = str(folder / IN) + os.sep
+    own = ("/cache/", "/holder.txt")  # what a run keeps for itself, with its lock and who holds it
+    changed = [
+        p for p, old in before.items() if p.startswith(read) and not any(o in p for o in own) and after.get(p) != old
+    ]
+    if changed:
+        found.append(("input changed", ", ".join(sorted(changed)[:3])))
+    if outcome.code is not None:
+        found += _printed(outcome)
+        found += _left(call, folder / OUT, outcome.code, before, after)
+    return found
+
+
+def _ending(outcome: Outcome, refused: bool) -> Iterator[tuple[str, str]]:
+    if outcome.trace.startswith("too long"):
+        yield "hang", f"over {LONGEST_S:g} s\n{outcome.trace}"
+    elif outcome.trace:
+        yield "traceback", outcome.trace
+    elif outcome.code not in CODES:
+        yield "exit code", f"{outcome.code}, one of {CODES} needed"
+    elif refused and outcome.code == 0:
+        yield "exit code", "0, an error needed"
+    if "Traceback (most recent call last)" in outcome.out + outcome.err:
+        yield "traceback", outcome.err
 
 
 def _printed(outcome: Outcome) -> Iterator[tuple[str, str]]:
-    lines = outcome.lines
+    lines = lines_of(outcome.err)
     if outcome.code == 0 and (noise := [line for line in lines if not line.startswith("warning: ")]):
         yield "noise", noise[0][:300]
     done = outcome.code == 3 and not lines and _NO_POSE in outcome.out
@@ -253,23 +248,53 @@ def _printed(outcome: Outcome) -> Iterator[tuple[str, str]]:
             yield "message too long", f"over {LONGEST_PRINTED >> 20} MB on {name}"
 
 
+def _left(call: Call, written: Path, code: int, before: dict, after: dict) -> Iterator[tuple[str, str]]:
+    """Of what lies where the command writes."""
+    for path in after:
+        if path.endswith(".partial") and path not in before:
+            yield "broken result", f"{path} is left behind"
+    for name in call.outputs:
+        path = written / name
+        earlier = before.get(str(path))
+        if earlier is not None and str(path) not in after:
+            yield "earlier result lost", f"{name} is gone, exit code {code}"
+        elif str(path) in after and after[str(path)] != earlier:
+            if reason := broken(path):
+                yield "broken result", f"{name}: {reason}, exit code {code}"
+        elif code == 0:
+            yield "broken result", f"{name} was not written, exit code 0"
+    for place in call.folders if code not in (0, FAILED_CHECKS) else ():
+        for path, old in before.items():
+            own = any(Path(path).is_relative_to(written / place / entry) for entry in RUN_ENTRIES)
+            if own and after.get(path) != old:
+                yield "earlier run lost", f"{path} of the earlier run, exit code {code}"
+
+
+BINARY = (".mat", ".bin")
+
+
 def broken(path: Path) -> str:
     """Why a result file is none; empty where it is one."""
-    data = b"" if path.is_dir() else path.read_bytes()
     try:
+        if path.suffix == ".pdf":
+            whole = path.read_bytes().rstrip().endswith(b"%%EOF")
+            return "" if whole else "cut off"
+        if path.suffix in BINARY:
+            return "" if path.stat().st_size else "empty"
+        text = path.read_text(encoding="utf-8")
         if path.suffix == ".json":
-            json.loads(data, parse_constant=_no_number)
+            json.loads(text, parse_constant=_no_number)
         elif path.suffix == ".csv":
-            rows = csv.reader(line for line in data.decode().splitlines() if not line.startswith("#"))
-            if len({len(row) for row in rows}) != 1:
+            rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
+            if not rows or len({len(row) for row in rows}) > 1:
                 return "rows of several lengths, or none"
         elif path.suffix in (".svg", ".urdf"):
-            ElementTree.fromstring(data)
-        elif path.suffix in ENDS and not data.rstrip().endswith(ENDS[path.suffix]):
+            ElementTree.fromstring(text)
+        elif path.suffix == ".html" and not text.rstrip().endswith("</html>"):
             return "no end"
-    except (ValueError, ElementTree.ParseError) as error:
+    except (OSError, ValueError, ElementTree.ParseError) as error:
         return str(error)
-    return "" if data and path.suffix != ".partial" else "empty or left behind"
+    return "" if text else "empty"
 
 
 def _no_number(name: str) -> float:

@@ -1,6 +1,5 @@
 """The rule for written files, watched during a call: each is read again, and its check sees another number in it."""
 
-import json
 import math
 import re
 from collections.abc import Iterator
@@ -28,14 +27,16 @@ NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:e[-+]?\d+)?(?![\w.])")
 
 
 @contextmanager
-def watched(record: Path) -> Iterator[None]:
-    """Writes which files were checked meanwhile, and whether their check sees a change; null where there is none."""
-    seen: dict[str, bool | None] = {}
+def watched() -> Iterator[tuple[set[str], list[str]]]:
+    """Collects meanwhile the names of files that are checked, and of those whose check does not see a change."""
+    names: set[str] = set()
+    seen: dict[str, bool] = {}
+    blind: list[str] = []
     measure = files._difference
 
     def difference(path, read, reported) -> float:
         found, content = measure(path, read, reported), Path(path).read_bytes()
-        seen.setdefault(Path(path).name, None)
+        names.add(Path(path).name)
         changed = NUMBER.sub(_another, content)
         if changed != content:
             Path(path).write_bytes(changed)
@@ -45,15 +46,15 @@ def watched(record: Path) -> Iterator[None]:
                 noticed = True
             finally:
                 Path(path).write_bytes(content)
-            seen[Path(path).name] = seen[Path(path).name] or noticed
+            seen[Path(path).name] = seen.get(Path(path).name, False) or noticed
         return found
 
     files._difference = difference
     try:
-        yield
+        yield names, blind
     finally:
         files._difference = measure
-        record.write_text(json.dumps(seen))
+        blind += [name for name, noticed in seen.items() if not noticed]
 
 
 def _another(number: re.Match[bytes]) -> bytes:
@@ -61,18 +62,15 @@ def _another(number: re.Match[bytes]) -> bytes:
     return repr(float(number[0]) * 1.001 if math.isfinite(float(number[0])) else 0.0).encode()
 
 
-def unchecked(
-    call: Call, folder: Path, record: Path, before: dict[str, str], after: dict[str, str]
-) -> list[tuple[str, str]]:
-    """Returns the files below ``folder`` that a call wrote and nobody read again, and those whose check is blind."""
-    seen = json.loads(record.read_text())
-    blind = [("check is blind", name) for name, noticed in seen.items() if noticed is False]
+def unchecked(call: Call, folder: Path, names: set[str], before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """Returns the files below ``folder`` that a call wrote and nobody read again."""
     if call.command in ELSEWHERE or call.code:
-        return blind
-    figures = {word[1:] for option, word in pairwise(call.split()) if option in OPTIONS_OF_FIGURES}
+        return []
+    words = call.split()
+    figures = {word[1:] for option, word in pairwise(words) if option in OPTIONS_OF_FIGURES}
     changed = [Path(path).relative_to(folder) for path in after if after[path] != before.get(path)]
-    return blind + [
-        ("not read again", str(path))
+    return [
+        str(path)
         for path in changed
-        if path.name not in seen.keys() | figures and path.suffix not in TO_LOOK_AT and not OF_A_RUN & set(path.parts)
+        if path.name not in names | figures and path.suffix not in TO_LOOK_AT and not OF_A_RUN & set(path.parts)
     ]

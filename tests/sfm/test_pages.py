@@ -3,7 +3,7 @@
 import pytest
 
 from tests.commands import CALLS, Call
-from tests.fuzzing.judged import OUT, called, lay_out
+from tests.fuzzing.judged import OUT, in_process, lay_out
 from tests.report.browser import faults, opened, show, sideways_px
 
 PAGES = {call.command: call for call in reversed(CALLS) if ">page.html" in call.words}
@@ -21,7 +21,7 @@ def chrome():
 @pytest.mark.parametrize("call", PAGES.values(), ids=PAGES)
 def test_a_page_fits_a_phone_and_a_screen(chrome, stock, tmp_path, call: Call):
     lay_out(stock, tmp_path / "case", call, earlier=False)
-    outcome = called(call, tmp_path / "case")
+    outcome = in_process(call, "stcal", tmp_path / "case")
     assert outcome.code == call.code, outcome
     for theme in ("light", "dark"):
         chrome.execute_cdp_cmd(

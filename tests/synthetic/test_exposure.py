@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.support.exposures import FULL_WELL, READ_NOISE, Light, expose
+from stcal.synthetic.optics import FULL_WELL, READ_NOISE, Light, expose
+from tests.outcome import refuses
 
 RAMP = np.tile(np.linspace(20, 200, 300).astype(np.uint8), (200, 1))
 
@@ -41,3 +42,8 @@ def test_light_falls_off_and_glares():
 def test_the_same_seed_gives_the_same_images():
     assert (expose(RAMP, [1.0], seed=3)[0] == expose(RAMP, [1.0], seed=3)[0]).all()
     assert (expose(RAMP, [1.0], seed=3)[0] != expose(RAMP, [1.0], seed=4)[0]).any()
+
+
+def test_what_cannot_be_exposed():
+    refuses("E-IMAGE-TYPE", expose, RAMP.astype(float), [1.0])
+    refuses("E-EXPOSURES-VALUE", expose, RAMP, [0.0])

@@ -166,8 +166,11 @@ def _content(path: Path, data: bytes, said: Said, key: str, quaternions: Order) 
     if not first:
         return None
     if text.lstrip().startswith(("{", "[")):
+        value = None
         with suppress(ValueError, RecursionError):  # YAML may begin so, too
-            return _of_values(json.loads(text), "JSON", said, where)
+            value = json.loads(text)
+        if value is not None:
+            return _of_values(value, "JSON", said, where)
     if _UNIVERSAL.fullmatch(first):
         inside = [(number, _UNIVERSAL.fullmatch(line.strip())) for number, line in lines]
         values, places = _rows_of([(number, match[1] if match else "") for number, match in inside], 6, where)

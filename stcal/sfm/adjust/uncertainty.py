@@ -209,12 +209,16 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
     """Returns the parts for quantities with derivatives (3c, k) by the circles, or for the 3c coordinates if None."""
     setting, solution = state.setting, state.solution
     camera, xyz = state.camera, solution.values[CIRCLES].array
-    along_all = np.eye(xyz.size) if quantities is None else quantities
-    k = along_all.shape[1]
+    k = xyz.size if quantities is None else quantities.shape[1]
+
+    def along_quantities(inverse: np.ndarray) -> np.ndarray:
+        own = inverse[:, : xyz.size]
+        return own if quantities is None else own @ quantities
+
     covariance = {kind: np.zeros((k, k)) for kind in OBSERVED}
     by_scale, by_intrinsics = np.zeros(k), np.zeros((k, len(PARAMETER_NAMES)))
     for group, model, part in zip(setting.groups, state.models, solution.whole, strict=True):
-        along = part.inverse[:, : xyz.size] @ along_all
+        along = along_quantities(part.inverse)
         pitch = (group.design @ group.board_at(solution.values).rotation.T / setting.own_sigma_mm()).ravel()
         for rows, batch, total in part.effects(along):
             (kind,), flat = rows.factor.kinds, total.reshape(-1, k)
@@ -225,7 +229,7 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
                 seen = model.observed(group.observations(kind)[batch])
                 lens = seen.whiten(seen.by_parameters(camera)) * np.sqrt(rows.weight[batch])[:, None, None]
                 by_intrinsics += flat.T @ lens.reshape(len(flat), -1)
-    inverse = solution.inverse[:, : xyz.size] @ along_all
+    inverse = along_quantities(solution.inverse)
     intrinsics = inverse[solution.parts[0].places[equations.CAMERA]]
     covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
     for kind, known in ((FLATNESS, equations.planes), (DISTANCES, equations.bars)):

@@ -333,7 +333,7 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
     """Returns how much leaving out one image explains, at most; ``left``: unexplained square per degree of freedom."""
     each = (n.score_of_image(image) for n in networks for image in range(len(n.model.images)))
     tests = [solve_score(*equations) for equations in each]
-    return max((test.statistic - test.freedom * left for test in tests), default=0.0)
+    return max([0.0, *(test.statistic - test.freedom * left for test in tests)])
 
 
 Size = Callable[[np.ndarray, np.ndarray], str]  # words on the size of a cause, from its parameters (q,) and their σ
