@@ -248,8 +248,8 @@ class Camera(ByValue):
         return moved_x, moved_y, r2, top, bottom
 
     def undistort(self, xy_distorted: ArrayLike, or_nan: bool = False) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12; where the image is folded over, raise ConvergenceError,
-        or with ``or_nan`` return NaN."""
+        """Invert :meth:`distort` by Newton's method to 1e-12, of finite points; where the image is folded over, raise
+        ConvergenceError, or with ``or_nan`` return NaN."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
             return self._perspective(target.copy(), target, or_nan)

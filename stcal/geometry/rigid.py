@@ -139,7 +139,7 @@ class Rigid(ByValue, _Frames):
         deviation = _off_proper(*self.rotation.tolist())
         if deviation > 1e-6:
             raise InputError("E-ROTATION-IMPROPER", "rotation: improper; orthogonal with determinant +1 needed")
-        if deviation > 1e-12:  # or a product of accepted rotations could be refused
+        if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could be refused
             object.__setattr__(self, "rotation", frozen(best_rotations(self.rotation)[0]))
 
     @classmethod

@@ -13,11 +13,11 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import LocateOptions, SceneTags, detect, find_scenes, locate_image, locate_scene, run
+from stcal.synthetic.optics import Light, expose
 from tests.levels import sampled
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.outcome import fails_with, refuses
 from tests.support.areas import homography, rendered
-from tests.support.exposures import Light, expose
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", CAMERA.width, CAMERA.height, "test")
 TRUTH = tilted(30)

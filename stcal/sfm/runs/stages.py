@@ -384,7 +384,8 @@ def solve_groups(
     groups: Groups, target: TargetDesign, scratch: Path, cache: Path, progress: Progress, names: Collection[str] = ()
 ) -> tuple[dict[str, GroupSolution], list[str]]:
     """Maps and refines group by group, all if no ``names`` are given; returns the solutions, and the reasons why groups
-    have none; raises the error of the first group if there is no solution. ``scratch`` is made and removed again."""
+    have none; raises the error of the first group if there is no solution. ``scratch`` is made and removed again,
+    ``cache`` keeps what later runs take up."""
     images, options = groups.observations, groups.options
     inputs = {}
     for name, of_group in by_group(images).items():
@@ -410,14 +411,14 @@ def solve_groups(
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
-    def scaled(name: str) -> GroupSolution:
+    def with_scale(name: str) -> GroupSolution:
         solution = found[name]
         if not isinstance(solution, GroupSolution):
             raise solution or KeyError(name)
-        find_scale(solution.model, groups.board)
+        find_scale(solution.model, groups.board)  # raises ScaleError where nothing tells the size
         return solution
 
-    return _each_group(inputs, scaled)
+    return _each_group(inputs, with_scale)
 
 
 def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
@@ -477,7 +478,7 @@ def _solve_body(task: Task, groups: Groups) -> tuple[dict[str, GroupSolution], l
         try:
             mapping = map_body(body, images[name], camera)
             refined = refine_or_explain(mapping.model, camera, task.target, board, eccentricity)
-            find_scale(refined.model, board)
+            find_scale(refined.model, board)  # raises ScaleError where nothing tells the size
         finally:
             step(None)
         return _solution(images[name], mapping, refined, [pair_of_model(refined.model)])

@@ -41,7 +41,7 @@ def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_
     small = with_a_stray
     _, out, err = outcome = stcal_sfm(*small.arguments(*files(small)))
     line = assert_error(outcome, CHECKS_FAILED, "E-CHECKS-FAILED", "may I use it? No", "--no-strict", "see")
-    assert {"faces: 4 of 4", "check: 18 of 18"} <= set(err.splitlines())
+    assert {"faces: 4 of 4", "check: 19 of 19"} <= set(err.splitlines())
     assert "µm" not in next(line for line in out.splitlines() if line.startswith("How good is it?"))
     assert "(a check is suspicious by chance in one run in 1,000, failed in one in 100,000)" in " ".join(out.split())
     assert f"--exclude {STRAY}" in " ".join(out.split()).split(" failed: ")[1]
