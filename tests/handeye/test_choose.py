@@ -42,7 +42,7 @@ def test_files_that_are_right_are_trusted(seed):
     found = chosen(truth)
     assert found.chosen.method == "reprojection"
     assert [each.candidate for each in found.tried] == list(BY_VIEWS)
-    assert "on poses held out" in found.sentence
+    assert "by poses held out" in found.sentence
     # What is printed is what poses held out by none really show: the robot's error, 3-D, a little less across.
     assert 0.5 * ROBOT[1] < found.held_out.board_mm.mean() < 4 * ROBOT[1]
 
