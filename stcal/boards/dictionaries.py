@@ -123,7 +123,7 @@ def find_family(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
     found = _detector(family).detect(np.ascontiguousarray(grey))
     return [
         (int(tag.tag_id), np.array(tag.corners, float)[::-1] - 0.5)
-        for tag in found  # type: ignore
+        for tag in found
         if tag.hamming <= FAMILIES[family].most_wrong
     ]
 

@@ -409,9 +409,9 @@ def body_truth(scene: BodyScene, image_format: str = "jpg") -> TruthFile:
     return TruthFile(
         unit="mm",
         reference_face=scene.target.faces[0].id,
-        target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},  # type: ignore
-        circles=scene.circles_target(),  # type: ignore[arg-type]
-        camera_from_target=poses,  # type: ignore[arg-type]
+        target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
+        circles=scene.circles_target(),
+        camera_from_target=poses,
     )
 
 

@@ -57,7 +57,7 @@ def connected(address: str) -> Iterator[Any]:
         except OSError as error:
             none = f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`"
             raise InputError("E-CLUSTER-WORKERS", none) from error
-        _require_same(client.run(versions), address)  # type: ignore[arg-type]
+        _require_same(client.run(versions), address)
         client.register_worker_callbacks(_limit_threads)
         yield client
 

@@ -204,7 +204,7 @@ class Keys:
             raise InputError("E-CAMERA-CONTENT", f"no {name}; add it")
         if numbers is not None and numbers.size != 1:
             raise InputError("E-CAMERA-COEFFICIENTS", f"{name} of {numbers.size} numbers; 1 needed")
-        return float(default if numbers is None else numbers[0])  # type: ignore[arg-type]
+        return float(default if numbers is None else numbers[0])
 
     def size(self) -> tuple[float, float, bool]:
         """Return width and height, px, 0 if the file states none; and whether they are from a list of both."""

@@ -218,7 +218,7 @@ def _arrays(kind: str, *parts: Centres | FaceSighting | BoardSighting) -> dict[s
 
 def _part(stored, kind: str, i: int, make: type[P], *first: str) -> P:
     """Returns part ``i`` of :func:`_arrays`, of the class ``make``; ``first`` : its fields that are no arrays."""
-    return make(*first, *(stored[f"{kind}_{i}_{f.name}"] for f in fields(make)[len(first) :]))  # type: ignore[arg-type]
+    return make(*first, *(stored[f"{kind}_{i}_{f.name}"] for f in fields(make)[len(first) :]))
 
 
 def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarray, scale: float) -> bytes:

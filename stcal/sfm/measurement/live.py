@@ -218,7 +218,7 @@ def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tr
         font, height = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit
         for words, corner, colour in names:  # over all else, each above its face
             for ink, width in (((0, 0, 0), 4), (colour, 1.5)):
-                cv2.putText(picture, words, corner, font, height, ink, round(width * unit), cv2.LINE_AA)  # type: ignore
+                cv2.putText(picture, words, corner, font, height, ink, round(width * unit), cv2.LINE_AA)  # type: ignore[call-overload]
     for place in places(centres_px).tolist():
         cv2.drawMarker(picture, place, (0, 255, 0), cv2.MARKER_CROSS, round(7 * unit), round(unit), cv2.LINE_AA)
     return picture
