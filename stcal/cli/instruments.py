@@ -378,7 +378,7 @@ def compare(
 def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
     """Returns the lens of a file, and prints the quality of a fit, or what EXIF says. ``fit`` : whether the fit is
     what is used, so that its quality is printed, or the lens itself."""
-    from stcal.io.cameras.difference import SizedLens, load_lens
+    from stcal.io.cameras.difference import load_lens
     from stcal.io.cameras.read import SIGMA_FOCAL
     from stcal.report.camera_figures import fitted_text
 
@@ -386,12 +386,12 @@ def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
         raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
     found = load_lens(path, name, (int(sides[0]), int(sides[1])))
-    lens = found.lens
-    if isinstance(lens, SizedLens) and fit:
-        print_each("note", fitted_text(lens.lens.called, lens.near, lens.lens.region is not None))
-    elif isinstance(lens, SizedLens):
-        where = ", within its valid_intrinsics_region" if lens.lens.region is not None else ""
-        print_each("note", [f"{path}: {lens.lens.called} is compared by its own projection{where}, not by a fit to it"])
+    if found.fitted and fit:
+        print_each("note", fitted_text(found.fitted))
+    elif found.fitted:
+        lens = found.fitted.lens
+        where = ", within its valid_intrinsics_region" if lens.region is not None else ""
+        print_each("note", [f"{path}: {lens.called} is compared by its own projection{where}, not by a fit to it"])
     elif found.told:
         accuracy = f"f to {SIGMA_FOCAL:.0%}, distortion unknown"
         start = "a start for `run --refine-camera`, not for measuring"

@@ -37,11 +37,11 @@ def shown(camera: Camera) -> list[str]:
     return lines
 
 
-def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[str]:
-    """Return lines on the quality of a fitted lens; ``region`` : whether the file states where the lens is valid."""
-    where = "its valid_intrinsics_region" if region else "the image"
+def fitted_text(found: FittedLens) -> list[str]:
+    """Return lines on the quality of a fitted lens."""
+    where = "the image" if found.lens.region is None else "its valid_intrinsics_region"
     fitted = f"{found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off"
-    lines = [f"{called} has no place here: {fitted} over {where}, {found.most_px:.2g} px at most"]
+    lines = [f"{found.lens.called} has no place here: {fitted} over {where}, {found.most_px:.2g} px at most"]
     turn = np.degrees(found.camera_from_lens.log()[:3])
     if turn.any():
         turned = (

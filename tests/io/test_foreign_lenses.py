@@ -10,7 +10,7 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
-from stcal.io.cameras.difference import SizedLens, compare_cameras, fit_lens
+from stcal.io.cameras.difference import compare_cameras, fit_lens
 from stcal.io.cameras.foreign_lenses import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_camera, read_lens
 from tests.outcome import refuses
@@ -286,7 +286,7 @@ def test_a_lens_is_fitted_where_it_was_determined():
 def test_lenses_are_compared_by_their_own_projections():
     """Not by the models that are fitted to them, which are a pixel off."""
     lens, camera, turn = turned_lens([1.0, 2.0, 0.0], REGION)
-    sized = SizedLens(lens, WIDTH, HEIGHT, fit_lens(lens, WIDTH, HEIGHT))
+    sized = fit_lens(lens, WIDTH, HEIGHT)
     pixels = np.random.default_rng(0).uniform([300, 200], [900, 600], (50, 2))
     np.testing.assert_allclose(lens.project(sized.rays(pixels)), pixels, atol=1e-6)
     for one, two in ((sized, camera), (camera, sized)):

@@ -1,6 +1,6 @@
 """Difference between two cameras, and the fit of a supported camera model to a lens of another model."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +37,27 @@ class CameraDifference:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SizedLens:
-    """A lens of an unsupported model over an image; ``near`` : the fitted model, from which rays are sought."""
+class FittedLens:
+    """A lens of an unsupported model over an image, the camera that was fitted to it, and its RMS and largest residual
+    where the lens was determined. ``share`` : of the azimuths in which that ends within 89° of the axis;
+    ``camera_from_lens`` : the rotation of the camera's axes, the identity unless it helps much."""
 
     lens: ForeignLens
-    width: int
-    height: int
-    near: "FittedLens"
+    camera: Camera
+    rms_px: float
+    most_px: float
+    share: float
+    camera_from_lens: Rigid
+
+    @property
+    def width(self) -> int:
+        """Width of the image, px."""
+        return self.camera.width
+
+    @property
+    def height(self) -> int:
+        """Height of the image, px."""
+        return self.camera.height
 
     def project(self, rays: np.ndarray) -> np.ndarray:
         """Return the pixels (n, 2) of rays (n, 3)."""
@@ -51,7 +65,7 @@ class SizedLens:
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Return the unit rays (n, 3) of pixels (n, 2) by Newton's method; nan where there is none."""
-        unit = self.near.camera_from_lens.inverse() @ rays(self.near.camera, pixels)
+        unit = self.camera_from_lens.inverse() @ rays(self.camera, pixels)
         unit /= np.linalg.norm(unit, axis=1)[:, None]
         for _ in range(STEPS):
             off = self.project(unit) - pixels
@@ -70,7 +84,7 @@ class SizedLens:
 
 
 @require_arguments
-def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
+def compare_cameras(one: Camera | FittedLens, two: Camera | FittedLens) -> CameraDifference:
     """Return how many pixels apart two cameras see the same ray, after the turn that brings them nearest.
 
     Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
@@ -87,7 +101,7 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
         raise InputError("E-CAMERA-SIZES-DIFFER", f"{fault}; files of one image size needed")
     pixels = image_grid(one)
     flat = pixels.reshape(-1, 2)
-    first, second = (each.rays(flat) if isinstance(each, SizedLens) else rays(each, flat) for each in (one, two))
+    first, second = (each.rays(flat) if isinstance(each, FittedLens) else rays(each, flat) for each in (one, two))
     good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
     if good.sum() < LEAST_POINTS:
         fault = f"{good.sum()} of {len(flat)} pixels have a ray in both cameras"
@@ -104,13 +118,13 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     turn = turned(least_squares(off, np.zeros(3), diff_step=STEP_RAD, method="lm", xtol=SETTLED, ftol=SETTLED).x)
     apart = np.full(flat.shape, np.nan)
     seen = two.project(turn @ first[good])
-    if isinstance(two, SizedLens):
+    if isinstance(two, FittedLens):
         seen = np.where(two.lens.determined(seen)[:, None], seen, np.nan)
     apart[good] = seen - flat[good]
     return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
 
 
-def image_grid(camera: Camera | SizedLens) -> np.ndarray:
+def image_grid(camera: Camera | FittedLens) -> np.ndarray:
     """Return a grid of pixels (r, c, 2) over the image, edges included."""
     count = max(round(CELLS * camera.width / camera.height), 2), CELLS
     x, y = (np.linspace(-0.5, side - 0.5, n) for side, n in zip((camera.width, camera.height), count, strict=True))
@@ -141,19 +155,6 @@ SMALL = 1e-6
 """Step about the axis, in normalised coordinates, from which the initial focal lengths are computed."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedLens:
-    """The camera that was fitted to a lens, and its RMS and largest residual where the lens was determined.
-    ``share`` : of the azimuths in which that ends within 89° of the axis; ``camera_from_lens`` : the rotation of the
-    camera's axes, the identity unless it helps much."""
-
-    camera: Camera
-    rms_px: float
-    most_px: float
-    share: float
-    camera_from_lens: Rigid = field(default_factory=lambda: Rigid())
-
-
 @require_arguments
 def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> LoadedLens:
     """Load a camera from a file also of a model that is not supported, to which one is fitted, or from EXIF.
@@ -177,7 +178,7 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     if isinstance(lens, CameraModel) or not (width and height):
         return LoadedLens(sized_camera(lens, path, (width, height)))
     with named(f"camera file {path}"):
-        return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
+        return LoadedLens(fit_lens(lens, width, height))
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
@@ -190,7 +191,8 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
             camera, from_lens = _fitted(model, rays, pixels, lens, (width, height), turn)
             off = np.linalg.norm(camera.project(from_lens @ rays) - pixels, axis=1)
             if not fits or not off.max() > fits[-1].most_px - AS_GOOD_PX:
-                fits.append(FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share, from_lens))
+                figures = float(np.sqrt((off**2).mean())), float(off.max()), share
+                fits.append(FittedLens(lens, camera, *figures, from_lens))
         return fits[-1]
 
     straight = best(turn=False)

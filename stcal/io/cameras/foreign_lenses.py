@@ -2,9 +2,10 @@
 
 import re
 import sqlite3
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,17 @@ class ForeignLens:
     def __post_init__(self):  # a number beyond all numbers is no pixel, and no warning
         object.__setattr__(self, "project", np.errstate(all="ignore")(self.project))
 
+    @classmethod
+    def of(
+        cls, called: str, lens, distorted: Callable[[np.ndarray], np.ndarray], size: Sequence[float], skew: float = 0.0
+    ) -> "ForeignLens":
+        """Return the lens of fx, fy, cx, cy, px, with ``skew`` as of :func:`of_opencv`. ``distorted`` : returns the
+        distorted normalised coordinates (n, 2) of rays (n, 3); ``size`` : width and height, 0 if not stated."""
+        fx, fy, cx, cy = lens
+        transposed, centre = np.array([[fx, 0], [skew, fy]]), np.array([cx, cy])
+        width, height = (int(side) or None for side in size)
+        return cls(called, lambda rays: distorted(rays) @ transposed + centre, width, height)
+
     def determined(self, pixels: np.ndarray) -> np.ndarray:
         """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
         return np.ones(len(pixels), bool) if self.region is None else inside(self.region, pixels)
@@ -80,20 +92,17 @@ def of_colmap(model: str, width: float, height: float, params) -> CameraModel | 
     camera_from_colmap("PINHOLE", width, height, [*focal, *others[:2]])  # refuses impossible values
     coefficients, centre = np.array(others[2:]), np.array(others[:2]) - COLMAP_PIXEL_ORIGIN
     require_finite(coefficients)
-
-    def project(rays: np.ndarray) -> np.ndarray:
-        return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), coefficients)
-
-    return ForeignLens(f"COLMAP's {model}", project, int(width), int(height))
+    distorted = partial(_colmap_normalised, model.removeprefix("SIMPLE_"), coefficients)
+    return ForeignLens.of(f"COLMAP's {model}", [*focal, *centre], distorted, (width, height))
 
 
-def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndarray:
+def _colmap_normalised(model: str, own: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Return the distorted normalised coordinates (n, 2) of rays (n, 3); ``own`` : parameters of the model."""
     if model == "EUCM":
-        return _on_plane(rays, "eucm", own)
+        return _on_plane("eucm", own, rays)
     xy = rays[:, :2] / rays[:, 2:]
     if model == "FOV":
-        return _of_fov(xy, own[0])
+        return _of_fov(own[0], xy)
     r2 = (xy**2).sum(axis=1)
     if model == "DIVISION":  # ideal = distorted / (1 + k r²)
         return xy * (2 / (1 + np.sqrt(1 - 4 * own[0] * r2)))[:, None]
@@ -172,15 +181,14 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, skew: float 
         return camera_from_opencv(lens, given, False, width, height)
     camera_from_opencv(lens, given[:8], False, width, height)  # refuses impossible values
     require_finite(given)
-    fx, fy, cx, cy = lens
-    matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
+    still = np.zeros(3)
 
-    def project(rays: np.ndarray) -> np.ndarray:
-        return cv2.projectPoints(np.array(rays, float), still, still, matrix, given)[0].reshape(-1, 2)
+    def distorted(rays: np.ndarray) -> np.ndarray:
+        return cv2.projectPoints(np.array(rays, float), still, still, np.eye(3), given)[0].reshape(-1, 2)
 
     tilted = len(given) == 14 and given[12:].any()
     called = "OpenCV's lens with a tilted sensor" if tilted else "OpenCV's lens with thin prisms"
-    return ForeignLens(called, project, int(width) or None, int(height) or None)
+    return ForeignLens.of(called, lens, distorted, (width, height))
 
 
 def of_parts(
@@ -194,17 +202,16 @@ def of_parts(
         raise InputError("E-CAMERA-SKEW", f"skew {skew:g} px, less than fx needed; correct it")
     if not (np.isfinite(xi) and xi >= 0):
         raise InputError("E-CAMERA-CONTENT", f"xi {xi:g}; a number from 0 needed")
-    (fx, fy), (cx, cy) = camera.focal, camera.centre
-    matrix = np.array([[fx, skew, cx], [0, fy, cy]])
-    flat = Camera(1, 1, [1, 1], [0, 0], camera.distortion, kind == "equidistant")
-
-    def project(rays: np.ndarray) -> np.ndarray:
-        xy = _on_plane(rays, "omni", np.array([xi])) if kind == "unified" else rays[:, :2] / rays[:, 2:]
-        distorted = flat.distort(xy)
-        return np.column_stack([distorted, np.ones(len(distorted))]) @ matrix.T
-
+    distort = without_matrix(camera.distortion, kind == "equidistant")
     called = f"a unified lens with ξ = {xi:g}" if kind == "unified" else "a lens with skewed axes"
-    return ForeignLens(called, project, camera.width, camera.height)
+    return ForeignLens.of(
+        called, lens, lambda rays: distort(_on_plane("omni", np.array([xi]), rays)), (width, height), skew
+    )
+
+
+def without_matrix(distortion: np.ndarray, fisheye: bool) -> Callable[[np.ndarray], np.ndarray]:
+    """Return :meth:`Camera.distort` of a camera with this distortion (12,)."""
+    return Camera(1, 1, [1, 1], [0, 0], distortion, fisheye).distort
 
 
 def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size) -> ForeignLens:
@@ -220,22 +227,19 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
     if not of_model or not np.isfinite([*numbers, *coefficients]).all():
         fault = f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, finite numbers"
         raise InputError("E-CAMERA-COEFFICIENTS", f"{fault}; {numbers.size} and {coefficients.size} found")
-    shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
-    if (focal <= 0).any():
-        raise InputError("E-CAMERA-FOCAL", f"focal length {focal.tolist()}; positive numbers needed")
-    width, height = map(int, size)
-    fisheye = distortion == "equidistant"
-    in_opencv_order = opencv_lens(np.zeros(0) if distortion == "fov" else coefficients, fisheye)[0]
-    flat = Camera(1, 1, [1, 1], [0, 0], in_opencv_order, fisheye)
-
-    def project(rays: np.ndarray) -> np.ndarray:
-        xy = _on_plane(rays, lens, shape)
-        return centre + focal * (_of_fov(xy, coefficients[0]) if distortion == "fov" else flat.distort(xy))
-
-    return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None)
+    shape, matrix = numbers[:first], numbers[first:]
+    if (matrix[:2] <= 0).any():
+        raise InputError("E-CAMERA-FOCAL", f"focal length {matrix[:2].tolist()}; positive numbers needed")
+    if distortion == "fov":
+        distort = partial(_of_fov, coefficients[0])
+    else:
+        fisheye = distortion == "equidistant"
+        distort = without_matrix(opencv_lens(coefficients, fisheye)[0], fisheye)
+    called = f"Kalibr's {lens} with {distortion}"
+    return ForeignLens.of(called, matrix, lambda rays: distort(_on_plane(lens, shape, rays)), size)
 
 
-def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
+def _on_plane(lens: str, shape: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Return the normalised coordinates (n, 2) of rays (n, 3); nan where a ray has none."""
     below, r2, length = rays[:, 2], (rays[:, :2] ** 2).sum(axis=1), np.linalg.norm(rays, axis=1)
     if lens in ("omni", "ds"):
@@ -246,7 +250,7 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
     return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
 
 
-def _of_fov(xy: np.ndarray, omega: float) -> np.ndarray:
+def _of_fov(omega: float, xy: np.ndarray) -> np.ndarray:
     r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
     return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
 
@@ -261,22 +265,20 @@ def of_splines(name: str, numbers: list[float], width: float, height: float) -> 
     if columns <= MARGIN[order] + 1 or len(numbers) != needed or not 0 < wide < 360:
         size = f"{len(numbers)} intrinsics of {columns}×{rows} points; {needed} needed"
         raise InputError("E-CAMERA-COEFFICIENTS", size)
-    focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
     per_u = (columns - 1 - MARGIN[order]) / (4 * np.tan(np.radians(wide) / 4))
     middle = np.array([(columns - 1) / 2, (rows - 1) / 2])
 
-    def project(rays: np.ndarray) -> np.ndarray:
+    def distorted(rays: np.ndarray) -> np.ndarray:
         u = 2 * rays[:, :2] / (np.linalg.norm(rays, axis=1) + rays[:, 2])[:, None]
         at = (u * per_u + middle).T[::-1]
         settings = {"order": order, "prefilter": False, "mode": "nearest"}
         from scipy.ndimage import map_coordinates  # of this model alone; a tenth of the start of a run
 
         moved = [map_coordinates(c, at, **settings) for c in np.moveaxis(control, 2, 0)]
-        return centre + focal * (u + np.column_stack(moved))
+        return u + np.column_stack(moved)
 
-    called = f"mrcal's splines of {columns}×{rows} points"
-    return ForeignLens(called, project, int(width), int(height))
+    return ForeignLens.of(f"mrcal's splines of {columns}×{rows} points", numbers[:4], distorted, (width, height))
 
 
 def refused(camera: Camera, form: str, why: str) -> InputError:
@@ -300,12 +302,11 @@ def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens
     camera_from_opencv([fx, fy, cx, cy], np.zeros(4), False, width, height)  # refuses impossible values
     axis = np.array([np.sin(alpha) * np.cos(beta), np.sin(beta), np.cos(alpha) * np.cos(beta)])
 
-    def project(rays: np.ndarray) -> np.ndarray:
+    def distorted(rays: np.ndarray) -> np.ndarray:
         along = rays @ axis
         tau = (rays**2).sum(axis=1) / along**2 - 1
         bent = rays + (r[0] + tau * (r[1] + tau * r[2]))[:, None] * (rays - along[:, None] * axis)
         inside = (along > 0) & (bent[:, 2] > 0)
-        xy = np.array([cx, cy]) + np.array([fx, fy]) * bent[:, :2] / bent[:, 2:]
-        return np.where(inside[:, None], xy, np.nan)
+        return np.where(inside[:, None], bent[:, :2] / bent[:, 2:], np.nan)
 
-    return ForeignLens("mrcal's CAHVOR", project, int(width), int(height))
+    return ForeignLens.of("mrcal's CAHVOR", numbers[:4], distorted, (width, height))

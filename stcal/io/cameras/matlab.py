@@ -27,7 +27,8 @@ PIXEL_ORIGIN = 1.0
 STRUCTURE = "RadialDistortion"
 MARKS = (STRUCTURE, "MappingCoefficients")
 """Fields that tell a structure that ``toStruct`` makes of a camera, of a fisheye the second."""
-BOUGUET = ("fc", "cc", "kc")
+BOUGUET = {"fc": 2, "cc": 2, "kc": 5}
+"""Variables of Bouguet's toolbox that hold the lens, and their numbers of values."""
 BOUGUET_SIGMAS = 3.0
 """Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of …")."""
 TAKEN = {
@@ -182,22 +183,21 @@ def _numbers(values: Mapping, key: str, count: int = 0, needed: bool = False) ->
 def _from_bouguet(values: Mapping) -> CameraModel | ForeignLens:
     others = {key: value for key, value in values.items() if key not in BOUGUET_TAKEN and not key.startswith("__")}
     require_known({key: _plain_value(value) for key, value in others.items()}, BOUGUET_HARMLESS)
-    focal, centre, k = (_numbers(values, key, n, True) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
+    focal, centre, k = (_numbers(values, key, count, True) for key, count in BOUGUET.items())
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
     lens = of_opencv([*focal, *centre], k, width, height, skew)
-    if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV":
+    stated = all(f"{key}_error" in values for key in BOUGUET)
+    if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV" or not stated:
         return lens
-    if not all(f"{key}_error" in values for key in BOUGUET):
-        return lens
-    errors = [_numbers(values, f"{key}_error", n, True) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
+    errors = [_numbers(values, f"{key}_error", count, True) for key, count in BOUGUET.items()]
     sigma = np.concatenate(errors)[:8] / BOUGUET_SIGMAS
     return replace(lens, covariance=np.diag(sigma**2)) if (sigma > 0).all() and np.isfinite(sigma).all() else lens
 
 
 def is_script(text: str) -> bool:
     """Return True if a text assigns Bouguet's ``fc`` and ``cc`` as his ``Calib_Results.m`` does."""
-    return all(re.search(rf"(?m)^\s*{key}\s*=\s*\[", text) for key in BOUGUET[:2])
+    return all(re.search(rf"(?m)^\s*{key}\s*=\s*\[", text) for key in ("fc", "cc"))
 
 
 def from_script(text: str, _: str) -> CameraModel | ForeignLens:
@@ -211,7 +211,7 @@ def from_script(text: str, _: str) -> CameraModel | ForeignLens:
             if name in values and not np.array_equal(np.asarray(values[name]), numbers):
                 raise InputError("E-CAMERA-REPEATED", f"{name} twice; leave one in")
             values[name] = numbers
-    if BOUGUET[2] not in values:
+    if "kc" not in values:
         raise InputError("E-CAMERA-CONTENT", "no kc; 5 numbers needed")
     return _from_bouguet(values)
 

@@ -15,7 +15,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import CovarianceRows, require_covariance
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.camera_model import CameraModel, camera_from_opencv
-from stcal.io.cameras.foreign_lenses import ForeignLens, one_of, refused, require_finite
+from stcal.io.cameras.foreign_lenses import ForeignLens, one_of, refused, require_finite, without_matrix
 from stcal.io.cameras.keys import pass_over, require_known
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
@@ -65,22 +65,21 @@ def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
 
 def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: float) -> ForeignLens:
     """Return the lens by Metashape's formula (PhotoScan's manual, version 1.2, appendix C, with ``p3`` and ``p4``)."""
-    camera = camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height)
+    camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height)  # refuses impossible values
     require_finite([v[name] for name in (*NAMES, *MORE_NAMES)])
-    matrix = np.array([[lens[0], v["b2"], lens[2]], [0, lens[1], lens[3]]])
-    flat = Camera(1, 1, [1, 1], [0, 0], np.zeros(12), kind != "frame")
+    ideal = without_matrix(np.zeros(12), kind != "frame")
 
-    def project(rays: np.ndarray) -> np.ndarray:
-        x, y = flat.distort(rays[:, :2] / rays[:, 2:]).T
+    def distorted(rays: np.ndarray) -> np.ndarray:
+        x, y = ideal(rays[:, :2] / rays[:, 2:]).T
         r2 = x * x + y * y
         radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * (v["k3"] + r2 * v["k4"])))
         grown = 1 + r2 * (v["p3"] + r2 * v["p4"])
         across = v["p1"] * (r2 + 2 * x * x) + 2 * v["p2"] * x * y
         up = v["p2"] * (r2 + 2 * y * y) + 2 * v["p1"] * x * y
-        return np.column_stack([x * radial + across * grown, y * radial + up * grown, np.ones(len(x))]) @ matrix.T
+        return np.column_stack([x * radial + across * grown, y * radial + up * grown])
 
     own = ", ".join(f"{name} = {v[name]:g}" for name in ("b2", "k4", "p3", "p4") if v[name])
-    return ForeignLens(f"Metashape's lens with {own}", project, camera.width, camera.height)
+    return ForeignLens.of(f"Metashape's lens with {own}", lens, distorted, (width, height), v["b2"])
 
 
 def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:

@@ -34,7 +34,7 @@ from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
 if TYPE_CHECKING:
-    from stcal.io.cameras.difference import FittedLens, SizedLens
+    from stcal.io.cameras.difference import FittedLens
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
 FILM_DIAGONAL_MM = 43.2666
@@ -52,18 +52,18 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 class LoadedLens:
     """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
 
-    lens: "Camera | SizedLens"
+    lens: "Camera | FittedLens"
     told: str = ""
 
     @property
     def camera(self) -> Camera:
         """The camera; of a lens of another model the one that was fitted to it."""
-        return self.lens if isinstance(self.lens, Camera) else self.lens.near.camera
+        return self.lens if isinstance(self.lens, Camera) else self.lens.camera
 
     @property
     def fitted(self) -> "FittedLens | None":
         """Quality of the fit, None where the file's model is supported."""
-        return None if isinstance(self.lens, Camera) else self.lens.near
+        return None if isinstance(self.lens, Camera) else self.lens
 
 
 def is_photograph(path: str | Path) -> bool:
