@@ -49,8 +49,6 @@ class DotLabel(str):
 
 Label: TypeAlias = CircleLabel | DotLabel
 L = TypeVar("L", CircleLabel, DotLabel)
-PARSED = (CircleLabel, DotLabel)
-"""The types of a label as a tuple, by which ``isinstance`` tells them in a third of the time."""
 
 
 def parse_label(text: str) -> Label:
@@ -71,7 +69,7 @@ def parse_label(text: str) -> Label:
 
 def parse_labels(texts: Iterable[str]) -> tuple[Label, ...]:
     """Parses each text with :func:`parse_label`."""
-    return tuple(text if isinstance(text, PARSED) else parse_label(text) for text in texts)
+    return tuple(map(parse_label, texts))
 
 
 def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:

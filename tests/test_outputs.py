@@ -85,8 +85,7 @@ def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("poses.csv").write_text("an earlier table")
     given = {"camera": tmp_path / "none.txt", "faces": tmp_path / "none.json", "out": Path("poses.csv")}
-    with fails_with("E-OUTPUT-EXISTS … --out poses.csv"):
-        COMMANDS["sfm measure"](**given, images=tmp_path / "images")
+    refuses("E-OUTPUT-EXISTS … --out poses.csv", COMMANDS["sfm measure"], **given, images=tmp_path / "images")
     with fails_with("E-FILE-UNREADABLE … none.json"):
         COMMANDS["sfm measure"](
             **given, target=None, board=None, sigma_factor=None, json_file=None, report=None, joints=None,

@@ -21,7 +21,7 @@ from stcal.cli.help import FIRST_WEEK, PANELS
 from stcal.cli.main import app, main
 from stcal.errors import lacks_memory
 from tests.commands import COMMANDS
-from tests.outcome import INPUT, assert_error, ended, fails_with
+from tests.outcome import INPUT, assert_error, ended, fails_with, refuses
 
 CLI = Path(stcal.__file__).parent / "cli"
 
@@ -263,8 +263,7 @@ def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, v
         assert capsys.readouterr() == ("", f"warning: {verdict}\n")
         rule(False, [], None)
         if failed:
-            with fails_with("E-CHECKS-FAILED … a"):
-                rule(True, failed, None, verdict)
+            refuses("E-CHECKS-FAILED … a", rule, True, failed, None, verdict)
     with terminal.manner(False, False):
         rule(False, failed, None, verdict)
     assert capsys.readouterr() == ("", "")

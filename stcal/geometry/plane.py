@@ -190,14 +190,6 @@ Descend = Callable[[Poses, float], Minima]
 """Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneMinima:
-    """One or two distinct minima, the better one first."""
-
-    minima: Minima
-    outlier_limit: float  # length, in stated σ, beyond which a residual is an outlier
-
-
 def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
     """Return h poses camera_from_target with the depths about the plane's origin mirrored along the line of sight."""
     middle = poses.rotation @ target_from_plane.translation + poses.translation
@@ -217,12 +209,13 @@ def distinct(poses: Poses, normal: np.ndarray, robust_sigma: float = 1.0) -> boo
 
 def two_minima(
     descend_near: Callable[[Poses], Descend], start: Poses, target_from_plane: Rigid, failure: str, planar: bool = True
-) -> PlaneMinima:
-    """Return one or two distinct minima of the residuals of single points. ``descend_near`` : whitens residuals near
-    one pose, alike for both minima, and returns the descent; ``start`` : one pose, to which its mirror image is
-    added, or two, the likelier one first; ``target_from_plane`` : origin in the middle of the points, Z along the
-    normal; ``planar`` : whether all points are in the plane, so that two starts that end alike may have been on one
-    side, and the mirror image of their minimum is tried."""
+) -> tuple[Minima, float]:
+    """Return one or two distinct minima of the residuals of single points, the better one first, and the length, in
+    stated σ, beyond which a residual is an outlier. ``descend_near`` : whitens residuals near one pose, alike for both
+    minima, and returns the descent; ``start`` : one pose, to which its mirror image is added, or two, the likelier one
+    first; ``target_from_plane`` : origin in the middle of the points, Z along the normal; ``planar`` : whether all
+    points are in the plane, so that two starts that end alike may have been on one side, and the mirror image of their
+    minimum is tried."""
     poses = start + mirrored(start, target_from_plane) if len(start) == 1 else start
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
@@ -240,7 +233,7 @@ def two_minima(
         again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
         minima = minima.rows([0]).plus(again).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
-    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma)
+    return minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:

@@ -220,9 +220,8 @@ def locate(
     failure = f"{where}: no pose found; check layout and camera file"
     while True:
         middle = Rigid(np.eye(3), np.append(problem.xy.mean(0), 0.0))
-        two = two_minima(partial(descent_near, problem), start, middle, failure)
-        minima = two.minima
-        excess = minima.length[0].reshape(-1, 4).max(1) / two.outlier_limit
+        minima, limit = two_minima(partial(descent_near, problem), start, middle, failure)
+        excess = minima.length[0].reshape(-1, 4).max(1) / limit
         worst = int(excess.argmax())
         if excess[worst] <= 1:
             break

@@ -18,15 +18,11 @@ import cv2
 import numpy as np
 
 from tests.fuzzing import structures
+from tests.fuzzing.structures import pick
 
 Mutation = Callable[[Path, np.random.Generator], str]
 HUGE_BYTES = 3 << 30
 IMAGES = (".jpg", ".png")
-
-
-def pick(rng: np.random.Generator, values):
-    """One of them; not an array's copy of it."""
-    return values[int(rng.integers(len(values)))]
 
 
 def _bytes(said: str, change: Callable[[bytes, np.random.Generator], bytes]) -> Mutation:

@@ -41,6 +41,11 @@ XML = {
 }
 
 
+def pick(rng: np.random.Generator, values):
+    """One of them; not an array's copy of it."""
+    return values[int(rng.integers(len(values)))]
+
+
 class Raw(str):
     """Stands in the file as it is."""
 
@@ -62,22 +67,18 @@ def changed(tree, rng: np.random.Generator):
     if not found:
         return [], "a list"
     depth = int(rng.integers(1, 1 + max(len(p) for p in found)))  # values far down are many: each depth as often
-    path = _pick(rng, [p for p in found if len(p) == depth])
+    path = pick(rng, [p for p in found if len(p) == depth])
     holder = tree
     for key in path[:-1]:
         holder = holder[key]
-    key, change = path[-1], _pick(rng, CHANGES)
+    key, change = path[-1], pick(rng, CHANGES)
     said = change(holder, key, rng)
     return tree, f"{'.'.join(map(str, path))}: {said}"
 
 
-def _pick(rng: np.random.Generator, values):
-    return values[int(rng.integers(len(values)))]
-
-
 def _put(values):
     def change(holder, key, rng) -> str:
-        holder[key] = _pick(rng, values)
+        holder[key] = pick(rng, values)
         return repr(holder[key])[:40]
 
     return change
@@ -89,12 +90,12 @@ def _gone(holder, key, rng) -> str:
 
 
 def _kind(holder, key, rng) -> str:
-    holder[key] = _pick(rng, [None, [], {}, [[]], {"x": 1}, [None], [1, "a"], True, holder[key], [holder[key]]])
+    holder[key] = pick(rng, [None, [], {}, [[]], {"x": 1}, [None], [1, "a"], True, holder[key], [holder[key]]])
     return repr(holder[key])[:40]
 
 
 def _sibling(holder, key, rng) -> str:
-    other = _pick(rng, list(holder) if isinstance(holder, dict) else range(len(holder)))
+    other = pick(rng, list(holder) if isinstance(holder, dict) else range(len(holder)))
     holder[key], holder[other] = holder[other], holder[key]
     return f"exchanged with {other}"
 
@@ -103,13 +104,13 @@ def _more(holder, key, rng) -> str:
     if isinstance(holder, list):
         holder.insert(int(rng.integers(len(holder) + 1)), holder[key])
         return "twice"
-    other = _pick(rng, KEYS)
+    other = pick(rng, KEYS)
     holder[other] = holder.pop(key) if rng.random() < 0.5 else holder[key]
     return f"as {other[:10]!r}"
 
 
 def _scaled(holder, key, rng) -> str:
-    factor = _pick(rng, [1e-3, 1e3, -1, 0, 1e300, 25.4])
+    factor = pick(rng, [1e-3, 1e3, -1, 0, 1e300, 25.4])
     holder[key] = _times(holder[key], factor)
     return f"times {factor:g}"
 
@@ -151,8 +152,8 @@ def number_replaced(text: str, rng: np.random.Generator) -> tuple[str, str]:
     found = list(NUMBER.finditer(text))
     if not found:
         return text + "1", "a number more"
-    place = _pick(rng, found)
-    number = str(_pick(rng, NUMBERS)) if rng.random() < 0.7 else _pick(rng, [*WORDS, *TEXTS])
+    place = pick(rng, found)
+    number = str(pick(rng, NUMBERS)) if rng.random() < 0.7 else pick(rng, [*WORDS, *TEXTS])
     return text[: place.start()] + number + text[place.end() :], f"{place[0]} → {number[:20]!r}"
 
 
@@ -162,14 +163,14 @@ Rows = list[list[str]]
 def _cell(rows: Rows, rng) -> str:
     i = int(rng.integers(1, len(rows))) if len(rows) > 1 else 0
     j = int(rng.integers(len(rows[i])))
-    cell = str(_pick(rng, NUMBERS)) if rng.random() < 0.6 else _pick(rng, [*WORDS, *TEXTS, '"', " "])
+    cell = str(pick(rng, NUMBERS)) if rng.random() < 0.6 else pick(rng, [*WORDS, *TEXTS, '"', " "])
     rows[i][j] = cell
     return f"line {i + 1}, {rows[0][j] if j < len(rows[0]) else j}: {cell[:20]!r}"
 
 
 def _column(rows: Rows, rng) -> str:
     j = int(rng.integers(len(rows[0])))
-    name, value = rows[0][j], str(_pick(rng, NUMBERS))
+    name, value = rows[0][j], str(pick(rng, NUMBERS))
     for row in rows[1:]:
         row[j : j + 1] = [value]
     return f"all {name}: {value}"
@@ -190,7 +191,7 @@ def _columns_exchanged(rows: Rows, rng) -> str:
 
 
 def _column_named(rows: Rows, rng) -> str:
-    j, name = int(rng.integers(len(rows[0]))), _pick(rng, [*KEYS, "x_mm", "q1_rad", *TEXTS])
+    j, name = int(rng.integers(len(rows[0]))), pick(rng, [*KEYS, "x_mm", "q1_rad", *TEXTS])
     old, rows[0][j] = rows[0][j], name
     return f"{old} as {name[:20]!r}"
 
@@ -211,7 +212,7 @@ def _row_gone(rows: Rows, rng) -> str:
 
 def _row_twice(rows: Rows, rng) -> str:
     i = int(rng.integers(len(rows)))
-    rows[i:i] = [list(rows[i])] * int(_pick(rng, [1, 3, 200]))
+    rows[i:i] = [list(rows[i])] * int(pick(rng, [1, 3, 200]))
     return f"line {i + 1} again"
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stcal.geometry.camera import Camera
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 WIDTH, HEIGHT = 5184, 3456
 small = st.floats(-1, 1)
@@ -76,8 +76,7 @@ def test_barrel_inverts_up_to_its_fold(radius):
 def test_barrel_refuses_every_point_beyond_its_fold(radius):
     # The cubic has a root there too, at −2.1 and less: the mirrored side of the image, and Newton finds it.
     for xy in ([radius, 0.0], [-0.6 * radius, 0.8 * radius], [[0.1, 0.2], [0.0, radius]]):
-        with fails_with("E-CAMERA-FOLDED"):
-            BARREL.undistort(xy)
+        refuses("E-CAMERA-FOLDED", BARREL.undistort, xy)
 
 
 @pytest.mark.parametrize(
@@ -97,8 +96,7 @@ def test_barrel_refuses_every_point_beyond_its_fold(radius):
 )
 def test_camera_refuses(change, message):
     good = {"width": WIDTH, "height": HEIGHT, "focal": [1e3, 1e3], "centre": [0, 0], "distortion": np.zeros(8)}
-    with fails_with(message):
-        Camera(**(good | change))
+    refuses(message, Camera, **good | change)
 
 
 FISHEYES = st.tuples(small, small, small, small).map(lambda c: np.array(c) * [0.05, 0.01, 2e-3, 5e-4])
@@ -162,8 +160,7 @@ STRAIGHT = fisheye_of([0.0, 0.0, 0.0, 0.0])
     ],
 )
 def test_places_without_a_ray_are_named(function, place, message):
-    with fails_with(message):
-        function(place)
+    refuses(message, function, place)
 
 
 def test_just_before_a_right_angle_there_is_a_ray():

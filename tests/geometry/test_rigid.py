@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Affine, Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 TOLERANCE_MM = 1e-9
 """Rounding: three products of coordinates below 1e4 mm lose about 1e4 · 1e-16 · 10 = 1e-11 mm."""
@@ -134,8 +134,7 @@ def _changed(row, column, value):
     ],
 )
 def test_what_is_no_transform_is_refused(make, given, message):
-    with fails_with(message):
-        make(*given)
+    refuses(message, make, *given)
 
 
 def test_from_matrix_repairs_the_rounding_of_a_text_file():
@@ -273,8 +272,7 @@ OFF_ZERO = LINE + np.array([1000.0, 0, 0])  # a line that misses the origin
     ],
 )
 def test_degenerate(align, xyz_a, xyz_b, weights, message):
-    with fails_with(message):
-        align(xyz_a, xyz_b, weights)
+    refuses(message, align, xyz_a, xyz_b, weights)
 
 
 def test_affine_transforms_compose_and_invert():

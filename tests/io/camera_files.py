@@ -31,6 +31,18 @@ def unified(xi: float, k, lens=LENS, skew: float = 0.0, rays=RAYS) -> np.ndarray
     return perspective(k, lens, skew, np.column_stack([unit[:, :2] / (unit[:, 2:] + xi), np.ones(len(unit))]))
 
 
+def metashape(xy, f: float, b, k, p, grown=(0.0, 0.0), centre=LENS[2:]) -> np.ndarray:
+    """Pixels of normalised coordinates: Agisoft's manual, appendix D, with the p3 and p4 of PhotoScan's, version 1.2,
+    appendix C. ``b`` : b1, b2; ``grown`` : p3, p4."""
+    x, y = xy.T
+    r2 = x * x + y * y
+    radial = 1 + sum(each * r2**i for i, each in enumerate(k, 1))
+    more = 1 + grown[0] * r2 + grown[1] * r2**2
+    moved_x = x * radial + (p[0] * (r2 + 2 * x * x) + 2 * p[1] * x * y) * more
+    moved_y = y * radial + (p[1] * (r2 + 2 * y * y) + 2 * p[0] * x * y) * more
+    return np.column_stack([centre[0] + moved_x * (f + b[0]) + moved_y * b[1], centre[1] + moved_y * f])
+
+
 NEW_NAMES = ("camera_matrix", "distortion_coefficients", "image_width", "image_height")
 
 
@@ -99,8 +111,9 @@ CHAIN = (
     "  rostopic: /cam0/image_raw\n"
 )
 MRCAL = (
-    "{\n    'lensmodel': 'LENSMODEL_OPENCV5',\n    'intrinsics': [ 911.5, 910.25, 639, 359, -0.2, 0.05, 0.001, "
-    "-0.0005, 0.01 ],\n    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n    'imagersize': [ 1280, 720 ],\n}\n"
+    "# written by hand\n{\n    'lensmodel':  'LENSMODEL_OPENCV5',\n    # fx,fy,cx,cy,distortion0,distortion1,...\n"
+    "    'intrinsics': [ 911.5, 910.25, 639, 359, -0.2, 0.05, 0.001, -0.0005, 0.01, ],\n"
+    "    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n    'imagersize': [ 1280, 720 ],\n}\n"
 )
 OLD_NAMES = ("Camera_Matrix", "Distortion_Coefficients", "image_Width", "image_Height")
 SKEWED = "911.5 0.7 639. 0. 910.25 359. 0. 0. 1."
@@ -112,7 +125,7 @@ FILES = {
     "OpenCV, old names": (storage(names=OLD_NAMES), perspective(D5)),
     "OpenCV, skew": (storage(k=SKEWED), perspective(D5, skew=0.7)),
     "OpenCV, JSON with tabs": (
-        f'{{\n\t"camera_matrix": {matrix().tolist()},\n\t"dist_coeffs": [{D5}],\n\t"image_size": [1280, 720]\n}}\n',
+        f'{{\n\t"cameraMatrix": {matrix().tolist()},\n\t"distCoeffs": [{D5}],\n\t"image_size": [1280, 720]\n}}\n',
         perspective(D5),
     ),
     "ROS 1": (CAMERA_INFO.format(model="equidistant", values=K4, **ROS1) + "---\n", equidistant(K4)),

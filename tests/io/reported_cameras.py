@@ -21,14 +21,8 @@ def equidistant(lens, k) -> np.ndarray:
 
 
 def metashape() -> np.ndarray:
-    """Agisoft's manual, appendix on camera models."""
-    x, y = RAYS[:, 0], RAYS[:, 1]
-    r2 = x**2 + y**2
-    radial, grown = 1 + 0.11 * r2 - 0.32 * r2**2 + 0.21 * r2**3, 1 + 0.85 * r2 - 0.44 * r2**2
-    moved_x = x * radial + (0.0012 * (r2 + 2 * x * x) + 2 * -0.0031 * x * y) * grown
-    moved_y = y * radial + (-0.0031 * (r2 + 2 * y * y) + 2 * 0.0012 * x * y) * grown
-    u = 4032 / 2 - 44.5 + moved_x * (3268.25 + 1.5) - 0.5
-    return np.column_stack([u, 3024 / 2 + 12.25 + moved_y * 3268.25 - 0.5])
+    k, p, centre = (0.11, -0.32, 0.21), (0.0012, -0.0031), (4032 / 2 - 44.5 - 0.5, 3024 / 2 + 12.25 - 0.5)
+    return camera_files.metashape(RAYS[:, :2], 3268.25, (1.5, 0), k, p, (0.85, -0.44), centre)
 
 
 def colmap(model: str, size: tuple[int, int], params: list[float]) -> np.ndarray:

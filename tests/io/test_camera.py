@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.camera_model import cameras_txt
 from stcal.io.cameras.read import read_camera
+from tests.io.camera_files import METASHAPE, MRCAL
 from tests.outcome import fails_with, refuses
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]
@@ -101,13 +102,6 @@ def test_file_storage_of_opencv(tmp_path, suffix):
     np.testing.assert_array_equal(model.distortion, padded([1e-7, -0.2, 3e-20, -4e-3, 0.05]))
 
 
-@pytest.mark.parametrize("names", [("K", "D"), ("cameraMatrix", "distCoeffs"), ("camera_matrix", "dist_coeffs")])
-def test_other_names_in_use(tmp_path, names):
-    model = read(tmp_path, f"{names[0]}: {K}\n{names[1]}: [{D5}]\n")
-    np.testing.assert_array_equal(model.focal, [1000, 1100])
-    np.testing.assert_array_equal(model.distortion, padded(D5))
-
-
 @pytest.mark.parametrize(
     ("distortion", "expected"),
     [
@@ -187,6 +181,13 @@ WRONG = {
     "YAML: five of a fisheye": (yaml_text(d=str(D5), more="distortion_model: fisheye"), "E-CAMERA-COEFFICIENTS … 5"),
     "XML: cut off": ("<opencv_storage><camera_matrix>", "E-CAMERA-UNREADABLE"),
     "XML: a web page": ("<!DOCTYPE html><html><body>404</body></html>", "E-CAMERA-CONTENT … camera_matrix"),
+    "Metashape: spherical": (METASHAPE.replace("frame", "spherical"), "E-CAMERA-MODEL … spherical"),
+    "Metashape: b2": (METASHAPE.replace("<b1>", "<b2>0.1</b2><b1>"), "E-CAMERA-MODEL … b2 … 0.1"),
+    "Metashape: short": ("<calibration><width>3</width></calibration>", "E-CAMERA-UNREADABLE"),
+    "mrcal: splines of nothing": (MRCAL.replace("OPENCV5", "SPLINED_STEREOGRAPHIC"), "E-CAMERA-MODEL"),
+    "mrcal: a program": ("{'lensmodel': __import__('os'), 'imagersize': [1, 1]}", "E-CAMERA-UNREADABLE"),
+    "COLMAP, binary: cut off": (b"\x01" + bytes(7) + b"\x01" + bytes(30), "E-CAMERA-UNREADABLE"),
+    "COLMAP, binary: no camera": (b"\x02" + bytes(7), "E-CAMERA-UNREADABLE"),
     "XML: short": ("<o><camera_matrix><data>1 2 3</data></camera_matrix></o>", "E-CAMERA-COEFFICIENTS … matrix … 3"),
 }
 # fmt: on

@@ -12,18 +12,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from stcal.errors import InputNote
 from stcal.geometry.rigid import Rigid
 from stcal.io.device import AUTO, MOVED, chosen_frames, sharpness, write_frames
+from stcal.io.files import json_text
 from stcal.io.images import find_images
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
-from stcal.synthetic.body_scene import (
-    BodyOptions,
-    body_camera,
-    body_truth,
-    drawing_of,
-    make_body_scene,
-    render_body,
-    write_body,
-)
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.synthetic.body_scene import BodyOptions, body_camera, body_truth, make_body_scene, render_body
 from stcal.synthetic.designs import tag_cube
 from tests.outcome import refuses
 
@@ -125,26 +119,24 @@ def test_a_cube_that_turns_before_a_camera_is_calibrated(tmp_path):
     """A cube that turns from one of eight poses to the next in six frames each; every third frame is smeared."""
     count = 8
     scene = make_body_scene(tag_cube(60), body_camera(576), BodyOptions(images=count, distance_mm=300, seed=2))
-    assert {face.id for k in range(count) for face in scene.faces_in_view(k)} == {
-        face.id for face in scene.target.faces
-    }
+    in_view = {face.id for k in range(count) for face in scene.faces_in_view(k)}
+    assert in_view == {face.id for face in scene.target.faces}
     turns = Rotation.from_matrix([pose.rotation for pose in scene.camera_from_target])
     places, at = np.array([pose.translation for pose in scene.camera_from_target]), np.arange(6 * count - 5) / 6
     between = Slerp(np.arange(count), turns)(at).as_matrix()
     shifts = np.stack([np.interp(at, np.arange(count), place) for place in places.T], axis=1)
     poses = [Rigid(turn, shift) for turn, shift in zip(between, shifts, strict=True)]
-    scene = replace(scene, camera_from_target=tuple(poses))
-    drawings = {face.id: drawing_of(face) for face in scene.target.faces}
-    frames = [render_body(scene, k, drawings) for k in range(len(poses))]
+    moving_scene, drawings = replace(scene, camera_from_target=tuple(poses)), scene.drawings()
+    frames = [render_body(moving_scene, k, drawings) for k in range(len(poses))]
     frames = [cv2.blur(frame, (9, 1)) if k % 3 == 0 else frame for k, frame in enumerate(frames)]
-    video = clip_of(frames, tmp_path / "clip.mp4")
-    write_body(tmp_path / "set", replace(scene, camera_from_target=()))
-    result = pipeline.run(video, tmp_path / "set/cameras.txt", tmp_path / "run", tmp_path / "set/target.toml")
+    video, truth = clip_of(frames, tmp_path / "clip.mp4"), body_truth(replace(scene, camera_from_target=()))
+    (tmp_path / "truth.json").write_text(json_text(truth), encoding="utf-8")
+    result = pipeline.run(video, scene.camera, tmp_path / "run", scene.target, options=RunOptions(workers=1))
     numbers = [int(path.stem[-6:]) for path in sorted((tmp_path / "run/.stcal/cache/frames").iterdir())]
     assert 15 < len(numbers) < len(frames)
     assert all(number % 3 for number in numbers)
     assert len(result.target.target_from_face) == 6
-    assert body_truth(scene).reference_face == result.target.reference_face
-    errors = compare(tmp_path / "run", tmp_path / "set/truth.json").faces.values()
+    assert truth.reference_face == result.target.reference_face
+    errors = compare(tmp_path / "run", tmp_path / "truth.json").faces.values()
     assert max(face.translation_um for face in errors) < 300  # 0.1 px of compression at 300 mm are 40 µm
     assert max(face.rotation_mdeg for face in errors) < 300

@@ -147,8 +147,7 @@ def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, wh
     count, alone = len(problem.labels), len({label.face for label in problem.labels}) == 1
     failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
     while True:
-        both = two_minima(partial(descent_near, problem), start, plane, failure, planar=alone)
-        best, limit = both.minima, both.outlier_limit
+        best, limit = two_minima(partial(descent_near, problem), start, plane, failure, planar=alone)
         excess = best.length[0] / limit
         bad = excess > max(1.0, WORST_SHARE * excess.max())
         if not bad.any():
