@@ -186,9 +186,12 @@ def test_no_field_takes_a_value_of_another_type(made):
 
 
 @pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
-def test_a_copy_of_a_value_is_equal(made):
+def test_a_copy_of_a_value_is_equal_and_a_value_shows_itself_in_a_line(made):
+    """Results with many values: in `tests/sfm/test_pipeline.py`, and by what they are made of."""
     for again in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert (again, hash(again)) == (made, hash(made))
+    assert len(repr(made)) < 600
+    assert len(repr(made)) < 200 or "array([[" not in repr(made) or isinstance(made, Rigid)
 
 
 def test_results_and_designs_are_equal_by_value():
@@ -209,13 +212,6 @@ def test_transforms_are_equal_by_value():
     assert Poses.of([turned, Rigid()]) == Poses.of([turned, Rigid()]) != Poses.of([Rigid(), turned])
     assert Similarity(2.0, turned) == Similarity(2.0, turned) != Similarity(2.0, Rigid())
     assert Rigid() != "identity"
-
-
-@pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
-def test_a_value_shows_itself_in_a_line(made):
-    """Results with many values: in `tests/sfm/test_pipeline.py`, and by what they are made of."""
-    assert len(repr(made)) < 600
-    assert len(repr(made)) < 200 or "array([[" not in repr(made) or isinstance(made, Rigid)
 
 
 def test_errors_speak_of_arguments(monkeypatch):

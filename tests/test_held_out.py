@@ -11,17 +11,15 @@ def rng(seed=0):
     return np.random.default_rng(seed)
 
 
-@pytest.mark.parametrize(("count", "folds", "sizes"), [(11, 4, [2, 3, 3, 3]), (3, 6, [1, 1, 1]), (8, 2, [4, 4])])
-def test_every_row_is_dealt_once(count, folds, sizes):
+@pytest.mark.parametrize(
+    ("count", "folds", "sizes"),
+    [(11, 4, [2, 3, 3, 3]), (3, 6, [1, 1, 1]), (8, 2, [4, 4]), (8, 0, []), (8, 1, []), (1, 6, []), (0, 6, [])],
+)
+def test_every_row_is_dealt_once_or_none_to_one_fold(count, folds, sizes):
     found = dealt(count, folds, rng())
     assert sorted(len(rows) for rows in found) == sizes
-    assert sorted(np.concatenate(found)) == list(range(count))
+    assert sorted(row for rows in found for row in rows) == list(range(count if sizes else 0))
     assert all((np.diff(rows) > 0).all() for rows in found)
-
-
-@pytest.mark.parametrize(("count", "folds"), [(8, 0), (8, 1), (1, 6), (0, 6)])
-def test_one_fold_is_none(count, folds):
-    assert dealt(count, folds, rng()) == []
 
 
 def test_rows_are_dealt_at_random():

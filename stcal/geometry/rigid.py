@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,6 +116,9 @@ class _Frames:
         return np.concatenate([turn, self.translation - other.translation], axis=-1)
 
 
+F = TypeVar("F", "Rigid", "Poses", "Similarity")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rigid(ByValue, _Frames):
     """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
@@ -180,11 +183,7 @@ class Rigid(ByValue, _Frames):
         return np.sqrt(np.maximum(squares, 0))
 
     @overload
-    def __matmul__(self, other: "Rigid") -> "Rigid": ...
-    @overload
-    def __matmul__(self, other: "Poses") -> "Poses": ...
-    @overload
-    def __matmul__(self, other: "Similarity") -> "Similarity": ...
+    def __matmul__(self, other: F) -> F: ...
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):

@@ -73,13 +73,13 @@ def columns(place: str, change: Callable[[dict[str, list[str]]], dict[str, list[
     return edit
 
 
+def cells(place: str, names: str, change: Callable[[list[str]], list[str]]) -> Edit:
+    """Change the cells of the columns of these names."""
+    return columns(place, lambda table: {n: change(c) if re.fullmatch(names, n) else c for n, c in table.items()})
+
+
 def times(place: str, names: str, factor: float) -> Edit:
-    return columns(
-        place,
-        lambda table: {
-            n: [repr(float(v) * factor) for v in c] if re.fullmatch(names, n) else c for n, c in table.items()
-        },
-    )
+    return cells(place, names, lambda column: [repr(float(v) * factor) for v in column])
 
 
 def named(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
@@ -95,17 +95,11 @@ def without(place: str, names: str) -> Edit:
 
 
 def moved(place: str, names: str, by: int = 1) -> Edit:
-    return columns(
-        place, lambda table: {n: c[-by:] + c[:-by] if re.fullmatch(names, n) else c for n, c in table.items()}
-    )
+    return cells(place, names, lambda column: column[-by:] + column[:-by])
 
 
 def shuffled(place: str, names: str) -> Edit:
-    def change(table):
-        order = np.random.default_rng(5).permutation(len(next(iter(table.values()))))
-        return {n: [c[i] for i in order] if re.fullmatch(names, n) else c for n, c in table.items()}
-
-    return columns(place, change)
+    return cells(place, names, lambda column: np.random.default_rng(5).permutation(column).tolist())
 
 
 def both(*edits: Edit) -> Edit:

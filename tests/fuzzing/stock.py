@@ -232,12 +232,9 @@ def _tags(folder: Path, rng: np.random.Generator) -> None:
 def _sheet_with_board() -> np.ndarray:
     printed = np.full((320 * PER_MM, int(SHEET_MM[0]) * PER_MM), 255, np.uint8)
     printed[: sheet().shape[0]] = sheet()
-    side = 20 * PER_MM
-    for row in range(-1, 4):
-        for column in range(-1, 9):
-            x, y = BOARD_AT_MM[0] * PER_MM + column * side, BOARD_AT_MM[1] * PER_MM + row * side
-            if (row + column) % 2 == 0:
-                printed[y : y + side, x : x + side] = 0
+    side, (x, y) = 20 * PER_MM, np.array(BOARD_AT_MM) * PER_MM
+    squares = np.kron(np.indices((5, 10)).sum(0) % 2 * 255, np.ones((side, side)))
+    printed[y - side : y + 4 * side, x - side : x + 9 * side] = squares
     return printed
 
 
