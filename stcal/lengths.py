@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from stcal.errors import InputError
 
@@ -27,14 +28,10 @@ class Length:
     most: float
 
 
-def side(place: str, value_mm: float) -> Length:
-    """Returns the side of a tag or a square, or a pitch."""
-    return Length(place, value_mm, LEAST_SIDE_MM, MOST_SIDE_MM)
-
-
-def radius(place: str, value_mm: float) -> Length:
-    """Returns the radius of a dot."""
-    return Length(place, value_mm, LEAST_RADIUS_MM, MOST_RADIUS_MM)
+side = partial(Length, least=LEAST_SIDE_MM, most=MOST_SIDE_MM)
+"""Returns the side of a tag or a square, or a pitch, of its place and value."""
+radius = partial(Length, least=LEAST_RADIUS_MM, most=MOST_RADIUS_MM)
+"""Returns the radius of a dot, likewise."""
 
 
 def _unusual(lengths: Iterable[Length]) -> Length | None:

@@ -89,6 +89,7 @@ def test_the_page_of_checks_has_each_check_by_its_key():
     assert told == CHECKS.keys() - {CAUSE}
 
 
+@pytest.mark.slow
 def test_the_pages_made_have_every_option_key_and_error():
     made = dict(pages.made())
     listed = "".join(text for place, text in made.items() if place.startswith("reference/commands/"))

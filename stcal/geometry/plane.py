@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -236,9 +237,8 @@ def two_minima(
     return minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma
 
 
-def weights_of(length: np.ndarray) -> np.ndarray:
-    """Return Huber's weights of points, same shape, from the lengths of their residuals in σ."""
-    return huber_weights(length, HUBER)
+weights_of = partial(huber_weights, limit=HUBER)
+"""Return Huber's weights of points, same shape, from the lengths of their residuals in σ."""
 
 
 def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:

@@ -1,6 +1,8 @@
 """Robust weights and scales: Huber's loss of lengths, σ from medians, and limits of given false-alarm probability. A
 length is the norm of d coordinates over their σ, of normal errors the root of a χ² of d degrees of freedom."""
 
+from functools import partial
+
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri
@@ -14,6 +16,8 @@ def length_limit(coordinates: int, beyond: float) -> float:
     return float(np.sqrt(chdtri(coordinates, beyond)))
 
 
+median_length = partial(length_limit, beyond=0.5)
+"""Return the median length of normal errors in a number of coordinates, in σ."""
 TAIL = 0.05
 """Share of the lengths beyond the quantile that tells how heavy the tail is: gross errors are fewer."""
 TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
@@ -48,11 +52,6 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:
     """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F."""
     return float(1 / fdtri(redundancy, freedom, beyond))
-
-
-def median_length(coordinates: int) -> float:
-    """Return the median length of normal errors in this number of ``coordinates``, in σ."""
-    return length_limit(coordinates, 0.5)
 
 
 def huber_weights(length: np.ndarray, limit: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, 
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.foreign_lenses import ForeignLens
-from stcal.io.cameras.read import LoadedLens, camera_of_photograph, is_photograph, read_lens, sized_camera
+from stcal.io.cameras.read import camera_of_photograph, is_photograph, read_lens, sized_camera
 
 CELLS = 24  # number of grid points along the shorter side of the image
 STEPS, STEP_RAD = 10, 1e-6
@@ -48,16 +48,6 @@ class FittedLens:
     most_px: float
     share: float
     camera_from_lens: Rigid
-
-    @property
-    def width(self) -> int:
-        """Width of the image, px."""
-        return self.camera.width
-
-    @property
-    def height(self) -> int:
-        """Height of the image, px."""
-        return self.camera.height
 
     def project(self, rays: np.ndarray) -> np.ndarray:
         """Return the pixels (n, 2) of rays (n, 3)."""
@@ -96,10 +86,11 @@ def compare_cameras(one: Camera | FittedLens, two: Camera | FittedLens) -> Camer
 
     Raises DegenerateError: too few pixels have a ray in both cameras.
     """
-    if (one.width, one.height) != (two.width, two.height):
-        fault = f"cameras of {one.width}×{one.height} and {two.width}×{two.height} px"
+    a, b = (each.camera if isinstance(each, FittedLens) else each for each in (one, two))
+    if (a.width, a.height) != (b.width, b.height):
+        fault = f"cameras of {a.width}×{a.height} and {b.width}×{b.height} px"
         raise InputError("E-CAMERA-SIZES-DIFFER", f"{fault}; files of one image size needed")
-    pixels = image_grid(one)
+    pixels = image_grid(a)
     flat = pixels.reshape(-1, 2)
     first, second = (each.rays(flat) if isinstance(each, FittedLens) else rays(each, flat) for each in (one, two))
     good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
@@ -124,7 +115,7 @@ def compare_cameras(one: Camera | FittedLens, two: Camera | FittedLens) -> Camer
     return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
 
 
-def image_grid(camera: Camera | FittedLens) -> np.ndarray:
+def image_grid(camera: Camera) -> np.ndarray:
     """Return a grid of pixels (r, c, 2) over the image, edges included."""
     count = max(round(CELLS * camera.width / camera.height), 2), CELLS
     x, y = (np.linspace(-0.5, side - 0.5, n) for side, n in zip((camera.width, camera.height), count, strict=True))
@@ -155,6 +146,24 @@ SMALL = 1e-6
 """Step about the axis, in normalised coordinates, from which the initial focal lengths are computed."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedLens:
+    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
+
+    lens: Camera | FittedLens
+    told: str = ""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; of a lens of another model the one that was fitted to it."""
+        return self.lens if isinstance(self.lens, Camera) else self.lens.camera
+
+    @property
+    def fitted(self) -> FittedLens | None:
+        """Quality of the fit, None where the file's model is supported."""
+        return None if isinstance(self.lens, Camera) else self.lens
+
+
 @require_arguments
 def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> LoadedLens:
     """Load a camera from a file also of a model that is not supported, to which one is fitted, or from EXIF.
@@ -172,7 +181,7 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     Raises ConvergenceError, DegenerateError: no supported model comes near the lens.
     """
     if is_photograph(path):
-        return camera_of_photograph(path)
+        return LoadedLens(*camera_of_photograph(path))
     lens, (across, up) = read_lens(path, name), size or (0, 0)
     width, height = lens.width or across, lens.height or up
     if isinstance(lens, CameraModel) or not (width and height):

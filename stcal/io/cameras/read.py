@@ -9,12 +9,12 @@ import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 import yaml
@@ -33,9 +33,6 @@ from stcal.io.cameras.matlab import mat
 from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
-if TYPE_CHECKING:
-    from stcal.io.cameras.difference import FittedLens
-
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")  # first bytes of JPEG, TIFF and PNG
 FILM_DIAGONAL_MM = 43.2666
 """Diagonal of 36 × 24 mm, by which CIPA DCG-001 states focal lengths; widths would differ by 4 % at 4 : 3."""
@@ -48,24 +45,6 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 """σ of radial and tangential distortion, which EXIF does not state."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadedLens:
-    """The lens of a file: the camera, or another model's lens; ``told`` : what a photograph's EXIF says of it."""
-
-    lens: "Camera | FittedLens"
-    told: str = ""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera; of a lens of another model the one that was fitted to it."""
-        return self.lens if isinstance(self.lens, Camera) else self.lens.camera
-
-    @property
-    def fitted(self) -> "FittedLens | None":
-        """Quality of the fit, None where the file's model is supported."""
-        return None if isinstance(self.lens, Camera) else self.lens
-
-
 def is_photograph(path: str | Path) -> bool:
     """Return True if a file begins with the bytes of an image."""
     try:
@@ -76,9 +55,9 @@ def is_photograph(path: str | Path) -> bool:
         return False
 
 
-def camera_of_photograph(path: str | Path) -> LoadedLens:
+def camera_of_photograph(path: str | Path) -> tuple[Camera, str]:
     """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes, OPENCV without distortion and with a
-    covariance for what EXIF leaves open."""
+    covariance for what EXIF leaves open; and in words the entries used."""
     where = f"camera file {path}"
     try:
         data = read_bytes(path, IMAGE_BYTES)
@@ -107,7 +86,7 @@ def camera_of_photograph(path: str | Path) -> LoadedLens:
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
-    return LoadedLens(Camera.of(camera, "OPENCV", covariance), told)
+    return Camera.of(camera, "OPENCV", covariance), told
 
 
 def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
@@ -309,9 +288,8 @@ _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
 
 
-def camera_chosen(name: str) -> AbstractContextManager[None]:
-    """Read the camera of this name from files of several; for a command's option, which applies to all it reads."""
-    return held(_chosen, name)
+camera_chosen = partial(held, _chosen)
+"""Read the camera of a name from files of several; for a command's option, which applies to all it reads."""
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:

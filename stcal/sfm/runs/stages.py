@@ -169,7 +169,7 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     (width, height), _ = require_common_size(list(files))
     for file in files:
         with suppress(InputError):
-            camera = camera_of_photograph(file.path).camera
+            camera, _ = camera_of_photograph(file.path)
             if (camera.width, camera.height) == (width, height):
                 return [camera]
     return [Camera.of(start_camera(width, height, LENS), LENS)]

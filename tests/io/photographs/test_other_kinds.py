@@ -71,7 +71,7 @@ def test_a_damaged_heic_photograph_is_refused(monkeypatch):
 def test_the_camera_of_a_heic_photograph(tmp_path):
     path = tmp_path / "a.heic"
     path.write_bytes(heic(exif=exif()))
-    camera = camera_of_photograph(path).camera
+    camera, _ = camera_of_photograph(path)
     np.testing.assert_allclose(camera.focal, 26 / np.hypot(36, 24) * np.hypot(WIDTH, HEIGHT), rtol=1e-4)
 
 
