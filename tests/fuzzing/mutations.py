@@ -66,15 +66,20 @@ junk = _bytes("junk", lambda data, rng: rng.bytes(max(len(data), 64)))
 utf_16 = _bytes("utf_16", lambda data, rng: data.decode("utf-8", "replace").encode(pick(rng, ENCODINGS)))
 
 
-def a_folder(path: Path, _) -> str:
-    path.unlink()
-    path.mkdir()
-    return "a folder"
+def _done(said: str, *steps: Callable[[Path], object]) -> Mutation:
+    def spoil(path: Path, _) -> str:
+        for step in steps:
+            step(path)
+        return said
+
+    return spoil
 
 
-def missing(path: Path, _) -> str:
-    path.unlink()
-    return "missing"
+a_folder = _done("a folder", Path.unlink, Path.mkdir)
+missing = _done("missing", Path.unlink)
+not_permitted = _done("not permitted", lambda path: path.chmod(0))
+huge = _done(f"{HUGE_BYTES >> 30} GB", lambda path: os.truncate(path, HUGE_BYTES))
+"""A hole without end, that takes no space."""
 
 
 def a_broken_link(path: Path, rng: np.random.Generator) -> str:
@@ -88,17 +93,6 @@ def a_link(path: Path, _) -> str:
     path.rename(path.with_name(f"real {path.name}"))
     path.symlink_to(f"real {path.name}")
     return "a link"
-
-
-def not_permitted(path: Path, _) -> str:
-    path.chmod(0)
-    return "not permitted"
-
-
-def huge(path: Path, _) -> str:
-    """A hole without end, that takes no space."""
-    os.truncate(path, HUGE_BYTES)
-    return f"{HUGE_BYTES >> 30} GB"
 
 
 BYTES = (

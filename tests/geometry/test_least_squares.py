@@ -6,7 +6,7 @@ from scipy import stats
 
 from stcal.design import reference_board
 from stcal.geometry.clusters import by_clusters
-from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.least_squares import NormalEquations, minimise, select_rows
 from stcal.geometry.normal_equations import constrained_inverse, free_motions, generalised_inverse
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.robust import (
@@ -46,10 +46,7 @@ def test_many_problems_end_where_each_would_alone():
         return NormalEquations(*(np.array([getattr(e, k) for e in each]) for k in ("cost", "normal", "gradient")))
 
     def select(take, new, old):
-        if isinstance(new, np.ndarray):
-            return np.where(take.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-        parts = ((getattr(each, k) for each in (new, old)) for k in ("cost", "normal", "gradient"))
-        return NormalEquations(*(select(take, *part) for part in parts))
+        return np.where(take[:, None], new, old) if isinstance(new, np.ndarray) else select_rows(take, new, old)
 
     found = minimise(starts, at_once, np.add, select=select)
     assert found.converged.all()
